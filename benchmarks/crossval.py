@@ -1,11 +1,15 @@
 """What `drgs crossval` says of correct and broken rasterizers and of outside code; writes docs/crossval.md's tables.
 
-    python benchmarks/crossval.py [--only alarms|poses|broken|outside] [--seeds 50] [--runs runs]
+    python benchmarks/crossval.py [--only alarms|poses|broken|rays|eval3d|outside] [--seeds 50] [--runs runs]
 
 Correct ones, for false alarms (`alarms`): our presets against the oracle, and gsplat's own torch code (examples/) where
 it is installed. Each seed has its cotangents and its view of a real scene, and the crop of it that the command takes.
 Rows are kept in crossval.json, crossval_poses.json and crossval_broken.json: a run that was stopped goes on. `poses`:
 the same for gradients of poses and of colors of six channels, four seeds each.
+
+Along rays (`rays`, `eval3d`): the right rasterizer of tests/torch_rays.py and copies that are broken on purpose, and
+gsplat 1.6's own torch code (examples/gsplat_eval3d.py), through a pinhole, OpenCV's lens and a fisheye. Rows are kept
+in crossval_rays.json and crossval_eval3d.json; those of gsplat's code are made where gsplat 1.6 can be imported.
 
 Outside code: gsplat's again, and Mitsuba's `volprim_rf_basic`. Scenes: random ones, and of real scenes (DRGS_DATA) the
 2,000 Gaussians that weigh most in a view of 64x48 pixels (250 at 48x40 for the broken ones, which are dense).
@@ -30,6 +34,7 @@ import sys  # isort: skip
 sys.path[:0] = [str(ROOT / "tests")]
 
 import torch_rasterizer  # noqa: E402
+import torch_rays  # noqa: E402
 
 import drgs  # noqa: E402
 from drgs.cameras import Camera  # noqa: E402
@@ -40,7 +45,7 @@ from drgs.files import load_ply  # noqa: E402
 from drgs.lab.crossval import VERDICTS, crops, crossval  # noqa: E402
 from drgs.lab.dumps import cotangents  # noqa: E402
 from drgs.lab.rasterizers import function, load_rasterizer  # noqa: E402
-from drgs.lab.raw import PARAMETERS, raw_of, with_pose  # noqa: E402
+from drgs.lab.raw import PARAMETERS, POSE_END, raw_of, with_pose  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.sizes import at_most  # noqa: E402
 from drgs.testing import random_scene  # noqa: E402
@@ -64,6 +69,12 @@ DOCUMENTED = ("view_direction_detached", "clamp_passes_gradient")  # are choices
 BROKEN = Path(__file__).with_name("crossval_broken.json")
 ROWS = Path(__file__).with_suffix(".json")
 POSES = Path(__file__).with_name("crossval_poses.json")
+RAYS = Path(__file__).with_name("crossval_rays.json")
+EVAL3D = Path(__file__).with_name("crossval_eval3d.json")
+OWN_EVAL3D = "examples.gsplat_eval3d:rasterization"
+RAY_SEEDS = 2
+RAY_FIELDS = {"background": BACKGROUND, "culling": "extent"}  # dense code has no boxes of the unscented transform
+RAY_SPLATS = 100  # of a real scene those that weigh most: the rasterizer in torch is dense
 POSE_SEEDS = 4
 MOVING = ("covariance_off_diagonal", "background_gradient", "clamp_passes_gradient")  # are wrong for the pose, too
 
@@ -243,12 +254,164 @@ def _found(name: str, g: Gaussians, cameras: list[Camera]) -> dict:
 
 def _same(a, b, g: Gaussians, camera: Camera) -> bool:
     """Whether two rasterizers' images and gradients of a view are equal, bit for bit."""
-    raw = with_pose(raw_of(g))
+    raw = with_pose(raw_of(g), camera.is_rolling)
     u = cotangents([camera], 0)[0]
     if not torch.equal(*(x.image(raw, camera, BACKGROUND)[0] for x in (a, b))):
         return False
     slopes = [x.gradient(raw, camera, BACKGROUND, u) for x in (a, b)]
     return all(y is not None and torch.equal(x, y) for x, y in zip(*(s.values() for s in slopes), strict=True))
+
+
+def ray_scenes() -> dict[str, tuple]:
+    """Name -> (Gaussians, camera): made for rays, through every lens, and the wolf."""
+    scenes = {}
+    for lens, (model, distortion) in torch_rays.LENSES.items():
+        for seed in range(RAY_SEEDS):
+            s = torch_rays.ray_scene(seed)
+            g = Gaussians(**{name: s[name].float() for name in PARAMETERS})
+            size = {"width": s["width"], "height": s["height"]}
+            camera = Camera(K=s["K"].numpy(), w2c=s["viewmat"].numpy(), model=model, distortion=distortion, **size)
+            scenes[f"{lens} {seed}"] = g, camera
+    real = wolf(RAY_SPLATS, 32, 24)
+    if real:
+        scenes["wolf"] = real[0], real[1][0]
+    return scenes
+
+
+def right_rays() -> torch_rays.RayModel:
+    """The right rasterizer along rays, with the constants of preset `3dgut`."""
+    s = RenderSettings.preset("3dgut")
+    density = 0.0 if s.extent is None else math.exp(-(s.extent**2) / 2)
+    return dataclasses.replace(torch_rays.CORRECT, alpha_max=s.alpha_max, density_min=density, between=False)
+
+
+def rays() -> list[str]:
+    """One line a rasterizer along rays that is broken on purpose."""
+    scenes = ray_scenes()
+    rows = studies.read_rows(RAYS, {})
+    lines = [
+        "| rasterizer | what is wrong | " + " | ".join(scenes) + " | named |",
+        "|---|---|" + "---|" * len(scenes) + "---|",
+    ]
+    for name in ("right", *torch_rays.DEFECTS):
+        what = "nothing" if name == "right" else torch_rays.DEFECTS[name].what
+        cells = []
+        named = {}
+        for scene, (g, camera) in scenes.items():
+            key = f"{name} {scene}"
+            if key not in rows:
+                rows[key] = _ray_row(name, g, camera)
+                studies.write_rows(RAYS, rows)
+                print(key, rows[key], flush=True)
+            row = rows[key]
+            cells.append(row["verdict"] if row["right"] else f"**{row['verdict']}**")
+            named |= dict.fromkeys(row["named"])
+        lines.append(f"| `{name}` | {what} | " + " | ".join(cells) + f" | {', '.join(named)} |")
+    return lines
+
+
+def _ray_row(name: str, g: Gaussians, camera: Camera) -> dict:
+    """What is said of a rasterizer along rays, and whether it is that."""
+    right = right_rays()
+    defect = torch_rays.DEFECTS.get(name)
+    drawn = torch_rays.rasterizer(right) if defect is None else torch_rays.broken(name, right)
+    good, made = function(torch_rays.rasterizer(right), "right"), function(drawn, name)
+    moves = defect is not None and defect.kind == "shutter"
+    if moves:
+        end = torch_rays.end_of(torch.tensor(camera.w2c)).numpy()
+        camera = dataclasses.replace(camera, shutter="rolling_top_to_bottom", w2c_end=end)
+    start = time.process_time()
+    try:
+        found = crossval(made, g, [camera], "3dgut", RAY_FIELDS)
+    except ValueError as error:  # a rasterizer that draws nothing at all is refused
+        return {"verdict": "refused", "right": "shows the background alone" in str(error), "named": [], "seconds": 0.0}
+    seconds = time.process_time() - start
+    groups = {v: sorted(n for n, row in found.report["groups"].items() if row["verdict"] == v) for v in VERDICTS}
+    # What is found of another model's image explains a part of it only.
+    conventions = found.report["conventions"] if found.report["image"]["agrees"] else []
+    named = [f"{c['name']}: {c['found']}" for c in conventions]
+    named += groups["gradient bug"] + groups["known deviation"]
+    shown = defect is not None and not _same(good, made, g, camera)
+    if not shown:
+        is_right = found.verdict == "agreement"
+    elif name in DOCUMENTED:
+        is_right = found.verdict == "known deviation"
+    elif defect.kind == "gradient":
+        is_right = {*groups["gradient bug"]} - {"colors"} == {*defect.groups}
+    elif moves and defect.groups:
+        is_right = {*groups["gradient bug"]} == {POSE_END}
+    elif moves and found.verdict == "known deviation":  # the other eye, where the image does not show it
+        is_right = "from between both poses" in " ".join(row.why for row in found.groups.values())
+    else:
+        is_right = found.verdict == "other convention" and len(found.findings) == 1
+    verdict = found.verdict if shown or defect is None or not is_right else "not shown"
+    return {"verdict": verdict, "right": is_right, "named": named, "seconds": seconds}
+
+
+def eval3d() -> list[str]:
+    """One line a scene: gsplat 1.6's own torch code along rays beside preset `3dgut` and the rasterizer in plain torch.
+
+    Rows that are kept need no gsplat.
+    """
+    rows = studies.read_rows(EVAL3D, {})
+    lines = [
+        "| scene | conventions that differ | RMS of the image | verdict | relative difference of gradients: means, "
+        "quats, log_scales, logit_opacities, sh, viewmats, colors | plain torch: image, largest of the gradients "
+        "| the same with a rolling shutter, the largest of four directions "
+        "| `drgs.render` with a rolling shutter: conventions that differ; verdict; RMS; largest of the gradients |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for scene, (g, camera) in ray_scenes().items():
+        if scene not in rows:
+            rows[scene] = _eval3d_row(g, camera)
+            studies.write_rows(EVAL3D, rows)
+            print(scene, rows[scene], flush=True)
+        row = rows[scene]
+        groups = ", ".join(f"{row['groups'][name]:.0e}" for name in (*PARAMETERS, "viewmats", "colors"))
+        pairs = [", ".join(f"{x:.0e}" for x in row[kind]) for kind in ("plain", "rolling")]
+        odd = "; ".join(row["conventions"]) or "-"
+        rolled = [", ".join(row["rolling_conventions"]) or "-", row["rolling_verdict"]]
+        rolled += [f"{row[name]:.0e}" for name in ("rolling_rms", "rolling_gradient")]
+        cells = [scene, odd, f"{row['rms']:.0e}", row["verdict"], groups, *pairs, "; ".join(rolled)]
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines
+
+
+def _eval3d_row(g: Gaussians, camera: Camera) -> dict:
+    """gsplat's torch code on one view."""
+    theirs = load_rasterizer(OWN_EVAL3D)
+    # What preset 3dgut may have otherwise: the clamp and the density that gsplat's functions have.
+    fields = RAY_FIELDS | {"alpha_max": 0.99, "extent": math.sqrt(-2 * math.log(0.0113))}
+    found = crossval(theirs, g, [camera], "3dgut", fields)
+    plain = torch_rays.rasterizer(dataclasses.replace(torch_rays.CORRECT, behind=True))
+    apart = {"plain": _apart(theirs, function(plain, "plain"), g, camera), "rolling": (0.0, 0.0)}
+    for shutter in torch_rays.SHUTTERS:
+        end = torch_rays.end_of(torch.tensor(camera.w2c)).numpy()
+        moving = dataclasses.replace(camera, shutter=shutter, w2c_end=end)
+        found_now = _apart(theirs, function(plain, "plain"), g, moving)
+        apart["rolling"] = tuple(max(x) for x in zip(apart["rolling"], found_now, strict=True))
+    rolled = crossval(theirs, g, [moving], "3dgut", fields)
+    return {
+        "rolling_conventions": [f"{c['name']}: {c['found']}" for c in rolled.report["conventions"]],
+        "rolling_verdict": rolled.verdict,
+        "rolling_rms": rolled.views[0].rms,
+        "rolling_gradient": max(row.relative for row in rolled.groups.values()),
+        "conventions": [f"{c['name']}: {c['found']}" for c in found.report["conventions"]],
+        "verdict": found.verdict,
+        "rms": found.views[0].rms,
+        "groups": {name: row.relative for name, row in found.groups.items()},
+        **apart,
+    }
+
+
+def _apart(a, b, g: Gaussians, camera: Camera) -> tuple[float, float]:
+    """Largest difference of two rasterizers' images, and the largest relative one of a group's gradient."""
+    raw = with_pose(raw_of(g), camera.is_rolling)
+    u = cotangents([camera], 0)[0]
+    images = [x.image(raw, camera, BACKGROUND)[0] for x in (a, b)]
+    slopes = [x.gradient(raw, camera, BACKGROUND, u) for x in (a, b)]
+    pairs = zip(slopes[0].values(), slopes[1].values(), strict=True)
+    return float((images[0] - images[1]).abs().max()), max(float((x - y).norm() / y.norm()) for x, y in pairs)
 
 
 def outside() -> list[str]:
@@ -293,7 +456,7 @@ def outside() -> list[str]:
 
 def main():
     parser = argparse.ArgumentParser()
-    parser.add_argument("--only", choices=["alarms", "poses", "broken", "outside"])
+    parser.add_argument("--only", choices=["alarms", "poses", "broken", "rays", "eval3d", "outside"])
     parser.add_argument("--seeds", type=int, default=50, help="of every correct rasterizer on every real scene")
     parser.add_argument("--table", action="store_true", help="of false alarms: the table of the rows that are there")
     parser.add_argument("--runs", type=Path, default=ROOT / "runs", help="where fits are kept")
@@ -303,6 +466,8 @@ def main():
         "alarms": lambda: alarms(args.runs, args.seeds, args.table),
         "poses": lambda: poses(args.runs),
         "broken": lambda: broken(args.runs),
+        "rays": rays,
+        "eval3d": eval3d,
         "outside": outside,
     }
     for part, make in makers.items():

@@ -83,6 +83,8 @@ def render(
     window: tuple[int, int, int, int] | None = None,
     exact_ties: bool = False,
     effect: float = 1e-7,
+    plain_directions: bool = False,
+    peaks_behind: bool = False,
 ) -> ReferenceOutput:
     """Renders by brute force in float64.
 
@@ -107,6 +109,9 @@ def render(
         exact_ties: Keys that are equal make a pixel `ambiguous`, too: a renderer that rounds in another way, or sorts
             without the index, may have either order.
         effect: The change of a weight that matters to `ambiguous`.
+        plain_directions: Whether rho^2 is |o' x d'|^2, not divided by |d'|^2, as of a rasterizer that does not
+            normalize d' (`peak` without a window only).
+        peaks_behind: Whether peaks behind the origin of a ray count, too (`peak` only).
     Returns:
         `ReferenceOutput` in float64. `count` sees hits far below 1e-7, which `ambiguous` does not.
     Raises:
@@ -119,6 +124,14 @@ def render(
             f"reference.render: response must be one of {', '.join(_FORMS)}, got {s.response!r}; add its equations to "
             "reference._FORMS"
         )
+    form = _FORMS[s.response]
+    if plain_directions or peaks_behind:
+        if s.response != "peak" or (plain_directions and window is not None):
+            raise ValueError(
+                f"reference.render: plain_directions and peaks_behind need response='peak' and no window, got "
+                f"{s.response!r} and {window}"
+            )
+        form = _OddPeak(plain_directions, not peaks_behind)
     if s.planar and (
         rays is not None
         or getattr(cam, "model", "pinhole") != "pinhole"
@@ -153,7 +166,7 @@ def render(
     parts = []
     for i in range(0, max(len(directions), 1), step):
         part = (x[i : i + step] for x in (view.origins, directions, view.pixels))
-        args: tuple[Any, ...] = (scene, s, rotation, center, *part, tolerance, exact_ties, effect)
+        args: tuple[Any, ...] = (scene, s, form, rotation, center, *part, tolerance, exact_ties, effect)
         # Recomputing a chunk in the backward pass keeps memory bounded by one chunk.
         if torch.is_grad_enabled() and len(directions) > step:
             parts.append(checkpoint(_composite, *args, use_reentrant=False))
@@ -277,6 +290,7 @@ def _in_window(
 def _responses(
     scene: OracleScene,
     s: RenderSettings,
+    form: _Peak,
     rotation: Tensor,
     center: Tensor | None,
     o: Tensor,
@@ -291,7 +305,6 @@ def _responses(
     to the mean.
     """
     away = scene.means - o[:, None, :]
-    form = _FORMS[s.response]
     rho2, t, length = form.meet(scene, s, rotation, away, d, pixels)
     a, rest = form.opacity(scene, rho2, t, length)
     # Where it is clamped, and how near to that, are numbers; the value of a clamp that the gradient passes is one, too.
@@ -373,6 +386,21 @@ class _Peak:
         return t
 
 
+class _OddPeak(_Peak):
+    """A peak whose rho^2 is not divided by |d'|^2, or that counts behind the origin, too."""
+
+    def __init__(self, plain: bool, front_only: bool):
+        self.plain = plain
+        self.front_only = front_only
+
+    def meet(
+        self, scene: OracleScene, s: RenderSettings, rotation: Tensor, away: Tensor, d: Tensor, pixels: Tensor
+    ) -> tuple:
+        """rho^2 as it is or times |d'|^2, t* and |d'|."""
+        rho2, t, length = super().meet(scene, s, rotation, away, d, pixels)
+        return rho2 * length.square() if self.plain else rho2, t, length
+
+
 class _Integral(_Peak):
     """a = 1 - exp(-tau), tau = softplus(logit) exp(-rho^2 / 2) erfc(-u / sqrt 2) / 2, u = t* |d'|."""
 
@@ -416,6 +444,7 @@ _FORMS = {"peak": _Peak(), "integral": _Integral(), "ewa": _Ewa()}
 def _composite(
     scene: OracleScene,
     s: RenderSettings,
+    form: _Peak,
     rotation: Tensor,
     center: Tensor | None,
     o: Tensor,
@@ -426,7 +455,7 @@ def _composite(
     effect: float,
 ) -> dict:
     """The fields of `ReferenceOutput` for one chunk of rays."""
-    a, rest, t, key, *checks = _responses(scene, s, rotation, center, o, d, pixels, tolerance)
+    a, rest, t, key, *checks = _responses(scene, s, form, rotation, center, o, d, pixels, tolerance)
     # Near misses are sorted in, without effect, to see what they would have done.
     candidate = checks[0] | (checks[1] >= -tolerance)
     key, order = torch.where(candidate, key, math.inf).sort(dim=1, stable=True)

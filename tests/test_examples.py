@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import json
 import os
@@ -230,6 +231,49 @@ def test_gsplat_adapter_says_what_is_missing():
 
     with pytest.raises(ImportError, match=r"gsplat 1\.5\.3 must be installed, got: No module named 'gsplat'"):
         tr.draw(gsplat_torch.rasterization, tr.random_scene(0))
+
+
+def test_gsplat_along_rays_says_what_is_missing():
+    """gsplat before 1.6 has no torch code along rays, and its absence is told the same way."""
+    from examples import gsplat_eval3d
+
+    if importlib.util.find_spec("gsplat") and importlib.util.find_spec("gsplat.cuda._torch_impl_eval3d"):
+        pytest.skip("gsplat 1.6 is installed")
+    with pytest.raises(ImportError, match=r"gsplat 1\.6 must be installed, got: ") as error:
+        tr.draw(gsplat_eval3d.rasterization, tr.random_scene(0))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.skipif(
+    not (importlib.util.find_spec("gsplat") and importlib.util.find_spec("gsplat.cuda._torch_impl_eval3d")),
+    reason="gsplat 1.6 is not installed: pip install gsplat==1.6.0",
+)
+def test_gsplats_own_torch_code_along_rays():
+    """It is the rasterizer in plain torch, where peaks behind the eye count as in gsplat."""
+    import torch_rays
+
+    from examples import gsplat_eval3d
+
+    scene = torch_rays.ray_scene(0)
+    u = torch.randint(0, 2, (24, 32, 3), generator=torch.Generator().manual_seed(0)).double() * 2 - 1
+    right = torch_rays.rasterizer(dataclasses.replace(torch_rays.CORRECT, behind=True))
+    image, gradient = tr.gradients(right, scene, u)
+    theirs, found = tr.gradients(gsplat_eval3d.rasterization, scene, u)
+    torch.testing.assert_close(theirs, image, rtol=0, atol=1e-12)
+    for name in tr.GROUPS:
+        torch.testing.assert_close(found[name], gradient[name], rtol=1e-9, atol=1e-9)
+
+
+def test_hits_that_are_packed_by_ray():
+    """What the adapter along rays puts in place of nerfacc, on rays whose weights are known; one has no hit."""
+    from examples import gsplat_eval3d
+
+    alphas = torch.tensor([0.5, 0.5, 0.25, 0.9], dtype=torch.float64)
+    packed = gsplat_eval3d._packed(torch.tensor([0, 0, 2, 2]), 3)
+    assert packed.tolist() == [[0, 2], [2, 0], [2, 2]]
+    weights, front = gsplat_eval3d._weights(alphas, packed_info=packed)
+    torch.testing.assert_close(front, torch.tensor([1, 0.5, 1, 0.75], dtype=torch.float64))
+    torch.testing.assert_close(weights, torch.tensor([0.5, 0.25, 0.25, 0.675], dtype=torch.float64))
 
 
 def test_listing_and_compositing_of_pairs():

@@ -101,7 +101,7 @@ def test_float32_is_tiny(report):
         assert all(abs(x["share"]) < 1e-2 for x in row["gradient"].values())
 
 
-@pytest.mark.parametrize("preset", ["inria", "gsplat", "fast", "mitsuba"])
+@pytest.mark.parametrize("preset", ["inria", "gsplat", "3dgut", "fast", "mitsuba"])
 def test_orders_are_legal_and_meet(preset):
     """Every stop is legal (or it would raise), one rung switches its own fields once, both orders end in `exact`."""
     start = Preset(preset)

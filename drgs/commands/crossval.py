@@ -14,6 +14,7 @@ from drgs.guards.outputs import check_file, claim
 from drgs.lab import dumps, ladder, rasterizers
 from drgs.lab.crossval import Result, crossval
 from drgs.lab.report import html
+from drgs.settings import PRESETS, RenderSettings
 from drgs.sizes import at_most
 
 if TYPE_CHECKING:
@@ -34,14 +35,16 @@ def run(args: Crossval) -> int:
         check_file(args.export, "crossval", inputs, dumps.is_export)
     given = SceneInput.of(args)
     g, fields = given.colors, given.fields
-    cameras, source = seen_views(args, given)
+    along_rays = _along_rays(args)
+    # A model of the image plane has no lens, and what is written for another machine is pinholes.
+    cameras, source = seen_views(args, given, lenses=along_rays and args.export is None)
     cameras = [at_most(camera, args.max_pixels) for camera in cameras]
     if args.export is not None:
         dumps.export(args.export, g, cameras, given.background, args.seed)
         if not args.quiet:
             print(f"{len(g)} Gaussians, {len(cameras)} views of {cameras[0].width}x{cameras[0].height}: {args.export}")
         return 0
-    rasterizer = rasterizers.load_rasterizer(args.rasterizer, g, cameras, fields)
+    rasterizer = rasterizers.load_rasterizer(args.rasterizer, g, cameras, fields, along_rays)
     with Bar("crossval", show=not args.quiet) as bar:
 
         def advance(stage: str) -> None:
@@ -62,6 +65,15 @@ def run(args: Crossval) -> int:
         _print(result, args)
     bad = result.verdict == "gradient bug" or (args.strict and result.verdict != "agreement")
     return int(bad)
+
+
+def _along_rays(args: Crossval) -> bool:
+    """Whether the preset that is compared with is said to evaluate Gaussians along rays; a dump is of pinholes."""
+    own = args.rasterizer.removeprefix("drgs:") if args.rasterizer.startswith("drgs:") else "auto"
+    name = own if own in PRESETS and args.preset == "auto" else args.preset
+    if name == "auto" or args.rasterizer.endswith(dumps.SUFFIXES):
+        return False
+    return not RenderSettings.preset(name).planar
 
 
 def _print(result: Result, args: Crossval) -> None:

@@ -191,15 +191,20 @@ def drawn_views(
     return [_named(view) for view in views], f"{Path(text)} ({args.split})"
 
 
-def seen_views(args: Crossval | Query | Tradeoff, given: SceneInput) -> tuple[list[Camera], str]:
-    """At most `--limit` pinhole cameras of `--cameras`, as large as they are drawn; and where they come from in words.
+def seen_views(args: Crossval | Query | Tradeoff, given: SceneInput, lenses: bool = False) -> tuple[list[Camera], str]:
+    """At most `--limit` cameras of `--cameras`, as large as they are drawn; and where they come from in words.
 
+    Args:
+        args: What was asked for.
+        given: The scene.
+        lenses: Whether cameras keep their lens; without it all are pinholes.
     Raises:
         FileNotFoundError, ValueError: As `drawn_views`.
     """
     text = args.cameras or ("orbit" if given.run is None else str(given.run.path))
     cameras, source = drawn_views(args, text, given, args.limit)
-    return [camera.undistorted() for camera in evenly(cameras, args.limit)], source
+    chosen = evenly(cameras, args.limit)
+    return chosen if lenses else [camera.undistorted() for camera in chosen], source
 
 
 def _drawn_orbit(

@@ -31,7 +31,7 @@ from drgs.lab import conventions
 from drgs.lab.dumps import Dump, cotangents, one_line
 from drgs.lab.image_errors import error_line
 from drgs.lab.rasterizers import Rasterizer
-from drgs.lab.raw import COLORS, PARAMETERS, POSE, raw_of, with_colors, with_pose
+from drgs.lab.raw import COLORS, MOTIONS, PARAMETERS, raw_of, with_colors, with_pose
 from drgs.lab.reference_model import ReferenceModel
 from drgs.lab.rows import Crop, GroupRow, ViewRow
 from drgs.lab.verdicts import Case, Compared, compared, judge, with_errors
@@ -116,7 +116,7 @@ def crossval(
     Args:
         rasterizer: The rasterizer, as `drgs.lab.rasterizers.load_rasterizer` returns it.
         g: Gaussians of the scene.
-        cameras: Pinhole cameras of one image size.
+        cameras: Cameras of one image size; lenses are of presets along rays.
         preset: Preset that it claims to be, or `auto`: the one whose image needs least to be explained.
         fields: Settings that replace the preset's, `background` among them.
         tolerance: Relative L2 difference of gradients that agree; default 5e-4, and 5e-3 in float32.
@@ -125,7 +125,8 @@ def crossval(
         channels: Width of the plain colors whose gradient is compared, too; 0 for none.
         advance: Function that is called with each stage's name.
     Raises:
-        ValueError: If cameras differ in size, or the rasterizer's function fails.
+        ValueError: If cameras differ in size, have a lens that the preset does not draw, or the rasterizer's function
+            fails.
     Reference:
         The reference is `drgs.render` (float32, its errors in docs/numerics.md); for our own renderers it is the
         float64 oracle, on a crop of every view of a large scene (`crops`).
@@ -136,6 +137,15 @@ def crossval(
         raise ValueError("crossval: the scene must have Gaussians, got 0")
     presets = _presets(rasterizer, preset)
     starts = [ReferenceModel(RenderSettings.preset(name, **_legal(name, fields))) for name in presets]
+    through_lens = any(c.is_distorted or c.is_rolling for c in cameras)
+    if through_lens:
+        if all(start.settings.planar for start in starts):
+            raise ValueError(
+                f"crossval: cameras must be pinholes for preset {presets[0]}, a model of their image plane, got a lens "
+                "or a rolling shutter; use undistorted cameras, or a preset along rays (3dgut, exact, fast)"
+            )
+        drawable = [pair for pair in zip(presets, starts, strict=True) if not pair[1].settings.planar]
+        presets, starts = [name for name, _ in drawable], [start for _, start in drawable]
     background = starts[0].settings.background
     oracle = isinstance(rasterizer, Rasterizer) and rasterizer.preset is not None
     cameras = [c if c.name else dataclasses.replace(c, name=str(i)) for i, c in enumerate(cameras)]
@@ -146,7 +156,7 @@ def crossval(
         g, cameras, found_places = crops(g, cameras, starts[0].settings)
         places = [*found_places]
     dtype = getattr(rasterizer, "dtype", torch.float32)
-    raw = with_pose(raw_of(g))
+    raw = with_pose(raw_of(g), any(c.is_rolling for c in cameras))
     signs = cotangents(cameras, seed)
     say("images")
     if isinstance(rasterizer, Dump):
@@ -176,12 +186,22 @@ def crossval(
         return model.near_ties(raw, cameras[view])
 
     found = conventions.find(
-        pictures[first], starts, lambda m: drawn_by(m, first)[0], lambda m: ties_of(m, first), _SETTLED[dtype]
+        pictures[first],
+        starts,
+        lambda m: drawn_by(m, first)[0],
+        lambda m: ties_of(m, first),
+        _SETTLED[dtype],
+        lambda m: m.suits(cameras[first], len(g)),
     )
     model = found.model
     claimed = next(name for name, start in zip(presets, starts, strict=True) if start == found.start)
     drawn = [drawn_by(model, view) for view in range(len(cameras))]
     if not any(bool(alpha.any()) for _, alpha in drawn):
+        if any(bool(drawn_by(found.start, view)[1].any()) for view in range(len(cameras))):
+            raise ValueError(
+                f"{rasterizer.name}: its image must show Gaussians, shows the background alone where preset {claimed} "
+                "shows some; correct the rasterizer"
+            )
         raise ValueError("crossval: the cameras must show Gaussians, none of them shows any; choose others")
     case = Case(rasterizer, raw, cameras, background, oracle, tolerance or _TOLERANCE[dtype], entries, first, say)
     comparison = compared(case, model, signs, pictures, alphas, drawn, functools.partial(ties_of, model))
@@ -192,7 +212,7 @@ def crossval(
         models |= {f"preset {claimed}": found.start}  # and what else may be meant
         models |= {f"preset {name}": start for name, start in zip(presets, starts, strict=True)}
         comparison.views = with_errors(comparison, pictures, models, drawn_by)
-    not_offered = {} if POSE in comparison.groups else {POSE: "its image has no gradient of them"}
+    not_offered = {k: "its image has no gradient of them" for k in MOTIONS if k in raw and k not in comparison.groups}
     if channels:
         wide, reason = _wide_gradients(case, model, comparison, channels, seed, functools.partial(ties_of, model))
         comparison.groups |= wide
@@ -379,7 +399,7 @@ def _wide_gradients(
         (0.0, 0.0, 0.0),
     ):
         return {}, "what it does to colors is a convention of three channels"
-    fixed = {name: x for name, x in case.raw.items() if name != POSE}
+    fixed = {name: x for name, x in case.raw.items() if name not in MOTIONS}
     raw = with_colors(fixed, channels, seed)
     black = (0.0,) * channels
     u = cotangents([camera], seed, channels)

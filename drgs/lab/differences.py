@@ -14,7 +14,7 @@ import torch
 
 from drgs.cameras import Camera
 from drgs.lab.rasterizers import Rasterizer
-from drgs.lab.raw import POSE
+from drgs.lab.raw import MOTIONS
 from drgs.oracle import float64
 
 __all__ = ["Differences", "central"]
@@ -131,7 +131,7 @@ def _slopes(
 
 def _unit(raw: dict, camera: Camera, group: str, index: int) -> float:
     """The change of a parameter that changes its Gaussian's part of the image by about its own size."""
-    if group not in ("means", "quats", POSE):
+    if group not in ("means", "quats", *MOTIONS):
         return 1.0
     # A step is a number: it scales what is measured and is differentiated by nothing.
     w2c = float64(camera.w2c).detach()
@@ -139,7 +139,7 @@ def _unit(raw: dict, camera: Camera, group: str, index: int) -> float:
     depths = raw["means"] @ w2c[2, :3] + w2c[2, 3]
     # Nothing in the image is thinner than this.
     thin = scales.amin(1).maximum(0.3 * depths.abs() / float(camera.K[0][0]))
-    if group == POSE:  # an angle, or a part of the depth: all Gaussians move by as much as one of them is thin
+    if group in MOTIONS:  # an angle, or a part of the depth: all Gaussians move by as much as one of them is thin
         ahead = depths > 0
         return float((thin / depths)[ahead].median()) if bool(ahead.any()) else 1.0
     i = index // raw[group].shape[1]

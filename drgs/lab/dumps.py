@@ -78,7 +78,14 @@ def export(path: Path, g: Gaussians, cameras: list[Camera], background: tuple, s
 
     Arrays: `means` (N,3), `quats` (N,4), `log_scales` (N,3), `logit_opacities` (N,), `sh` (N,K,3), `viewmat` (C,4,4),
     `K` (C,3,3), `width`, `height`, `background` (3,), `cotangent` (C,H,W,3).
+
+    Raises:
+        ValueError: If a camera has a lens or a rolling shutter.
     """
+    if any(camera.is_distorted or camera.is_rolling for camera in cameras):
+        raise ValueError(
+            "crossval: cameras that are exported must be pinholes, got a lens or a rolling shutter; undistort them"
+        )
     arrays = scene_arrays(g, cameras, background)
     arrays["cotangent"] = cotangents(cameras, seed).float().numpy()
     arrays[_EXPORT] = _signature(arrays)

@@ -190,13 +190,17 @@ def _asides(made: Pictures, start: RenderSettings, end: RenderSettings) -> list[
     """Steps outside of the ladder, over all pixels, relative to `exact` and to the ladder's total.
 
     The gradient of the start without the direction's path (training code often detaches the direction that SH are
-    evaluated in: the image stays), SH along rays instead of towards means, and the response, both from `exact`.
+    evaluated in: the image stays), SH along rays instead of towards means, and the response, both from `exact`. From a
+    projected start also the step to preset `3dgut`, which evaluates the same Gaussians along rays and in the order of
+    their centers: how far on the way that is.
     """
     first, exact = made.full(start), made.full(end)
     total = exact - first
     steps = {}
     if made.gradients and start.sh_direction == "gaussian" and made.g.sh.shape[1] > 1:
         steps["view direction detached"] = made.full(start, True) - first
+    if start.planar:
+        steps["3dgut"] = made.full(RenderSettings.preset("3dgut", background=start.background)) - first
     if made.g.sh.shape[1] > 1:
         steps["SH along rays"] = made.full(end.replace(sh_direction="ray")) - exact
     steps["response"] = made.full(end.replace(response="integral")) - exact

@@ -1,6 +1,6 @@
 """Rasterizers to be compared: ours, gsplat, any torch function with gsplat's arguments, or what one wrote to a file.
 
-Each is given raw parameters (drgs.ellipsoids) and a pinhole camera and returns an image that torch can differentiate;
+Each is given raw parameters (drgs.ellipsoids) and a camera and returns an image that torch can differentiate;
 activations (exp, sigmoid) are applied here, so that derivatives arrive at the raw parameters, and the camera is moved
 here (raw.posed), so that they arrive at its motion. A dump has an image and gradients only: it cannot be asked again.
 """
@@ -8,9 +8,11 @@ here (raw.posed), so that they arrive at its motion. A dump has an image and gra
 from __future__ import annotations
 
 import dataclasses
+import enum
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +22,7 @@ from drgs.ellipsoids import Gaussians, sh_degree_of
 from drgs.guards.imports import imported_function
 from drgs.integrator import render
 from drgs.lab.dumps import SUFFIXES, Dump, one_line, read_dump
-from drgs.lab.raw import COLORS, POSE, gaussians_of, image_of, posed
+from drgs.lab.raw import COLORS, MOTIONS, gaussians_of, image_of, posed
 from drgs.oracle import float64
 from drgs.settings import PRESETS, RenderSettings
 
@@ -68,11 +70,12 @@ class Rasterizer:
             loss = (image * cotangent.to(image)).sum()
             found = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
         except Exception:
-            if POSE not in raw:
+            moving = [name for name in MOTIONS if name in raw]
+            if not moving:
                 raise
             # It may make an array of the pose, or refuse one that wants a gradient: the others are asked for alone.
-            fixed = {name: x for name, x in raw.items() if name != POSE}
-            return {**self.gradient(fixed, camera, background, cotangent), POSE: None}
+            fixed = {name: x for name, x in raw.items() if name not in MOTIONS}
+            return {**self.gradient(fixed, camera, background, cotangent), **dict.fromkeys(moving)}
         # Gradients are numbers from here on; a function may have asked for a graph of them.
         return {name: None if x is None else x.detach().double().cpu() for name, x in zip(leaves, found, strict=True)}
 
@@ -83,7 +86,11 @@ class Rasterizer:
 
 
 def load_rasterizer(
-    text: str, g: Gaussians | None = None, cameras: list[Camera] | None = None, fields: dict | None = None
+    text: str,
+    g: Gaussians | None = None,
+    cameras: list[Camera] | None = None,
+    fields: dict | None = None,
+    along_rays: bool = False,
 ) -> Rasterizer | Dump:
     """A rasterizer by its name.
 
@@ -96,6 +103,8 @@ def load_rasterizer(
         g: Scene that a dump must be of.
         cameras: Views that a dump must be of.
         fields: Settings that hold whatever the preset is: ours are drawn with them, a dump is of their background.
+        along_rays: Whether a function is asked for Gaussians along rays (`with_ut`, `with_eval3d`), as it always is
+            for a lens or a rolling shutter.
     Returns:
         A `Rasterizer` or a `Dump`.
     Raises:
@@ -117,9 +126,9 @@ def load_rasterizer(
             raise ValueError("--rasterizer gsplat: must be installed, is not; run pip install gsplat") from None
         if not torch.cuda.is_available():
             raise ValueError("--rasterizer gsplat: must have a CUDA card, torch finds none; use a dump made on one")
-        return function(rasterization, text)
+        return function(rasterization, text, along_rays)
     found = imported_function("--rasterizer", text, "drgs:PRESET, gsplat, a file .npz or .safetensors, or ")
-    return function(found, text)
+    return function(found, text, along_rays)
 
 
 def ours(settings: RenderSettings, name: str, preset: str | None = None) -> Rasterizer:
@@ -133,8 +142,14 @@ def ours(settings: RenderSettings, name: str, preset: str | None = None) -> Rast
     return Rasterizer(name, draw, torch.float64, "cpu", preset)
 
 
-def function(call: Callable, name: str) -> Rasterizer:
-    """A function with gsplat's argument names, in float64 if it takes that, on a card if there is one and it asks."""
+def function(call: Callable, name: str, along_rays: bool = False) -> Rasterizer:
+    """A function with gsplat's argument names, in float64 if it takes that, on a card if there is one and it asks.
+
+    Args:
+        call: The function.
+        name: Its name in messages.
+        along_rays: Whether it is asked for Gaussians along rays, as `load_rasterizer` says.
+    """
     accepted = inspect.signature(call).parameters
     open_ended = any(p.kind is p.VAR_KEYWORD for p in accepted.values())
 
@@ -157,7 +172,15 @@ def function(call: Callable, name: str) -> Rasterizer:
         options = {"backgrounds": torch.tensor([background], **like), "packed": False}
         if COLORS not in raw:
             options["sh_degree"] = sh_degree_of(raw["sh"].shape[1])
-        given = {k: v for k, v in options.items() if open_ended or k in accepted}
+        lens = _lens_arguments(camera, like, accepted)
+        if lens or along_rays:
+            options |= {"with_ut": True, "with_eval3d": True}
+        if missing := [] if open_ended else [k for k in lens if k not in accepted]:
+            raise ValueError(
+                f"--rasterizer {name}: must take {missing[0]} for a camera of model {camera.model!r}, does not; "
+                "compare it on undistorted cameras"
+            )
+        given = {k: v for k, v in options.items() if open_ended or k in accepted} | lens
         try:
             returned = call(**arguments, **given)
         except Exception as error:
@@ -168,6 +191,29 @@ def function(call: Callable, name: str) -> Rasterizer:
         return image, alpha
 
     return Rasterizer(name, draw, *_taste(draw))
+
+
+def _lens_arguments(camera: Camera, like: dict, accepted: Mapping[str, inspect.Parameter]) -> dict:
+    """A camera's lens and shutter as gsplat's arguments; none of a pinhole that stands still."""
+    found: dict[str, Any] = {}
+    if camera.model == "opencv_fisheye":
+        found |= {"camera_model": "fisheye", "radial_coeffs": torch.tensor([camera.distortion], **like)}
+    elif camera.is_distorted:
+        k1, k2, p1, p2, *rest = camera.distortion
+        rest = [*rest, *[0.0] * (8 - len(rest))]  # k3 to k6, and a thin prism's s1 to s4
+        found |= {
+            "camera_model": "pinhole",
+            "radial_coeffs": torch.tensor([[k1, k2, *rest[:4]]], **like),
+            "tangential_coeffs": torch.tensor([[p1, p2]], **like),
+        }
+        if any(rest[4:]):
+            found["thin_prism_coeffs"] = torch.tensor([rest[4:]], **like)
+    if camera.is_rolling:
+        # gsplat's is a member of an enumeration, whose type its default has.
+        kinds = type(accepted["rolling_shutter"].default) if "rolling_shutter" in accepted else str
+        kind = kinds[camera.shutter.upper()] if issubclass(kinds, enum.Enum) else camera.shutter
+        found |= {"rolling_shutter": kind, "viewmats_rs": float64(camera.w2c_end).to(**like)[None]}
+    return found
 
 
 def _taste(draw: Callable) -> tuple[torch.dtype, str]:

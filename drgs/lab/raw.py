@@ -16,6 +16,8 @@ from drgs.splats import color_of
 __all__ = [
     "COLORS",
     "POSE",
+    "MOTIONS",
+    "POSE_END",
     "PARAMETERS",
     "depth_of",
     "gaussians_of",
@@ -28,6 +30,8 @@ __all__ = [
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh")  # raw, as crossval and the ladder compare them
 POSE = "viewmats"  # (6,) of one view, 0: see `posed`
+POSE_END = "viewmats_rs"  # (6,) of the pose at the end of a rolling shutter, likewise
+MOTIONS = (POSE, POSE_END)
 COLORS = "colors"  # (N, D) in place of `sh`
 
 
@@ -39,9 +43,9 @@ def raw_of(g: Gaussians) -> dict[str, torch.Tensor]:
     return raw
 
 
-def with_pose(raw: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Raw parameters together with the motion of a view, which is none."""
-    return {**raw, POSE: torch.zeros(6, dtype=torch.float64)}
+def with_pose(raw: dict[str, torch.Tensor], shutter: bool = False) -> dict[str, torch.Tensor]:
+    """Raw parameters together with the motion of a view, or of both of its poses if it has two, which is none."""
+    return {**raw, **{name: torch.zeros(6, dtype=torch.float64) for name in MOTIONS[: 1 + shutter]}}
 
 
 def with_colors(raw: dict[str, torch.Tensor], channels: int, seed: int) -> dict[str, torch.Tensor]:
@@ -55,13 +59,19 @@ def posed(raw: dict[str, torch.Tensor], camera: Camera) -> Camera:
     """The camera moved by raw["viewmats"] if that is there: w2c <- exp(xi) w2c, in the camera's own axes.
 
     xi is a rotation about the camera's center in radians, then a translation in units of the Gaussians' median depth:
-    so both change the image by as much, and neither part of a gradient hides the other.
+    so both change the image by as much, and neither part of a gradient hides the other. raw["viewmats_rs"] moves the
+    pose at the end of a rolling shutter in the same way.
     """
-    if POSE not in raw:
-        return camera
+    fields = {"w2c": POSE, "w2c_end": POSE_END}
+    moved = {field: _moved(raw, camera, field, raw[name]) for field, name in fields.items() if name in raw}
+    return dataclasses.replace(camera, **moved) if moved else camera
+
+
+def _moved(raw: dict[str, torch.Tensor], camera: Camera, field: str, twist: torch.Tensor) -> torch.Tensor:
+    """(4, 4) a pose of a camera moved by a twist (6,)."""
     # The motion is the parameter, not the matrix: a camera whose pose is a leaf gets no gradient here.
-    w2c = float64(camera.w2c).detach()
-    twist = float64(raw[POSE])
+    w2c = float64(getattr(camera, field)).detach()
+    twist = float64(twist)
     turn = twist[:3]
     shift = twist[3:] * depth_of(raw, camera)
     zero = torch.zeros_like(turn[0])
@@ -71,7 +81,7 @@ def posed(raw: dict[str, torch.Tensor], camera: Camera) -> Camera:
         -turn[1], turn[0], zero, shift[2],
         zero, zero, zero, zero,
     ]  # fmt: skip
-    return dataclasses.replace(camera, w2c=torch.matrix_exp(torch.stack(rows).reshape(4, 4)) @ w2c)
+    return torch.matrix_exp(torch.stack(rows).reshape(4, 4)) @ w2c
 
 
 def depth_of(raw: dict[str, torch.Tensor], camera: Camera) -> float:
@@ -86,7 +96,7 @@ def depth_of(raw: dict[str, torch.Tensor], camera: Camera) -> float:
 
 def gaussians_of(raw: dict[str, torch.Tensor]) -> tuple[Gaussians, float]:
     """Gaussians with SH, or with colors of any width, and what was added to the first three channels of those."""
-    fields = {name: x for name, x in raw.items() if name not in (POSE, COLORS)}
+    fields = {name: x for name, x in raw.items() if name not in (*MOTIONS, COLORS)}
     if COLORS not in raw:
         return Gaussians(**fields), 0.0
     sh, features, shift = color_of(raw[COLORS])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,13 +19,24 @@ from drgs.cameras import Camera, rigid
 from drgs.ellipsoids import Y_00
 from drgs.integrator import render
 from drgs.lab.raw import COLORS, gaussians_of, image_of, posed
-from drgs.oracle import activate, float64, screen_rows
+from drgs.oracle import activate, float64, rolling_poses, screen_rows
 from drgs.settings import RenderSettings
 
-__all__ = ["ORDERS", "ReferenceModel"]
+__all__ = ["BETWEEN", "DISTORTIONS", "ORDERS", "ReferenceModel"]
 
 ORDERS = ("rgb", "bgr", "rbg", "grb", "gbr", "brg")
+BETWEEN = "to the mean, from between both poses"  # as gsplat has it
+# What may be made of OpenCV's (k1, k2, p1, p2, k3, ...): name -> the coefficients that it amounts to.
+DISTORTIONS = {
+    "as given": lambda k1, k2, p1, p2, *rest: (k1, k2, p1, p2, *rest),
+    "ignored": lambda *given: (0.0,) * len(given),
+    "tangential terms negated": lambda k1, k2, p1, p2, *rest: (k1, k2, -p1, -p2, *rest),
+    "tangential terms swapped": lambda k1, k2, p1, p2, *rest: (k1, k2, p2, p1, *rest),
+    "no tangential terms": lambda k1, k2, p1, p2, *rest: (k1, k2, 0.0, 0.0, *rest),
+    "in the order k1, k2, k3, p1, p2": lambda k1, k2, p1, p2, *rest: (k1, k2, *_later(p1, p2, *rest)),
+}
 _WINDOW = 16  # pixels a side
+_ODD_PAIRS = 4_000_000  # (pixel, Gaussian) pairs of a view that are drawn densely where our renderer lacks a convention
 _NEAR = 2e-6  # share of the distance: some ten times what float32 loses where it computes a depth
 _EFFECT = 1e-5  # part of a weight: what moves less moves no gradient by what counts
 _COMPENSATION_FLOOR = 0.005**2  # smallest ratio of determinants
@@ -43,7 +55,9 @@ class ReferenceModel:
         compensation: `none`, or opacities times sqrt(det / det after dilation) as in anti-aliased modes: `full`, or `at
             least 0.005`.
         direction: Direction that SH are evaluated in: `to the mean`, `to the camera` (the opposite), or `camera frame`
-            (to the mean, in camera axes). Along each pixel's ray is `settings.sh_direction`.
+            (to the mean, in camera axes). Along each pixel's ray is `settings.sh_direction`. Of a rolling shutter it
+            starts at the center of the pose in the middle of the exposure, or at the point between the centers of both
+            poses (`BETWEEN`).
         direction_gradient: Whether the mean gets a gradient through that direction.
         sh_degree: Largest SH degree that counts; bands above it are left out.
         sh_sign: Coefficients whose sign is turned: `none`, `odd m` (a basis without the factor (-1)^m), or a band.
@@ -53,6 +67,11 @@ class ReferenceModel:
         pixel_center: Coordinates of the center of column 0 and row 0, in pixels.
         flip: How the image is mirrored: `none`, `vertical`, `horizontal`.
         pose: How the camera matrix is read, `w2c` or `c2w`.
+        ray_direction: The direction of a ray in a Gaussian's own frame: `normalized`, or `not normalized`, where
+            rho^2 = |d' x o'|^2 is not divided by |d'|^2.
+        peaks: Whether peaks of Gaussians count `in front` of the ray's origin only, or `everywhere`.
+        distortion: What is made of the coefficients of a lens: `as given`, or one of the others of `DISTORTIONS`.
+        shutter: Direction of a rolling shutter: `as given`, or one of `drgs.shutters.SHUTTERS`.
     """
 
     settings: RenderSettings
@@ -70,6 +89,38 @@ class ReferenceModel:
     pixel_center: tuple[float, float] = (0.5, 0.5)
     flip: str = "none"
     pose: str = "w2c"
+    ray_direction: str = "normalized"
+    peaks: str = "in front"
+    distortion: str = "as given"
+    shutter: str = "as given"
+
+    def suits(self, camera: Camera, count: int) -> bool:
+        """Whether a view of so many Gaussians can be drawn of this model, and needs each of its conventions.
+
+        False where a simpler model draws the same: a lens is of cameras that have one, a shutter of those that move,
+        and where a ray meets a Gaussian of rays.
+        """
+        if self.settings.planar and (camera.is_distorted or camera.is_rolling):
+            return False
+        if self.distortion != "as given" and not self._reads(camera):
+            return False
+        if self.direction == BETWEEN and not camera.is_rolling:
+            return False
+        if self.shutter != "as given" and (not camera.is_rolling or self.shutter == camera.shutter):
+            return False
+        pairs = camera.width * camera.height * count
+        return not self._is_odd or (self.settings.response == "peak" and pairs <= _ODD_PAIRS)
+
+    @property
+    def _is_odd(self) -> bool:
+        """Whether a ray meets Gaussians as in none of our renderers: the oracle draws that, every pair of a view."""
+        return (self.ray_direction, self.peaks) != ("normalized", "in front")
+
+    def _reads(self, camera: Camera) -> bool:
+        """Whether the coefficients of this lens mean something else in this model."""
+        if camera.model == "opencv_fisheye":  # which has no tangential terms
+            return self.distortion in ("as given", "ignored") and any(camera.distortion)
+        return camera.is_distorted and _distorted(self.distortion, camera.distortion) != tuple(camera.distortion)
 
     def draw(self, raw: dict, camera: Camera, oracle: bool = False) -> tuple[torch.Tensor, torch.Tensor]:
         """Image (H, W, 3) and alpha (H, W), differentiable by torch with respect to the raw parameters.
@@ -77,7 +128,7 @@ class ReferenceModel:
         Args:
             raw: Raw parameters by group, float64, and maybe a motion of the camera, `viewmats`. With `colors` (N, D)
                 instead of `sh` the image has D channels, on black.
-            camera: Pinhole camera.
+            camera: Camera, with a lens where the response is along rays.
             oracle: Whether the float64 oracle draws instead of the renderer.
         """
         rows: dict[int, list] = {}
@@ -111,10 +162,17 @@ class ReferenceModel:
         found = torch.zeros(camera.height, camera.width, dtype=torch.bool)
         with torch.no_grad():  # marks of pixels have no derivative
             g, _ = gaussians_of(self._parameters(raw, camera))
-            for x, y, width, height in _windows(camera):
-                window = (x, y, width, height)
+            for x, y, width, height in _windows(camera, self._is_odd):
+                window = None if self._is_odd else (x, y, width, height)
                 out = reference.render(
-                    g, camera, self.settings, tolerance=_NEAR, window=window, exact_ties=True, effect=_EFFECT
+                    g,
+                    camera,
+                    self.settings,
+                    tolerance=_NEAR,
+                    window=window,
+                    exact_ties=True,
+                    effect=_EFFECT,
+                    **self._odd_ones(),
                 )
                 found[y : y + height, x : x + width] = out.ambiguous
         return self._flipped(found)
@@ -124,6 +182,10 @@ class ReferenceModel:
         camera = self._camera(posed(raw, camera))
         g, shift = gaussians_of(self._parameters(raw, camera))
         settings = self.settings.replace(background=(0.0, 0.0, 0.0)) if COLORS in raw else self.settings
+        if self._is_odd:
+            out = reference.render(g, camera, settings, **self._odd_ones())
+            yield ((0, 0), *self._developed(image_of(out, raw, shift), out.alpha))
+            return
         if not oracle:
             out = render(g, camera, settings, outputs=())
             yield ((0, 0), *self._developed(image_of(out, raw, shift), out.alpha))
@@ -131,6 +193,13 @@ class ReferenceModel:
         for x, y, width, height in _windows(camera):
             out = reference.render(g, camera, settings, window=(x, y, width, height))
             yield ((y, x), *self._developed(image_of(out, raw, shift), out.alpha))
+
+    def _odd_ones(self) -> dict[str, bool]:
+        """Arguments of the oracle for what our renderer does not have."""
+        return {
+            "plain_directions": self.ray_direction != "normalized",
+            "peaks_behind": self.peaks != "in front",
+        }
 
     def _developed(self, image: torch.Tensor, alpha: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Image and alpha, float64, with this model's channels and transfer function."""
@@ -158,10 +227,17 @@ class ReferenceModel:
         """What this model reads of a camera; a torch pose keeps its graph."""
         K = np.array(camera.K, float)
         K[:2, 2] += 0.5 - np.asarray(self.pixel_center)
-        w2c = camera.w2c
+        poses = {"w2c": camera.w2c, **({"w2c_end": camera.w2c_end} if camera.is_rolling else {})}
         if self.pose == "c2w":
-            w2c = torch.linalg.inv(w2c) if isinstance(w2c, torch.Tensor) else np.linalg.inv(w2c)
-        return dataclasses.replace(camera, K=K, w2c=w2c)
+            poses = {k: (torch if isinstance(x, torch.Tensor) else np).linalg.inv(x) for k, x in poses.items()}
+        fields: dict[str, Any] = {"K": K, **poses}
+        if self.distortion != "as given":
+            fields["distortion"] = _distorted(self.distortion, camera.distortion)
+        if self.shutter != "as given":
+            fields["shutter"] = self.shutter
+            if self.shutter == "global":
+                fields["w2c_end"] = None
+        return dataclasses.replace(camera, **fields)
 
     def _parameters(self, raw: dict, camera: Camera) -> dict:
         """The raw parameters that have this model's meaning in ours."""
@@ -198,9 +274,7 @@ class ReferenceModel:
             sh = sh * factor[:, None]
         if (self.direction == "to the mean" and self.direction_gradient) or sh.shape[1] == 1:
             return sh
-        w2c = float64(camera.w2c)
-        rotation, translation = rigid(w2c)
-        towards = raw["means"] + rotation.T @ translation
+        towards = raw["means"] - _eye(camera, self.direction == BETWEEN)
         # What is known as a detached direction is so for the mean and the camera.
         towards = towards if self.direction_gradient else towards.detach()
         # A mean at the camera has no direction: 0 instead of NaN.
@@ -208,16 +282,43 @@ class ReferenceModel:
         if self.direction == "to the camera":
             towards = -towards
         elif self.direction == "camera frame":
-            towards = towards @ w2c[:3, :3].T
+            towards = towards @ float64(camera.w2c)[:3, :3].T
         color = 0.5 + (reference.sh_basis(towards, sh.shape[1])[..., None] * sh).sum(1)
         return ((color - 0.5) / Y_00)[:, None]  # the renderer clamps at 0 as ever
 
 
-def _windows(camera: Camera) -> Iterator[tuple[int, int, int, int]]:
+def _later(k3: float, p1: float, p2: float = 0.0, *rest: float) -> tuple[float, ...]:
+    """The coefficients behind k2 in OpenCV's order, of those that come as k3, p1, p2."""
+    return (p1, p2, k3, *rest)
+
+
+def _distorted(how: str, given: tuple[float, ...]) -> tuple[float, ...]:
+    """The coefficients of a lens as OpenCV reads them, of what a model makes of the given ones."""
+    if how == "as given" or not given:
+        return tuple(given)
+    return DISTORTIONS[how](*given)
+
+
+def _windows(camera: Camera, whole: bool = False) -> Iterator[tuple[int, int, int, int]]:
     """(x, y, width, height) of squares that cover the image: the oracle takes of each the Gaussians that it can see."""
+    if whole:
+        yield 0, 0, camera.width, camera.height
+        return
     for y in range(0, camera.height, _WINDOW):
         for x in range(0, camera.width, _WINDOW):
             yield x, y, min(_WINDOW, camera.width - x), min(_WINDOW, camera.height - y)
+
+
+def _eye(camera: Camera, between: bool) -> torch.Tensor:
+    """(3,) the point that colors are seen from, float64: the camera's center, of a rolling shutter that of the pose in
+    the middle of the exposure, or the point between the centers of both poses.
+    """
+    if camera.is_rolling and not between:
+        turns, shifts = rolling_poses(camera)
+        return -turns[-1].T @ shifts[-1]
+    ends = [camera.w2c, camera.w2c_end] if camera.is_rolling else [camera.w2c]
+    centers = [-rotation.T @ translation for rotation, translation in (rigid(float64(w2c)) for w2c in ends)]
+    return torch.stack(centers).mean(0)
 
 
 def _compensation(raw: dict, camera: Camera, s: RenderSettings, floor: float) -> torch.Tensor:
