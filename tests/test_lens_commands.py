@@ -155,7 +155,7 @@ def test_eval_looks_through_the_lens(place):
 
 
 def test_what_belongs_to_a_photograph_lines_up(tmp_path):
-    """Masks, labels, depths and a teacher's maps are those of the files, pixel by pixel; undistorted, all move alike."""
+    """Masks, labels, depths and a teacher's maps are those of the files, pixel by pixel; undistorted all move alike."""
     size = (60, 40)
     rng = np.random.default_rng(3)
     blocks = np.kron(rng.integers(1, 5, (8, 12)), np.ones((5, 5))).astype(np.uint8)
