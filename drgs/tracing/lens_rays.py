@@ -26,16 +26,17 @@ import drjit as dr
 import numpy as np
 
 from drgs.cameras import Camera
+from drgs.lenses import LENS_MODELS, Guide
 from drgs.tracing import records as layout
 from drgs.tracing.arrays import Float, Int32, Lib, Mask, UInt32
 from drgs.tracing.pose import local_rays
 from drgs.tracing.primitives import Patch, Ray
 
 __all__ = [
-    "FISHEYE",
     "NARROW",
     "LensRays",
     "equidistant",
+    "guides_of",
     "lens_of",
     "on_plane",
     "on_side",
@@ -43,8 +44,6 @@ __all__ = [
     "tile_boxes",
 ]
 
-FISHEYE = ("opencv_fisheye",)
-"""Models whose guides are those of the equidistant fisheye; those of others are pixels of the pinhole camera."""
 NARROW = 0.17  # least d_z of a narrow lens: 80 degrees
 _CELL = 4  # pixels, about, of the least cells of a table of displacements
 _MOST_CELLS = 1024  # in a row of it
@@ -82,7 +81,7 @@ class LensRays:
         camera: Its pose plays no role.
         tile: Pixels of a tile in a row.
     Attributes:
-        fisheye: Guides are those of the equidistant fisheye.
+        guide: What guides are of: pixels of the pinhole camera, the equidistant fisheye, or longitude and latitude.
         wide: Rays are directions, not pixels of a pinhole camera.
         low, high: (2,) least and largest such pixel, of narrow lenses.
         known: (P,) 0 where OpenCV finds no ray for a pixel, but what is no number; None where there is none of these.
@@ -94,7 +93,7 @@ class LensRays:
 
     def __init__(self, lib: Lib, camera: Camera, tile: int) -> None:
         self.lib = lib
-        self.fisheye = camera.model in FISHEYE
+        self.guide: Guide = LENS_MODELS[camera.model].guide
         self.tiles = -(-camera.width // tile)
         d = local_rays(camera)
         known = np.isfinite(d).all(1)
@@ -113,7 +112,7 @@ class LensRays:
         self.columns = [dr.select(dr.isfinite(x), x, 0) for x in self.columns]
         boxes = tile_boxes(values.reshape(camera.height, camera.width, -1), tile, not self.wide)
         self.boxes = [lib.Float(np.ascontiguousarray(x)) for x in boxes.T]
-        self.set_displacements(camera, pixels_of(K, equidistant(d) if self.fisheye else on_plane(d)))
+        self.set_displacements(camera, guides_of(self.guide, K, d))
         dr.make_opaque(*self.columns, *self.boxes)
         arrays = [*self.columns, *self.boxes, self.cells]
         self.size = 4 * sum(dr.width(x) for x in arrays)
@@ -232,6 +231,16 @@ def _length(pinhole: list[Float], x: Float, y: Float) -> Float:
     v = (y - cy) / fy
     u = (x - cx - skew * v) / fx
     return dr.sqrt(dr.fma(u, u, dr.fma(v, v, 1)))
+
+
+def guides_of(guide: Guide, K: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """(P, 2) guides of directions (P, 3) in camera axes, in pixels."""
+    return pixels_of(K, {"plane": on_plane, "fisheye": equidistant, "panorama": _panorama}[guide](d))
+
+
+def _panorama(d: np.ndarray) -> np.ndarray:
+    """(P, 2) longitude and latitude of directions, in radians."""
+    return LENS_MODELS["equirectangular"].project(d, ())
 
 
 def on_plane(d: np.ndarray) -> np.ndarray:
