@@ -9,10 +9,10 @@ Conventions, stated once for the whole project:
   fy, cy) by s exactly. OpenCV functions that resample images count pixel centers at integers, so they get
   `cx - 0.5, cy - 0.5`; functions on points need no shift.
 - Lens models are those of lenses.py. Distortion is OpenCV's: model `opencv` with (k1, k2, p1, p2[, k3[, k4, k5, k6[,
-  s1, s2, s3, s4]]]), model `opencv_fisheye` with (k1, k2, k3, k4) on the angle; `pinhole` has none. `ftheta` has
-  (k1, ..., k5, c, d, e), as NVIDIA's: r = k1 a + ... + k5 a^5 of the angle a to the axis, in the direction of (x, y), times
-  [[c, d], [e, 1]], then K. `equirectangular` has none: K takes (longitude, latitude), in radians, to pixels, so that
-  fx = width / (2 pi), fy = height / pi and a principal point in the middle make a panorama of 360 degrees.
+  s1, s2, s3, s4]]]), model `opencv_fisheye` with (k1, k2, k3, k4) on the angle; `pinhole` has none. `ftheta`, which is
+  NVIDIA's, has (k1, ..., k5, c, d, e): r = k1 a + ... + k5 a^5 of the angle a to the axis, in the direction of (x, y),
+  times [[c, d], [e, 1]], then K. `equirectangular` has none: K takes (longitude, latitude), in radians, to pixels, so
+  that fx = width / (2 pi), fy = height / pi and a principal point in the middle make a panorama of 360 degrees.
 - Other frames are converted at the border by the functions here: OpenGL / Blender / Nerfstudio cameras (+x right, +y
   up, looking along -z), LLFF `poses_bounds` columns (down, right, backward) and Mitsuba cameras (+x left, +y up,
   looking along +z). World axes never change, only the camera's.
