@@ -27,6 +27,7 @@ __all__ = [
     "undistort_opencv",
 ]
 
+_CONVERGED = 1e-14  # radians; the next step of Newton's is far below the rounding of float64
 Guide = Literal["plane", "fisheye", "panorama"]
 """Where the silhouette of an ellipsoid is bounded (drgs/tracing/silhouettes.py): on the plane z = 1, under the
 equidistant fisheye, or in longitude and latitude."""
@@ -158,7 +159,11 @@ def _radial_unproject(plane: np.ndarray, distortion: tuple[float, ...], polynomi
     for _ in range(30):
         value, slope = polynomial(angle, distortion)
         # Where the lens turns back the slope is 0: a step that the clip ends stands for an infinite one.
-        angle = np.clip(angle - (value - radius) / np.where(np.abs(slope) > 1e-6, slope, 1e-6), 0.0, np.pi)
+        moved = np.clip(angle - (value - radius) / np.where(np.abs(slope) > 1e-6, slope, 1e-6), 0.0, np.pi)
+        is_there = np.abs(moved - angle).max(initial=0.0) < _CONVERGED
+        angle = moved
+        if is_there:
+            break
     factor = np.sin(angle) / np.where(radius > 0, radius, 1.0)
     return np.concatenate([plane * factor[:, None], np.cos(angle)[:, None]], axis=1)
 
