@@ -39,12 +39,12 @@ class LensModel:
 
     Attributes:
         lengths: Numbers of coefficients that it takes.
-        guide: Where silhouettes are bounded: under a map that is near the model's own.
+        guide: The map under which silhouettes are bounded, which is near the model's own.
         project: (P,3) directions, of any length, and coefficients -> (P,2) points of its plane, or NaN.
         unproject: (P,2) points of its plane and coefficients -> (P,3) unit directions; the caller checks them by
             projecting.
-        radial: Of a radial model, angle to the axis and coefficients -> distance in its plane and its derivative; of
-            arrays, or of tensors.
+        radial: Angle to the axis and coefficients -> distance in its plane and its derivative, of arrays or of tensors;
+            None of a model that is not radial.
     """
 
     lengths: tuple[int, ...]

@@ -11,7 +11,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 from drgs.commands.orbit_keys import ORBIT_KEYS
 from drgs.commands.overrides import parsed
 from drgs.commands.record_options import CAMERAS_TEXT, CARRIED, HIDDEN, options_of
-from drgs.fitting.config import SelectionConfig
+from drgs.fitting.config import SelectionConfig, UndistortUse
 from drgs.guards.records import texts_of
 from drgs.information.nuisances import Nuisances
 from drgs.information.prior import Prior
@@ -116,8 +116,8 @@ class Views(Timed):
 class Lenses:
     """Options of commands that can look through lenses."""
 
-    undistort: Literal["on", "off"] | None = None
-    """Take lenses out of cameras (on), or look through them, with presets along rays (off); default as the run."""
+    undistort: UndistortUse = "auto"
+    """Take lenses out of cameras (on), look through them, with presets along rays (off), or as the run did (auto)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

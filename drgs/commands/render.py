@@ -70,7 +70,7 @@ def run(args: Render) -> None:
     cameras, source = drawn_views(args, views, given, args.frames, size, returns=True)
     cameras = at_times(named_view(cameras, args.view, source)[: args.limit], args.time, args.frames, given)
     cameras = [_resized(camera, args.width, args.height) for camera in cameras]
-    follows = args.undistort is None and settings.traversal == "bvh"
+    follows = args.undistort == "auto" and settings.traversal == "bvh"
     bent = sum(camera.is_distorted for camera in cameras)
     if bent and not (follows or given.keeps_lenses(args.undistort)):
         cameras = [camera.undistorted() for camera in cameras]

@@ -99,9 +99,9 @@ class SceneInput:
 
         return None if self.decoder is None else SemanticMetric(self.decoder.metric())
 
-    def keeps_lenses(self, asked: str | None) -> bool:
+    def keeps_lenses(self, asked: str = "auto") -> bool:
         """Whether cameras keep their lenses: what --undistort says, else as the run was fitted, else not."""
-        if asked is None and self.record is not None:
+        if asked == "auto" and self.record is not None:
             asked = self.record.config.data.undistort
         return asked == "off"
 

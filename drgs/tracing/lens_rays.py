@@ -121,10 +121,10 @@ class LensRays:
         """Make the table of least and largest displacements from guides (P, 2) to pixels."""
         lib = self.lib
         size = np.array([camera.width, camera.height], np.float64)
-        pixels = np.empty((camera.height, camera.width, 2))
-        pixels[..., 0] = np.arange(camera.width) + 0.5
-        pixels[..., 1] = (np.arange(camera.height) + 0.5)[:, None]
-        pixels = pixels.reshape(-1, 2)
+        image = np.empty((camera.height, camera.width, 2))
+        image[..., 0] = np.arange(camera.width) + 0.5
+        image[..., 1] = (np.arange(camera.height) + 0.5)[:, None]
+        pixels = image.reshape(-1, 2)
         known = _finite(guides)
         if not known.all():
             guides, pixels = guides[known], pixels[known]
