@@ -8,8 +8,11 @@ Conventions, stated once for the whole project:
   center of pixel (column i, row j) lies at (i + 0.5, j + 0.5). Resizing an image by s therefore multiplies fx, cx (and
   fy, cy) by s exactly. OpenCV functions that resample images count pixel centers at integers, so they get
   `cx - 0.5, cy - 0.5`; functions on points need no shift.
-- Distortion is OpenCV's: model `opencv` with (k1, k2, p1, p2[, k3[, k4, k5, k6[, s1, s2, s3, s4]]]), model
-  `opencv_fisheye` with (k1, k2, k3, k4) on the angle; `pinhole` has none.
+- Lens models are those of lenses.py. Distortion is OpenCV's: model `opencv` with (k1, k2, p1, p2[, k3[, k4, k5, k6[,
+  s1, s2, s3, s4]]]), model `opencv_fisheye` with (k1, k2, k3, k4) on the angle; `pinhole` has none. `ftheta`, which is
+  NVIDIA's, has (k1, ..., k5, c, d, e): r = k1 a + ... + k5 a^5 of the angle a to the axis, in the direction of (x, y),
+  times [[c, d], [e, 1]], then K. `equirectangular` has none: K takes (longitude, latitude), in radians, to pixels, so
+  that fx = width / (2 pi), fy = height / pi and a principal point in the middle make a panorama of 360 degrees.
 - Other frames are converted at the border by the functions here: OpenGL / Blender / Nerfstudio cameras (+x right, +y
   up, looking along -z), LLFF `poses_bounds` columns (down, right, backward) and Mitsuba cameras (+x left, +y up,
   looking along +z). World axes never change, only the camera's.
@@ -39,12 +42,7 @@ from drgs.guards.camera_checks import (
     is_tensor,
     read_only,
 )
-from drgs.lenses import (
-    distort_opencv,
-    fisheye_directions,
-    fisheye_polynomial,
-    undistort_opencv,
-)
+from drgs.lenses import LENS_MODELS
 from drgs.runtime import uncompiled
 from drgs.shutters import BY_COLUMN, FORWARD, line_poses, line_times, points_seen, turn_between
 
@@ -83,8 +81,8 @@ class Camera:
             rotation that rounding has left not quite orthonormal is read as the nearest one, and the camera stays
             where it is; see `rigid`.
         width, height: Image size in pixels.
-        model: `pinhole`, `opencv` or `opencv_fisheye`.
-        distortion: Coefficients in OpenCV's order; empty for `pinhole`.
+        model: `pinhole`, `opencv`, `opencv_fisheye`, `ftheta` or `equirectangular`.
+        distortion: Coefficients of the model, in the order above; empty for `pinhole` and `equirectangular`.
         name: Name in messages and of files.
         time: Time at which the view was taken, in the scene's unit of time (0 to 1 over a sequence in most data sets),
             or None where that does not matter.
@@ -154,7 +152,7 @@ class Camera:
     @property
     def is_distorted(self) -> bool:
         """Whether the lens differs from a pinhole (a fisheye with zero coefficients still does)."""
-        return self.model == "opencv_fisheye" or (self.model == "opencv" and any(self.distortion))
+        return LENS_MODELS[self.model].guide != "plane" or any(self.distortion)
 
     @property
     def is_rolling(self) -> bool:
@@ -230,9 +228,9 @@ class Camera:
         Args:
             points: (P,3) world points.
         Returns:
-            pixels (P,2) float64 and camera z (P,). Pixels are NaN where z <= 0, except for fisheye lenses, which may
-            see behind themselves. Of a rolling shutter, where a line sees the point at the pose that it has itself; z
-            is of that pose.
+            pixels (P,2) float64 and camera z (P,). Pixels are NaN where z <= 0, except for fisheye lenses and
+            panoramas, which may see behind themselves. Of a rolling shutter, where a line sees the point at the pose
+            that it has itself; z is of that pose.
         """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         rotation, translation = self._rigid()
@@ -313,14 +311,7 @@ class Camera:
 
     def _camera_directions(self, pixels: np.ndarray) -> np.ndarray:
         """(P,3) unit directions in the camera's frame through pixels (P,2)."""
-        if self.model == "opencv_fisheye":
-            directions = fisheye_directions(self._normalized(pixels), self.distortion)
-        else:
-            plane = self._normalized(pixels)
-            if self.is_distorted:
-                plane = undistort_opencv(plane, self.distortion)
-            directions = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
-            directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        directions = LENS_MODELS[self.model].unproject(self._normalized(pixels), self.distortion)
         if self.is_distorted:
             error = np.linalg.norm(self._project_local(directions) - pixels, axis=1)
             bad = int(np.count_nonzero(~(error < _INVERSE_TOLERANCE)))
@@ -334,18 +325,7 @@ class Camera:
 
     def _project_local(self, local: np.ndarray) -> np.ndarray:
         """Pixels (P,2) of camera-frame points (P,3)."""
-        x, y, z = local.T
-        if self.model == "opencv_fisheye":
-            radius = np.hypot(x, y)
-            angle = np.arctan2(radius, z)
-            # On the axis the ratio is 0/0; its limit multiplies x = y = 0 and does not matter.
-            factor = fisheye_polynomial(angle, self.distortion)[0] / np.where(radius > 0, radius, 1.0)
-            plane = np.stack([x * factor, y * factor], axis=-1)
-        else:
-            depth = np.where(z > 0, z, np.nan)
-            plane = np.stack([x / depth, y / depth], axis=-1)
-            if self.is_distorted:
-                plane = distort_opencv(plane, self.distortion)
+        plane = LENS_MODELS[self.model].project(local, self.distortion)
         return plane @ self.K[:2, :2].T + self.K[:2, 2]
 
     def _normalized(self, pixels: np.ndarray) -> np.ndarray:

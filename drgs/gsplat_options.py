@@ -76,8 +76,8 @@ def check_unscented(params: object) -> None:
         value = getattr(params, name, usual)
         if value != usual:
             raise NotImplementedError(
-                f"rasterization: ut_params must be alpha 0.1, beta 2, kappa 0, got {name}={value:g}; leave with_ut out, "
-                "and nothing is culled by boxes"
+                f"rasterization: ut_params must be alpha 0.1, beta 2, kappa 0, got {name}={value:g}; leave with_ut "
+                "out, and nothing is culled by boxes"
             )
 
 

@@ -41,6 +41,7 @@ from drgs.fitting.config import (
 )
 from drgs.fitting.exposure import NETWORK as EXPOSURE
 from drgs.fitting.frames import Frame, frames_for
+from drgs.fitting.lenses import lens_choice
 from drgs.fitting.parts import parts_of, with_exposure, with_poses
 from drgs.fitting.photographs import check_photographs, estimated_of, join, photographs_record
 from drgs.fitting.poses import CAMERAS, POSE_NETWORK
@@ -171,6 +172,13 @@ def _fit(
     if train:
         check_parallax(train)
         check_cameras(train)
+    lenses = None
+    if config.data.undistort == "auto":
+        with Bar("lenses") as bar:
+            lenses = lens_choice(config, train)
+            if lenses.words():
+                bar.note(lenses.words())
+        config = config.replace(data=dataclasses.replace(config.data, undistort=lenses.undistort))
     run = Run(out_dir)
     motion = motion_of(config, train, test) if parts is None else None
     selection = config.selection
@@ -214,6 +222,7 @@ def _fit(
     recorded = config_record(dataset, config, plan, taught, frames, held_out, source, motion.times if motion else ())
     recorded |= photographs_record(run, trainer, exposure, evidence, choice)
     recorded |= {"exposure": plan.exposure} if plan and plan.exposure else {}
+    recorded |= {"lenses": lenses.to_json()} if lenses and lenses.lost else {}
     poses = trainer.parts.poses
     _check_pictures(out_dir, config.max_steps, held_out, taught is not None)
     run.start(recorded, resume=resume)

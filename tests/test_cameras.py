@@ -27,6 +27,16 @@ from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 POSE = look_at((1.0, 2.0, 3.0), (0.2, -0.1, 0.3))
 OPENCV = (-0.2, 0.05, 1e-3, -2e-3, 0.01)
 FISHEYE = (-0.02, 0.005, 1e-3, -2e-4)
+PRISM = (*OPENCV, 0.02, 0.01, -0.005, 0.02, -0.01, -0.015, 0.01)
+FTHETA = (1.0, 0.01, -0.05, 0.02, -0.003, 1.02, 0.01, -0.02)
+LENSES = [
+    ("pinhole", ()),
+    ("opencv", OPENCV),
+    ("opencv", PRISM),
+    ("opencv_fisheye", FISHEYE),
+    ("ftheta", FTHETA),
+    ("equirectangular", ()),
+]
 
 
 def make(**changes) -> Camera:
@@ -96,7 +106,7 @@ def test_mitsuba_sensor_refuses_what_it_cannot_do():
         make().to_mitsuba()
 
 
-@pytest.mark.parametrize(("model", "distortion"), [("pinhole", ()), ("opencv", OPENCV), ("opencv_fisheye", FISHEYE)])
+@pytest.mark.parametrize(("model", "distortion"), LENSES)
 def test_pixel_directions_project_back_to_their_pixels(model, distortion):
     """Undistortion is converged: every pixel returns to itself."""
     camera = make(model=model, distortion=distortion)
@@ -108,7 +118,7 @@ def test_pixel_directions_project_back_to_their_pixels(model, distortion):
     assert np.abs(pixels - expected).max() < 1e-6
 
 
-@pytest.mark.parametrize(("model", "distortion"), [("opencv", OPENCV), ("opencv_fisheye", FISHEYE)])
+@pytest.mark.parametrize(("model", "distortion"), [("opencv", OPENCV), ("opencv", PRISM), ("opencv_fisheye", FISHEYE)])
 def test_lenses_agree_with_opencv(model, distortion, rng):
     """Our two lens models are OpenCV's."""
     cv2 = pytest.importorskip("cv2")
@@ -131,6 +141,38 @@ def test_fisheye_sees_beyond_180_degrees():
     directions = camera.pixel_directions()
     assert directions[40, 0, 2] < 0
     np.testing.assert_allclose(np.arccos(directions[40, 127, 2]), np.hypot(63.5, 0.5) / 25)
+
+
+def test_panoramas_see_everything():
+    """Forward in the middle, backward at both sides, up in the first row and down in the last one."""
+    K = intrinsics(128 / (2 * np.pi), 80 / np.pi, 64, 40)
+    camera = make(K=K, w2c=np.eye(4), model="equirectangular")
+    points = np.array([[0.0, 0, 2], [3, 0, 0], [-3, 0, 0], [0, 1, 0], [0, -1, 0], [1e-9, 0, -1], [-1e-9, 0, -1]])
+    pixels, z = camera.project(points)
+    expected = [[64, 40], [96, 40], [32, 40], [64, 80], [64, 0], [128, 40], [0, 40]]
+    np.testing.assert_allclose(pixels, expected, atol=1e-6)
+    np.testing.assert_allclose(z, points[:, 2])
+    directions = camera.pixel_directions()
+    half = np.pi / 128
+    np.testing.assert_allclose(
+        directions[40, 127, [0, 2]], np.array([np.sin(half), -np.cos(half)]) * np.cos(half * 0.8)
+    )
+    # A solid angle of 4 pi in all.
+    latitude = (np.arange(80) + 0.5 - 40) * np.pi / 80
+    np.testing.assert_allclose((np.cos(latitude) / (K[0, 0] * K[1, 1])).sum() * 128, 4 * np.pi, rtol=1e-3)
+    assert not camera.undistorted().is_distorted
+
+
+def test_ftheta_is_a_polynomial_of_the_angle():
+    """As many pixels from the middle as it says, sheared by c, d and e, in front of the camera and behind."""
+    camera = make(K=intrinsics(20, 20, 64, 40), w2c=np.eye(4), model="ftheta", distortion=FTHETA)
+    k, (c, d, e) = FTHETA[:5], FTHETA[5:]
+    for angle in (0.3, 1.2, 1.9):
+        for turn in (0.0, 2.0):
+            point = [np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)]
+            r = 20 * sum(x * angle ** (i + 1) for i, x in enumerate(k))
+            x, y = r * np.cos(turn), r * np.sin(turn)
+            np.testing.assert_allclose(camera.project([point])[0], [[64 + c * x + d * y, 40 + e * x + y]])
 
 
 def test_warns_where_a_lens_has_no_inverse():
@@ -251,7 +293,11 @@ FLIPPED = np.diag([1.0, 1.0, -1.0, 1.0])
         ({"width": 0}, "width must be a whole number of pixels >= 1, got 0"),
         ({"height": 2.5}, "height must be a whole number of pixels >= 1, got 2.5"),
         ({"width": float("nan")}, "width must be a whole number of pixels >= 1, got nan"),
-        ({"model": "fov"}, "model must be pinhole, opencv or opencv_fisheye, got 'fov'"),
+        ({"model": "fov"}, "model must be one of pinhole, opencv, opencv_fisheye, ftheta, equirectangular, got 'fov'"),
+        (
+            {"model": "ftheta", "distortion": (1, 0, 0, 0, 0, 0.5, 1, 0.5)},
+            r"must have an inverse, got \(0.5, 1.0, 0.5\)",
+        ),
         (
             {"model": "opencv", "distortion": (1, 2)},
             "takes 4 or 5 or 8 or 12 distortion coefficients, got 2",

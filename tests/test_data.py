@@ -214,6 +214,11 @@ def test_transforms_lenses(tmp_path):
     save(tmp_path, {**data, "camera_model": "OPENCV_FISHEYE", "k4": 0.5})
     camera = load(tmp_path).views[0].camera
     assert (camera.model, camera.distortion) == ("opencv_fisheye", (0.1, 0.02, 0.0, 0.5))
+    save(tmp_path, {"camera_model": "EQUIRECTANGULAR", "frames": data["frames"]})
+    panorama = load(tmp_path).views[0].camera
+    assert (panorama.model, panorama.distortion) == ("equirectangular", ())
+    assert 2 * np.pi * panorama.K[0, 0] == panorama.width
+    assert np.pi * panorama.K[1, 1] == panorama.height
     save(tmp_path, {**data, "camera_model": "PINHOLE"})
     assert load(tmp_path).views[0].camera.model == "pinhole"
 

@@ -141,8 +141,8 @@ def test_colmap_image_of_another_shape(tmp_path):
         ({"fl_x": float("nan")}, "frame 0: fl_x must be a finite number, got NaN"),
         ({"fl_x": -3}, "focal lengths must be positive"),
         (
-            {"camera_model": "EQUIRECTANGULAR"},
-            "camera_model must be one of .*got 'EQUIRECTANGULAR'",
+            {"camera_model": "FOV"},
+            "camera_model must be one of .*got 'FOV'",
         ),
         ({"k4": 0.1}, "OPENCV takes k1, k2, k3, p1, p2, got k4 = 0.1"),
         ({"w": 100}, r"must have the shape of its camera \(100x16\), got 24x16"),

@@ -12,23 +12,41 @@ import torch
 from test_train import FAST, SIZE, config, scene
 
 import drgs
-from drgs.cameras import orbit
+from drgs.cameras import intrinsics, orbit
 from drgs.data import Dataset, View
 from drgs.display.pictures import write_png
 from drgs.files import load_state
 from drgs.fitting.frames import load_frames
+from drgs.fitting.lenses import lens_choice, lost_share
 from drgs.train import FitConfig, SelectionConfig, fit
 
 BARREL = ("opencv", (-0.3, 0.08, 0.002, -0.003))
 
 
+# Name -> model, distortion, focal length (None: of a whole panorama) and distance of the cameras.
+WIDE = {
+    "fisheye": ("opencv_fisheye", (0.01, 0.0, 0.0, 0.0), 0.35, 1.2),
+    "panorama": ("equirectangular", (), None, 1.0),
+}
+
+
 @pytest.fixture(scope="module")
 def bent(tmp_path_factory):
     """Nine photographs of the scene of test_train.py through a lens, and points near the true means."""
-    folder = tmp_path_factory.mktemp("bent")
+    return _photographed(tmp_path_factory.mktemp("bent"), *BARREL, 0.5 / np.tan(np.radians(30)), 3.0)
+
+
+@pytest.fixture(scope="module", params=WIDE)
+def wide(request, tmp_path_factory):
+    """The same from close by, through lenses that no pinhole holds."""
+    return _photographed(tmp_path_factory.mktemp(request.param), *WIDE[request.param])
+
+
+def _photographed(folder, model, distortion, focal, distance):
     g, views = scene(), []
-    for i, camera in enumerate(orbit((0, 0, 0), 3.0, 9, width=SIZE, height=SIZE, fov=60.0)):
-        camera = dataclasses.replace(camera, model=BARREL[0], distortion=BARREL[1])
+    K = intrinsics(SIZE * (focal or 0.5 / np.pi), SIZE * (focal or 1 / np.pi), SIZE / 2, SIZE / 2)
+    for i, camera in enumerate(orbit((0, 0, 0), distance, 9, width=SIZE, height=SIZE)):
+        camera = dataclasses.replace(camera, K=K, model=model, distortion=distortion)
         write_png(folder / f"{i}.png", drgs.render(g, camera, FAST).rgb.numpy())
         views.append(View(camera=camera, name=str(i), image_path=folder / f"{i}.png"))
     points = g.means.double().numpy() + 0.05 * np.random.default_rng(0).standard_normal((len(g), 3))
@@ -60,7 +78,7 @@ def test_a_fit_through_the_lens(bent, tmp_path, whole_and_resumed):
     assert previews[-1] > previews[0] + 1
     rows = json.loads((result.run.path / "metrics.json").read_text())["renderers"]["rows"]
     assert [row["name"] for row in rows] == ["fast"]
-    other = fit(bent, tmp_path / "plain", config(max_steps=100), progress=False)
+    other = fit(bent, tmp_path / "plain", config(max_steps=100, undistort="on"), progress=False)
     frames = load_frames(bent.split()[1], 10**6, undistort="off")
     scores = [_psnr(x.gaussians.detach(), frames) for x in (result, other)]
     assert scores[0] > scores[1] - 0.3
@@ -70,8 +88,49 @@ def test_a_fit_through_the_lens(bent, tmp_path, whole_and_resumed):
     assert all(torch.equal(x, states[1][name]) for name, x in states[0].items())
     with pytest.raises(ValueError, match="--resume must continue the same fit, undistort was 'off' and is 'on'"):
         fit(
-            bent, tmp_path / "whole", config(max_steps=6, save_every=3, deterministic=True), resume=True, progress=False
+            bent,
+            tmp_path / "whole",
+            config(max_steps=6, save_every=3, undistort="on", deterministic=True),
+            resume=True,
+            progress=False,
         )
+
+
+def test_wide_lenses_are_kept_where_renderers_can(wide, tmp_path):
+    """Auto fits what no pinhole holds through its lens, learns, and says why; where it cannot, it says what would."""
+    result = fit(wide, tmp_path / "run", config(max_steps=200), progress=False)
+    told = result.run.config()
+    assert told["fit"]["data"]["undistort"] == "off"
+    assert told["lenses"]["undistort"] == "off"
+    assert 0.2 < told["lenses"]["lost"] < 1
+    previews = [e["test_psnr"] for e in result.run.events() if e["event"] == "preview"]
+    assert previews[-1] > previews[0] + 1
+    again = fit(wide, tmp_path / "run", config(max_steps=200), resume=True, progress=False)
+    assert again.run.config()["lenses"] == told["lenses"]
+    train = wide.split()[0]
+    for fields, because in (({"renderers": ("any",)}, "--for drgs"), ({"poses": "refined"}, "--poses fixed")):
+        choice = lens_choice(config(**fields), train)
+        assert choice.undistort == "on"
+        assert because in choice.words()
+    assert lens_choice(config(), train).words().endswith("they are fitted through their lenses")
+
+
+def test_ordinary_lenses_are_taken_out(tmp_path):
+    """Auto does what it did before there was a choice: a twentieth lost is nothing to be said."""
+    bent = _photographed(tmp_path, "opencv", (-0.1, 0.01, 0.0, 0.0), 0.5 / np.tan(np.radians(30)), 3.0)
+    choice = lens_choice(config(), bent.split()[0])
+    assert choice.undistort == "on"
+    assert 0.01 < choice.lost < 0.2
+    assert not choice.words()
+    runs = [fit(bent, tmp_path / use, config(max_steps=4, undistort=use), progress=False) for use in ("auto", "on")]
+    assert runs[0].run.config()["fit"] == runs[1].run.config()["fit"]
+    assert runs[0].run.config()["lenses"] == choice.to_json()
+    assert lost_share(orbit((0, 0, 0), 3.0, 1)[0]) == 0
+    assert FitConfig.of().difference(FitConfig.of(undistort="on")) is None
+    assert (
+        FitConfig.of(renderers=("fast",), undistort="off").difference(FitConfig.of(renderers=("fast",)))[0]
+        == "undistort"
+    )
 
 
 @pytest.mark.parametrize(

@@ -25,12 +25,17 @@ LENSES = {
     "barrel": ("opencv", (-0.2, 0.05, 0.003, -0.002), 1.0),
     "cushion": ("opencv", (0.3, 0.1, 0.01, 0.02, 0.02), 1.2),
     "rational": ("opencv", (0.4, -0.2, 0.01, -0.01, 0.05, 0.3, 0.1, 0.02), 0.8),
-    "thin prism": ("opencv", (0.1, -0.05, 0.01, -0.01, 0.02, 0.1, 0.0, 0.01, 0.03, -0.01, -0.02, 0.01), 0.9),
     # The polynomial turns back within the image: no inverse there, rays are approximate.
     "folded": ("opencv", (-0.9, 0.1, 0.0, 0.0), 0.7),
     "fisheye": ("opencv_fisheye", (0.05, -0.02, 0.01, -0.003), 1.0),
     "half sphere": ("opencv_fisheye", (-0.03, 0.004, 0.0, 0.0), 0.3),
     "beyond": ("opencv_fisheye", (0.0, 0.0, 0.0, 0.0), 0.12),
+    "thin prism": ("opencv", (0.2, -0.1, 0.01, -0.01, 0.05, 0.1, 0.1, 0.02, 0.06, -0.02, -0.05, 0.03), 0.8),
+    "f-theta": ("ftheta", (1.0, 0.02, -0.06, 0.01, -0.002, 1.05, 0.03, -0.02), 0.3),
+    "f-theta, narrow": ("ftheta", (0.9, 0.0, 0.05, 0.01, 0.0, 1.0, 0.0, 0.01), 1.0),
+    # K takes longitude and latitude to pixels: here the seam is within the image, and a part of a panorama is seen.
+    "panorama": ("equirectangular", (), None),
+    "part of a panorama": ("equirectangular", (), 0.4),
     "turning back": ("opencv_fisheye", (-0.15, 0.0, 0.0, 0.0), 0.2),
 }
 
@@ -40,8 +45,11 @@ def lens_camera(rng, name, size=(26, 21), **options):
     model, distortion, factor = LENSES[name]
     cam = camera(rng, size, **options)
     K = cam.K.copy()
-    K[:2, :2] *= factor
-    K[0, 1] = 0.03 * K[0, 0]
+    if factor is None:
+        K = intrinsics(size[0] / (2 * np.pi), size[1] / np.pi, size[0] / 2, size[1] / 2)
+    else:
+        K[:2, :2] *= factor
+        K[0, 1] = 0.03 * K[0, 0]
     return Camera(K=K, w2c=cam.w2c, width=cam.width, height=cam.height, model=model, distortion=distortion)
 
 
@@ -109,7 +117,6 @@ KINDS = [
     ("barrel", {"order": "ray"}),
     ("cushion", {"response": "integral", "alpha_min": 1 / 255, "near": 0.01}),
     ("rational", CUTS),
-    ("thin prism", {"order": "ray"}),
     ("folded", {"order": "ray"}),
     ("fisheye", {"order": "ray", "sh_direction": "ray"}),
     ("fisheye", CUTS),
@@ -118,6 +125,12 @@ KINDS = [
     ("beyond", {"order": "ray"}),
     ("beyond", {"response": "integral", "depth_key": "z"}),
     ("turning back", {"order": "ray", "sh_direction": "ray"}),
+    ("thin prism", {"order": "ray"}),
+    ("f-theta", {"order": "ray", "sh_direction": "ray"}),
+    ("f-theta, narrow", CUTS),
+    ("panorama", {"order": "ray", "sh_direction": "ray"}),
+    ("panorama", CUTS),
+    ("part of a panorama", {"response": "integral", "order": "ray"}),
 ]
 
 
@@ -143,6 +156,8 @@ INFORMED = [
     ("fisheye", "integral", "center"),
     ("beyond", "peak", "center"),
     ("half sphere", "integral", "ray"),
+    ("panorama", "peak", "ray"),
+    ("f-theta", "peak", "center"),
 ]
 
 
@@ -181,6 +196,12 @@ MOVED = [
     ("half sphere", {"response": "integral", "order": "ray", "sh_direction": "ray"}),
     ("beyond", CUTS),
     ("beyond", {"order": "ray", "traversal": "bvh", "sh_direction": "ray"}),
+    ("thin prism", {"order": "ray", "sh_direction": "ray"}),
+    ("f-theta", {"order": "ray"}),
+    ("f-theta", {"order": "ray", "traversal": "bvh"}),
+    ("f-theta, narrow", CUTS),
+    ("panorama", {"order": "ray", "sh_direction": "ray"}),
+    ("part of a panorama", {"response": "integral", "order": "ray"}),
 ]
 LENSES["pinhole"] = ("pinhole", (), 1.0)
 
@@ -233,6 +254,23 @@ def test_derivatives_by_the_lens(rng, name, fields):
     got = quietly(render_jvp, g.detach(), cam, {"lens": v}, settings)
     for k, x in zip(names, pushed, strict=True):
         assert relative(getattr(got, k).double()[good], x[good]) < 1e-4, k
+
+
+@pytest.mark.parametrize("order", ["center", "ray"])
+def test_panoramas_have_no_seam(rng, order):
+    """Turned by half a circle a panorama is the same one, its halves exchanged; upside down, it is turned over."""
+    size = 48, 24
+    K = intrinsics(size[0] / (2 * np.pi), size[1] / np.pi, size[0] / 2, size[1] / 2)
+    g = gaussians(rng, 60, 4, scale=0.15, spread=2.0).detach()
+    settings = RenderSettings(order=order)
+    images = []
+    for turn in ((1, 1, 1), (-1, 1, -1), (-1, -1, 1)):
+        camera = Camera(K, np.diag([*turn, 1.0]), *size, "equirectangular")
+        out = render(g, camera, settings, outputs=("depth",))
+        images.append(torch.cat([out.rgb, out.alpha[..., None], out.depth[..., None]], -1))
+    assert (images[0][..., 3] > 0.1).double().mean() > 0.3
+    torch.testing.assert_close(images[1], images[0].roll(size[0] // 2, 1), rtol=1e-4, atol=2e-5)
+    torch.testing.assert_close(images[2], images[0].flip(0, 1), rtol=1e-4, atol=2e-5)
 
 
 def test_derivatives_by_the_lens_through_torch(rng):

@@ -26,7 +26,7 @@ import torch
 from drgs import fisher
 from drgs.commands.compared_maps import ComparedMaps
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewpoints import check_counts, evenly, known_views, other_views, timed
+from drgs.commands.viewpoints import check_counts, check_lenses, evenly, known_views, other_views, timed
 from drgs.data.camera_lists import described
 from drgs.display import pictures, tables
 from drgs.display.progress import Bar
@@ -66,12 +66,13 @@ def run(args: Fisher) -> None:
                 "cameras.json"
             )
         text = args.cameras
-    known = known_views(text, args, given)
+    known = known_views(text, args, given, given.keeps_lenses(args.undistort))
     known = dataclasses.replace(known, cameras=timed(known.cameras, args, given))
     views, source = known.cameras, known.source
     if args.cameras is not None:
         views, source = other_views("--cameras", args.cameras, args, given, known, fresh=False)
     views = evenly(timed(views, args, given), args.limit)
+    check_lenses("fisher", settings, [*known.cameras, *views])
     names = pictures.file_names([camera.name for camera in views])
     blocks = asked_blocks(args, given, settings, [*known.cameras, *views])
     compared = ComparedMaps(given.scene, settings, prior) if args.maps else None

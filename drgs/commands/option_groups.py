@@ -11,7 +11,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 from drgs.commands.orbit_keys import ORBIT_KEYS
 from drgs.commands.overrides import parsed
 from drgs.commands.record_options import CAMERAS_TEXT, CARRIED, HIDDEN, options_of
-from drgs.fitting.config import SelectionConfig
+from drgs.fitting.config import SelectionConfig, UndistortUse
 from drgs.guards.records import texts_of
 from drgs.information.nuisances import Nuisances
 from drgs.information.prior import Prior
@@ -26,6 +26,7 @@ __all__ = [
     "Comparing",
     "Data",
     "Informed",
+    "Lenses",
     "Moments",
     "OutputPath",
     "SceneFile",
@@ -112,6 +113,14 @@ class Views(Timed):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class Lenses:
+    """Options of commands that can look through lenses."""
+
+    undistort: UndistortUse = "auto"
+    """Take lenses out of cameras (on), look through them, with presets along rays (off), or as the run did (auto)."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Around:
     """Options of commands that can make cameras around a scene."""
 
@@ -171,7 +180,7 @@ class Informed(Settings, _Information, _Pixels):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Comparing(Informed, Around, Views):
+class Comparing(Informed, Around, Views, Lenses):
     """Options of commands that compare views with known ones."""
 
     scene: SceneFile

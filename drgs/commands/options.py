@@ -20,6 +20,7 @@ from drgs.commands.option_groups import (
     Comparing,
     Data,
     Informed,
+    Lenses,
     Moments,
     OutputPath,
     SceneFile,
@@ -64,7 +65,7 @@ class Info(Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Render(Settings, Around, Views, Moments):
+class Render(Settings, Around, Views, Moments, Lenses):
     """Render a file of Gaussians, or a finished run, to pictures or a video."""
 
     scene: SceneFile
@@ -249,7 +250,7 @@ class Tradeoff(Seen):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Query(Settings, Around, Views):
+class Query(Settings, Around, Views, Lenses):
     """Find what a text means: masks of views, and a PLY of the Gaussians that are it, or of all others."""
 
     scene: Positional[Path]

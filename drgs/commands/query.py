@@ -11,7 +11,7 @@ import torch
 
 from drgs.commands.painters import OPAQUE
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewpoints import check_counts, seen_views
+from drgs.commands.viewpoints import check_counts, check_lenses, seen_views
 from drgs.data.camera_lists import described
 from drgs.data.checks import read_npy
 from drgs.display import pictures
@@ -56,7 +56,8 @@ def run(args: Query) -> None:
     kept = g.take(~selected if args.remove else selected)
     largest = float(score.max()) if len(g) else 0.0
     _refuse_nothing(len(g), count, largest, query, args.remove, _too_short(given))
-    cameras, source = seen_views(args, given)
+    cameras, source = seen_views(args, given, given.keeps_lenses(args.undistort))
+    check_lenses("query", settings, cameras)
     pixels = args.max_pixels or (given.record.config.data.max_pixels if given.record else None)
     if pixels is not None:
         cameras = [at_most(camera, pixels) for camera in cameras]

@@ -23,7 +23,7 @@ from drgs.commands.moments import at_times, named_view, ply_names, write_plys
 from drgs.commands.orbits import Wish
 from drgs.commands.painters import PAINTINGS, painters
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewpoints import MAX_SIDE, drawn_views
+from drgs.commands.viewpoints import MAX_SIDE, check_lenses, drawn_views
 from drgs.data.camera_lists import described, save_cameras_json
 from drgs.display import pictures
 from drgs.display.progress import Bar
@@ -70,9 +70,12 @@ def run(args: Render) -> None:
     cameras, source = drawn_views(args, views, given, args.frames, size, returns=True)
     cameras = at_times(named_view(cameras, args.view, source)[: args.limit], args.time, args.frames, given)
     cameras = [_resized(camera, args.width, args.height) for camera in cameras]
-    if settings.traversal == "tiles" and (bent := sum(camera.is_distorted for camera in cameras)):
+    follows = args.undistort == "auto" and settings.traversal == "bvh"
+    bent = sum(camera.is_distorted for camera in cameras)
+    if bent and not (follows or given.keeps_lenses(args.undistort)):
         cameras = [camera.undistorted() for camera in cameras]
-        _say(args, f"{bent} cameras have a lens: drawn without it; --preset mitsuba traces its true rays")
+        _say(args, f"{bent} cameras have a lens: drawn without it; --undistort off draws through it")
+    check_lenses("render", settings, cameras)
     _check_memory(cameras, settings, formats, 0 if gaussians.features is None else gaussians.features.shape[1])
     ends = [*(kind for kind in formats if kind not in ("webm", "ply")), *(["depth.png"] * args.depth)]
     ends += [f"{kind}.png" for kind in kinds]

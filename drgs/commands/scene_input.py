@@ -99,6 +99,12 @@ class SceneInput:
 
         return None if self.decoder is None else SemanticMetric(self.decoder.metric())
 
+    def keeps_lenses(self, asked: str = "auto") -> bool:
+        """Whether cameras keep their lenses: what --undistort says, else as the run was fitted, else not."""
+        if asked == "auto" and self.record is not None:
+            asked = self.record.config.data.undistort
+        return asked == "off"
+
     @property
     def estimated(self) -> tuple[Nuisance, ...]:
         """Unknowns of the photographs that the run has estimated."""

@@ -10,7 +10,7 @@ import torch
 
 from drgs.commands.clustered import workers_of
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewpoints import check_counts, known_views, other_views, timed
+from drgs.commands.viewpoints import check_counts, check_lenses, known_views, other_views, timed
 from drgs.data.camera_lists import described
 from drgs.display import tables
 from drgs.display.progress import Bar
@@ -43,10 +43,11 @@ def run(args: Select) -> None:
     given = SceneInput.of(args)
     settings = given.over_background(settings)
     scoring = dataclasses.replace(wanted.over(given.estimated), settings=settings, semantics=given.semantics())
-    known = known_views(args.train, args, given)
+    known = known_views(args.train, args, given, given.keeps_lenses(args.undistort))
     candidates, source = other_views("--candidates", args.candidates, args, given, known, fresh=True)
     candidates = timed(candidates, args, given)
     train = timed(known.cameras, args, given)
+    check_lenses("select", settings, [*train, *candidates])
     views = len(known.cameras) + len(candidates)
     with workers_of(args) as workers, Bar("information", views, not args.quiet) as bar:
         selection = select(

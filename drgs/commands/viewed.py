@@ -122,7 +122,7 @@ def _known(args: View, given: SceneInput, notes: list[str]) -> Known | None:
     if args.train is None and given.run is None:
         return None
     try:
-        return known_views(args.train, args, given)
+        return known_views(args.train, args, given, given.keeps_lenses())
     except (OSError, ValueError) as error:
         if args.train is not None:
             raise

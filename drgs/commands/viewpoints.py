@@ -30,17 +30,21 @@ from drgs.fitting.records import FitRecord, fit_record, fitted_views, is_run
 from drgs.sizes import at_most, resized_alike
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from drgs.cameras import Camera
     from drgs.commands.option_groups import Views
     from drgs.commands.options import Crossval, Fisher, Query, Render, Select, Tradeoff
     from drgs.commands.scene_input import SceneInput
     from drgs.data import Dataset, View
+    from drgs.settings import RenderSettings
 
 __all__ = [
     "MAX_SIDE",
     "Known",
     "Source",
     "check_counts",
+    "check_lenses",
     "drawn_views",
     "evenly",
     "known_views",
@@ -195,16 +199,15 @@ def seen_views(args: Crossval | Query | Tradeoff, given: SceneInput, lenses: boo
     """At most `--limit` cameras of `--cameras`, as large as they are drawn; and where they come from in words.
 
     Args:
-        args: What was asked for.
-        given: The scene.
-        lenses: Whether cameras keep their lens; without it all are pinholes.
+        args: Options of the command.
+        given: What it looks at.
+        lenses: Cameras keep their lenses; else all are pinholes.
     Raises:
         FileNotFoundError, ValueError: As `drawn_views`.
     """
     text = args.cameras or ("orbit" if given.run is None else str(given.run.path))
     cameras, source = drawn_views(args, text, given, args.limit)
-    chosen = evenly(cameras, args.limit)
-    return chosen if lenses else [camera.undistorted() for camera in chosen], source
+    return [_seen(camera, lenses) for camera in evenly(cameras, args.limit)], source
 
 
 def _drawn_orbit(
@@ -258,11 +261,12 @@ class Known:
     """Views that count as known.
 
     Attributes:
-        cameras: Pinhole, reduced.
+        cameras: Reduced; pinholes, unless lenses are kept.
         source: Words that say where they come from.
         pixels: These views, and those that are compared with them, are reduced to at most so many.
         data: The data set that they are of, or None.
         sizes: Stated size -> size of the image file, as far as known.
+        lenses: Cameras that are compared with them keep their lenses as these do.
     """
 
     cameras: list[Camera]
@@ -270,15 +274,17 @@ class Known:
     pixels: int
     data: Path | None = None
     sizes: dict[tuple[int, int], tuple[int, int]] = dataclasses.field(default_factory=dict)
+    lenses: bool = False
 
 
-def known_views(text: str | None, args: Select | Fisher, given: SceneInput) -> Known:
+def known_views(text: str | None, args: Select | Fisher, given: SceneInput, lenses: bool = False) -> Known:
     """The views of `--train`, else those that the run was fitted to.
 
     Args:
         text: A data set (all its views), a run (those it was fitted to), a cameras.json, or None.
         args: Options of the command, of which `info_pixels` and `strict` apply.
         given: What the command looks at, whose run is taken where `text` is None.
+        lenses: Cameras keep their lenses, these and those that are compared with them.
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If a file of Gaussians comes without `--train`, or a run's data set no longer has its views.
@@ -291,11 +297,12 @@ def known_views(text: str | None, args: Select | Fisher, given: SceneInput) -> K
     pixels = args.info_pixels or (_PIXELS if given.record is None else given.record.config.data.max_pixels)
     where = str(Path(source.text))
     if source.kind == "list":
-        return Known([at_most(camera.undistorted(), pixels) for camera in source.listed()], where, pixels)
+        cameras = [at_most(_seen(camera, lenses), pixels) for camera in source.listed()]
+        return Known(cameras, where, pixels, lenses=lenses)
     views = source.dataset(args, given).views
     if source.kind == "data":
-        cameras = [_camera(view, {}, pixels) for view in views]
-        return Known(cameras, where, pixels, Path(source.text).resolve())
+        cameras = [_camera(view, {}, pixels, lenses) for view in views]
+        return Known(cameras, where, pixels, Path(source.text).resolve(), lenses=lenses)
     place = source.record.data
     names = fitted_views(Run(Path(source.text)), source.record)
     named = {view.name: view for view in views}
@@ -307,7 +314,8 @@ def known_views(text: str | None, args: Select | Fisher, given: SceneInput) -> K
     checked = [view.checked() for view in stated]  # the fit has opened these images too
     size = lambda view: (view.camera.width, view.camera.height)  # noqa: E731
     sizes = {size(a): size(b) for a, b in zip(stated, checked, strict=True)}
-    return Known([_camera(view, {}, pixels) for view in checked], where, pixels, place.resolve(), sizes)
+    cameras = [_camera(view, {}, pixels, lenses) for view in checked]
+    return Known(cameras, where, pixels, place.resolve(), sizes, lenses)
 
 
 def other_views(
@@ -337,7 +345,7 @@ def other_views(
         circle = dataclasses.replace(wish, elevation=0.0, span=360.0)
         return dome(_compared_orbit(circle, given, known, 24), args.count), f"dome of {args.count}"
     if source.kind == "list":
-        return [at_most(camera.undistorted(), known.pixels) for camera in source.listed()], text
+        return [at_most(_seen(camera, known.lenses), known.pixels) for camera in source.listed()], text
     views = source.split(source.dataset(args, given), args.split, given)
     same = (source.record.data if source.kind == "run" else Path(text)).resolve() == known.data
     used = {camera.name for camera in known.cameras} if same and fresh else set()
@@ -347,7 +355,8 @@ def other_views(
             f"{text}: must hold a view that is not known yet, all {len(views)} of split {args.split} are; "
             f"use {option} orbit or dome, or another data set"
         )
-    return [_camera(view, known.sizes if same else {}, known.pixels) for view in left], f"{text} ({args.split})"
+    sizes = known.sizes if same else {}
+    return [_camera(view, sizes, known.pixels, known.lenses) for view in left], f"{text} ({args.split})"
 
 
 def timed(cameras: list[Camera], args: Select | Fisher, given: SceneInput) -> list[Camera]:
@@ -380,12 +389,18 @@ def _compared_orbit(wish: Wish, given: SceneInput, known: Known, count: int) -> 
     cameras, _ = capture_orbit(walked, count, distance_of=seen_distance(given.gaussians), beyond=True, **how)
     if not cameras:
         cameras = scene_orbit(given.gaussians, count, **how)
-    return [dataclasses.replace(camera, K=lens.K) for camera in cameras]
+    own = {"K": lens.K, "model": lens.model, "distortion": lens.distortion}
+    return [dataclasses.replace(camera, **own) for camera in cameras]
 
 
-def _camera(view: View, sizes: dict[tuple[int, int], tuple[int, int]], pixels: int) -> Camera:
-    """A view's camera: pinhole, of the size that its image probably has, then reduced."""
-    return at_most(resized_alike(_named(view).undistorted(), sizes), pixels)
+def _camera(view: View, sizes: dict[tuple[int, int], tuple[int, int]], pixels: int, lenses: bool) -> Camera:
+    """A view's camera: of the size that its image probably has, then reduced; a pinhole unless lenses are kept."""
+    return at_most(resized_alike(_seen(_named(view), lenses), sizes), pixels)
+
+
+def _seen(camera: Camera, lenses: bool) -> Camera:
+    """The camera that is looked through: itself where lenses are kept, else the pinhole in its place."""
+    return camera if lenses else camera.undistorted()
 
 
 def _named(view: View) -> Camera:
@@ -401,6 +416,17 @@ def evenly(views: list, limit: int) -> list:
     if len(views) <= limit:
         return views
     return [views[i * len(views) // limit] for i in range(limit)]
+
+
+def check_lenses(command: str, settings: RenderSettings, cameras: Iterable[Camera]) -> None:
+    """Raise ValueError if settings that draw pinholes alone meet a camera with a lens."""
+    bent = sum(camera.is_distorted for camera in cameras) if settings.planar else 0
+    if bent:
+        raise ValueError(
+            f"{command}: through a lens settings must follow rays, response {settings.response!r} is a model of a "
+            f"pinhole's image plane, and {bent} cameras have a lens; use --preset exact, fast or 3dgut, or "
+            "--undistort on"
+        )
 
 
 def check_counts(args: Crossval | Fisher | Query | Select | Tradeoff) -> None:

@@ -33,6 +33,7 @@ _LENSES = {
     "RADIAL": "opencv",
     "OPENCV": "opencv",
     "OPENCV_FISHEYE": "opencv_fisheye",
+    "EQUIRECTANGULAR": "equirectangular",
 }
 _MILLIMETER = 1e-3
 _DEPTH_SCALE_MAX = 1e9
@@ -250,6 +251,14 @@ def _camera(where: str, values: dict, w2c: np.ndarray, image: Path, first: _Firs
         )
     else:
         width, height = first.size()
+    kind = values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
+    if not isinstance(kind, str) or kind not in _LENSES:
+        raise ValueError(
+            f"{where}: camera_model must be one of {', '.join(_LENSES)}, got {str(kind)[:40]!r}; undistort the images"
+        )
+    model = _LENSES[kind]
+    if model == "equirectangular":
+        return _panorama(where, values, w2c, width, height)
     if "fl_x" in values:
         fx = _number(where, values, "fl_x")
         fy = _number(where, values, "fl_y", fx)
@@ -259,13 +268,7 @@ def _camera(where: str, values: dict, w2c: np.ndarray, image: Path, first: _Firs
     else:
         raise ValueError(f"{where}: must have fl_x or camera_angle_x (in the frame or the file), got neither; add one")
     K = intrinsics(fx, fy, _number(where, values, "cx", width / 2), _number(where, values, "cy", height / 2))
-    kind = values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
-    if not isinstance(kind, str) or kind not in _LENSES:
-        raise ValueError(
-            f"{where}: camera_model must be one of {', '.join(_LENSES)}, got {str(kind)[:40]!r}; undistort the images"
-        )
     k1, k2, k3, k4, p1, p2 = (_number(where, values, key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    model = _LENSES[kind]
     distortion = ()
     if model == "opencv_fisheye":
         distortion = (k1, k2, k3, k4)
@@ -280,6 +283,15 @@ def _camera(where: str, values: dict, w2c: np.ndarray, image: Path, first: _Firs
         return Camera(
             K=K, w2c=w2c, width=width, height=height, model=model, distortion=distortion, time=values.get("time")
         )
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def _panorama(where: str, values: dict, w2c: np.ndarray, width: float, height: float) -> Camera:
+    """The camera of a panorama of all directions, whatever focal lengths its file states."""
+    K = intrinsics(width / (2 * np.pi), height / np.pi, width / 2, height / 2)
+    try:
+        return Camera(K, w2c, width, height, "equirectangular", time=values.get("time"))
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
 

@@ -63,7 +63,7 @@ Restart = Literal["auto", "always", "never"]
 Schedule = Literal["auto", "views", "times", "pairs"]
 Start = Literal["first", "seed"]
 PoseUse = Literal["fixed", "auto", "refined"]
-UndistortUse = Literal["on", "off"]
+UndistortUse = Literal["auto", "on", "off"]
 SkyboxUse = Literal["off", "auto", "on"]
 TransientUse = Literal["auto", "mask", "keep"]
 Degree = Literal[0, 1, 2, 3]
@@ -106,7 +106,8 @@ class DataConfig(Record):
             valid where undistorted photographs have empty corners; ignore reads none. With object and auto nothing is
             where a photograph's own alpha channel is transparent, either.
         undistort: Take lenses out of photographs (on), or fit them as they were taken (off), with renderers that follow
-            rays through the lens (--for drgs, exact, fast or 3dgut).
+            rays through the lens (--for drgs, exact, fast or 3dgut); auto: off where these are asked for and more than
+            a fifth of what photographs show would be lost.
         exposure: Multiply what is rendered for a photograph by its own gain of R, G and B: none (off), those that
             initial points tell (points), the same fitted on (learned); auto: points, where they differ clearly.
         poses: Cameras of training photographs stay where the data set says (fixed) or are fitted, too (refined); auto:
@@ -124,7 +125,7 @@ class DataConfig(Record):
     test_cameras: tuple[str, ...] | None = None
     times: int = 40
     mask: MaskUse = "auto"
-    undistort: UndistortUse = "on"
+    undistort: UndistortUse = "auto"
     exposure: ExposureUse = "off"
     poses: PoseUse = "fixed"
     skybox: SkyboxUse = "auto"
@@ -524,7 +525,12 @@ class FitConfig(Record):
         """
         mine, theirs = (
             config.replace(
-                renderers=named_renderers(config.renderers, config.settings), saving=SavingConfig(), selection=None
+                renderers=named_renderers(config.renderers, config.settings),
+                data=dataclasses.replace(
+                    config.data, undistort="off" if config.data.undistort == "off" else "on"
+                ),  # a run from before `auto` took lenses out
+                saving=SavingConfig(),
+                selection=None,
             ).to_json()
             for config in (self, other)
         )

@@ -113,7 +113,7 @@ def load_frames(
         views: Whatever their sizes; those whose image has not been looked at yet are checked now.
         max_pixels: Pixels of one image at most; smaller ones keep their size.
         mask: Use of masks, as `DataConfig` has it.
-        undistort: Whether lenses are taken out, likewise.
+        undistort: Whether lenses are taken out, likewise; `auto`, which a fit decides, is on.
     """
     views = [dataclasses.replace(view, keeps_lens=undistort == "off") for view in views]
     with Bar("photographs", len(views)) as bar:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from drgs.guards.arguments import ArgumentError, kind_of
+from drgs.lenses import LENS_MODELS
 from drgs.shutters import SHUTTERS
 
 __all__ = [
@@ -27,7 +28,6 @@ __all__ = [
     "read_only",
 ]
 
-_OPENCV_LENGTHS = (4, 5, 8, 12)
 _ROTATION_TOLERANCE = 1e-4  # of R R^T: what four digits a number leave; more is a scale or a shear
 _ROW_TOLERANCE = 1e-6  # of the row 0 0 0 1, which only rounding may have touched
 # Beyond these, which no camera reaches, squares and ratios of float64 lose their meaning.
@@ -36,6 +36,7 @@ _FOCAL_MIN = 1e-4
 _FOCAL_MAX = 1e6
 _DISTANCE_MAX = 1e15
 _DISTORTION_MAX = 1e6
+_SINGULAR = 1e-6  # a determinant below has no inverse to speak of
 _TURN_MAX = math.radians(170)  # of a camera within an exposure
 
 
@@ -187,15 +188,19 @@ def checked_distortion(where: str, model: str, distortion: Any) -> tuple[float, 
         raise ValueError(
             f"{where}: distortion must be finite, no coefficient above {_DISTORTION_MAX:g}, got {values}; correct it"
         )
-    lengths = {"pinhole": (0,), "opencv": _OPENCV_LENGTHS, "opencv_fisheye": (4,)}.get(model)
-    if lengths is None:
-        raise ValueError(f"{where}: model must be pinhole, opencv or opencv_fisheye, got {model!r}; choose one")
+    if not isinstance(model, str) or model not in LENS_MODELS:
+        raise ValueError(f"{where}: model must be one of {', '.join(LENS_MODELS)}, got {model!r}; choose one")
+    lengths = LENS_MODELS[model].lengths
     if len(values) not in lengths:
         raise ValueError(
             f"{where}: model {model} takes {' or '.join(map(str, lengths))} distortion "
             f"coefficients, got {len(values)}; "
             "pad with zeros"
         )
+    if model == "ftheta":
+        c, d, e = values[5:]
+        if not abs(c - d * e) > _SINGULAR:
+            raise ValueError(f"{where}: [[c, d], [e, 1]] of ftheta must have an inverse, got {(c, d, e)}; correct it")
     return values
 
 

@@ -102,9 +102,8 @@ def _surfaces(scene: Scene, camera: Camera, mask: torch.Tensor | None = None) ->
     from drgs.integrator import render
 
     with torch.no_grad():  # a distance is a number
-        # Without its lens, which tiles do not know: what is wanted is how far away things are, about.
         plain = colors_only(scene, camera.time)
-        small = at_most(camera.undistorted(), _PIXELS)
+        small = at_most(camera, _PIXELS)
         out = render(plain, small, _FAST, outputs=("median_depth",))
     assert out.median_depth is not None
     return {"depths": out.median_depth[(out.alpha >= _SOLID) & (out.median_depth > 0)].cpu()}

@@ -130,8 +130,8 @@ class _Cast:
         train, test = dataset.split(config.data.test_every, config.data.test_offset, config.data.test_cameras)
 
         def camera(view: View) -> Camera:
-            plain = dataclasses.replace(view.camera.undistorted(), name=view.name)
-            return at_most(plain, config.data.max_pixels)
+            shown = dataclasses.replace(view, keeps_lens=config.data.undistort == "off").shown_camera
+            return at_most(dataclasses.replace(shown, name=view.name), config.data.max_pixels)
 
         cameras = {view.name: camera(view) for view in train}
         tested = {view.name: camera(view) for view in test}

@@ -20,9 +20,10 @@ import drjit as dr
 import numpy as np
 
 from drgs.cameras import Camera
+from drgs.lenses import LENS_MODELS
 from drgs.tracing import records as layout
 from drgs.tracing.arrays import Float, Int32, Lib, Mask, UInt32
-from drgs.tracing.lens_rays import NARROW, LensRays, equidistant, on_plane, pixels_of, tile_boxes
+from drgs.tracing.lens_rays import NARROW, LensRays, guides_of, tile_boxes
 from drgs.tracing.records import cross, dot
 
 __all__ = ["FreeRays"]
@@ -65,12 +66,15 @@ class FreeRays(LensRays):
         self.reach = float(np.sqrt(np.einsum("pk,pk->p", off, off).max(initial=0.0)))
         # Not `@` for all pixels: the threads of NumPy's BLAS spin on the cores that render next.
         local = np.einsum("pk,jk->pj", directions, pose[:, :3])
-        self.fisheye = self.wide = bool((local[known, 2] < NARROW).any())
+        self.wide = bool((local[known, 2] < NARROW).any())
+        self.guide = LENS_MODELS[camera.model].guide if self.wide else "plane"
+        if self.wide and self.guide == "plane":
+            self.guide = "fisheye"
         shape = camera.height, camera.width, 6
         boxes = tile_boxes(np.concatenate([origins, directions], 1).reshape(shape), tile, False)
         # A tile without any ray meets nothing, whatever its box: its pixels are left out.
         self.boxes = [lib.Float(np.ascontiguousarray(np.nan_to_num(x))) for x in boxes.T]
-        self.set_displacements(camera, pixels_of(camera.K, equidistant(local) if self.fisheye else on_plane(local)))
+        self.set_displacements(camera, guides_of(self.guide, camera.K, local))
         dr.make_opaque(*self.boxes)
 
     def may_meet(self, r: list[Float], x: Int32, y: Int32, limit: Float) -> Mask:

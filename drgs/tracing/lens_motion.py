@@ -2,8 +2,9 @@
 
 A ray is where the lens model meets a pixel, so that it is an inverse, and its derivative that of an implicit function:
 where distort(u; coefficients) = K^-1 pixel, du = J^-1 (d(K^-1 pixel) - d distort) with J = d distort / d u at the ray;
-of a fisheye the same for the angle alone. Both are one step of Newton's from the ray, which is where it is already: the
-value of such a step is that ray, and its derivative is exact.
+of a radial model the same for the angle alone. Both are one step of Newton's from the ray, which is where it is
+already: the value of such a step is that ray, and its derivative is exact. The rays of panoramas are an explicit
+function of K.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 import torch
 
 from drgs.cameras import Camera
-from drgs.lenses import distorted, fisheye_polynomial
+from drgs.lenses import LENS_MODELS, distorted, equirectangular, linear_part
 
 __all__ = ["LensMotion"]
 
@@ -38,9 +39,15 @@ class LensMotion:
         lens = torch.from_numpy(camera.lens_parameters.copy())
         plane = self._plane(lens)
         focal = float(max(camera.K[0, 0], camera.K[1, 1]))
-        if camera.model == "opencv_fisheye":
+        self.explicit = camera.model == "equirectangular"
+        self.radial = LENS_MODELS[camera.model].radial
+        if self.explicit:
+            self.fixed = torch.zeros(len(local), dtype=torch.bool)
+            return
+        if self.radial:
             self.angle = torch.atan2(local[:, :2].norm(dim=1), local[:, 2])
-            seen, self.slope = fisheye_polynomial(self.angle, tuple(camera.distortion))
+            seen, self.slope = self.radial(self.angle, tuple(camera.distortion))
+            plane = self._round(plane, tuple(camera.distortion))
             self.off: list[torch.Tensor] = [seen - torch.hypot(*plane)]
             self.fixed = ~((self.off[0].abs() * focal < _CONVERGED) & (self.slope.abs() > _FLAT))
             self.slope = torch.where(self.fixed, 1.0, self.slope)
@@ -67,14 +74,17 @@ class LensMotion:
         """(P, 3) float64 unit directions in camera axes, of `Camera.lens_parameters`, where they are the camera's."""
         plane = self._plane(lens)
         coefficients = tuple(lens[5:].unbind())
-        if self.camera.model == "opencv_fisheye":
+        if self.explicit:
+            moved = torch.stack(equirectangular(*plane, torch), 1)
+        elif self.radial:
+            plane = self._round(plane, coefficients)
             squared = plane[0] * plane[0] + plane[1] * plane[1]
             off = squared > 0
             radius = torch.where(off, torch.where(off, squared, 1.0).sqrt(), 0.0)
-            seen, _ = fisheye_polynomial(self.angle, coefficients)
+            seen, _ = self.radial(self.angle, coefficients)
             angle = self.angle - (seen - radius - self.off[0]) / self.slope
-            # On the axis a direction moves as its point of the plane does.
-            factor = torch.where(off, angle.sin() / torch.where(off, radius, 1.0), 1.0)
+            # On the axis a direction moves as its point of the plane does, over the slope there.
+            factor = torch.where(off, angle.sin() / torch.where(off, radius, 1.0), 1.0 / self.slope)
             moved = torch.stack([plane[0] * factor, plane[1] * factor, angle.cos()], 1)
         else:
             seen = distorted(self.at[0], self.at[1], coefficients)
@@ -94,6 +104,12 @@ class LensMotion:
         (fx, skew, _), (_, fy, _), _ = self.camera.K.tolist()
         x, y = ((directions[:, k] / directions[:, 2] - self.local[:, k] / self.local[:, 2]) for k in range(2))
         return torch.stack([fx * x + skew * y, fy * y, 1 / directions[:, 2] - 1 / self.local[:, 2]], 1)
+
+    def _round(self, plane: tuple[torch.Tensor, torch.Tensor], coefficients: tuple) -> tuple:
+        """Points of the plane before the linear part of a radial model."""
+        c, d, e = linear_part(self.camera.model, coefficients)
+        x, y = plane
+        return (x - d * y) / (c - d * e), (c * y - e * x) / (c - d * e)
 
     def _plane(self, lens: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """K^-1 times the pixels."""

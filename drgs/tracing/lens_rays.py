@@ -26,16 +26,17 @@ import drjit as dr
 import numpy as np
 
 from drgs.cameras import Camera
+from drgs.lenses import LENS_MODELS, Guide
 from drgs.tracing import records as layout
 from drgs.tracing.arrays import Float, Int32, Lib, Mask, UInt32
 from drgs.tracing.pose import local_rays
 from drgs.tracing.primitives import Patch, Ray
 
 __all__ = [
-    "FISHEYE",
     "NARROW",
     "LensRays",
     "equidistant",
+    "guides_of",
     "lens_of",
     "on_plane",
     "on_side",
@@ -43,8 +44,6 @@ __all__ = [
     "tile_boxes",
 ]
 
-FISHEYE = ("opencv_fisheye",)
-"""Models whose guides are those of the equidistant fisheye; those of others are pixels of the pinhole camera."""
 NARROW = 0.17  # least d_z of a narrow lens: 80 degrees
 _CELL = 4  # pixels, about, of the least cells of a table of displacements
 _MOST_CELLS = 1024  # in a row of it
@@ -75,14 +74,14 @@ def lens_of(lib: Lib, camera: Camera, tile: int) -> LensRays | None:
 class LensRays:
     """The rays of a lens, by pixel and by tile, and its table of displacements.
 
-    To make them takes about a second a million pixels, once for all cameras of a lens (`lens_of`).
+    To make them takes about half a second a million pixels, once for all cameras of a lens (`lens_of`).
 
     Args:
         lib: Dr.Jit types of the backend.
         camera: Its pose plays no role.
         tile: Pixels of a tile in a row.
     Attributes:
-        fisheye: Guides are those of the equidistant fisheye.
+        guide: What guides are of: pixels of the pinhole camera, the equidistant fisheye, or longitude and latitude.
         wide: Rays are directions, not pixels of a pinhole camera.
         low, high: (2,) least and largest such pixel, of narrow lenses.
         known: (P,) 0 where OpenCV finds no ray for a pixel, but what is no number; None where there is none of these.
@@ -94,18 +93,18 @@ class LensRays:
 
     def __init__(self, lib: Lib, camera: Camera, tile: int) -> None:
         self.lib = lib
-        self.fisheye = camera.model in FISHEYE
+        self.guide: Guide = LENS_MODELS[camera.model].guide
         self.tiles = -(-camera.width // tile)
         d = local_rays(camera)
-        known = np.isfinite(d).all(1)
+        known = _finite(d)
         # What stands for a ray must be a number; `TileTraversal` leaves these out.
         self.known = None if known.all() else lib.UInt32(known.astype(np.uint32))
         self.wide = bool((d[known, 2] < NARROW).any())
         K = camera.K
         values = d if self.wide else pixels_of(K, d[:, :2] / d[:, 2:])
         if not self.wide:
-            self.low = np.floor(values[known].min(0, initial=0.0))
-            self.high = np.floor(values[known].max(0, initial=0.0))
+            self.low = np.floor([x[known].min(initial=0.0) for x in values.T])
+            self.high = np.floor([x[known].max(initial=0.0) for x in values.T])
         # Pixels and anchors are centers of pixels, whose difference is exact.
         first = values.astype(np.float32) if self.wide else (np.floor(values) + 0.5).astype(np.float32)
         rest = (values - first).astype(np.float32)
@@ -113,7 +112,7 @@ class LensRays:
         self.columns = [dr.select(dr.isfinite(x), x, 0) for x in self.columns]
         boxes = tile_boxes(values.reshape(camera.height, camera.width, -1), tile, not self.wide)
         self.boxes = [lib.Float(np.ascontiguousarray(x)) for x in boxes.T]
-        self.set_displacements(camera, pixels_of(K, equidistant(d) if self.fisheye else on_plane(d)))
+        self.set_displacements(camera, guides_of(self.guide, K, d))
         dr.make_opaque(*self.columns, *self.boxes)
         arrays = [*self.columns, *self.boxes, self.cells]
         self.size = 4 * sum(dr.width(x) for x in arrays)
@@ -122,13 +121,16 @@ class LensRays:
         """Make the table of least and largest displacements from guides (P, 2) to pixels."""
         lib = self.lib
         size = np.array([camera.width, camera.height], np.float64)
-        rows, columns = np.divmod(np.arange(camera.width * camera.height), camera.width)
-        pixels = np.stack([columns, rows], 1) + 0.5
-        known = np.isfinite(guides).all(1)
-        guides, pixels = guides[known], pixels[known]
+        image = np.empty((camera.height, camera.width, 2))
+        image[..., 0] = np.arange(camera.width) + 0.5
+        image[..., 1] = (np.arange(camera.height) + 0.5)[:, None]
+        pixels = image.reshape(-1, 2)
+        known = _finite(guides)
+        if not known.all():
+            guides, pixels = guides[known], pixels[known]
         # Rays with guides far from the image are counted to the cells at the edge.
-        low = np.maximum(guides.min(0, initial=np.inf), -size)
-        high = np.minimum(guides.max(0, initial=-np.inf), 2 * size)
+        low = np.maximum([x.min(initial=np.inf) for x in guides.T], -size)
+        high = np.minimum([x.max(initial=-np.inf) for x in guides.T], 2 * size)
         span = np.maximum(high - low, 1.0)
         count = np.clip(np.ceil(span / _CELL), 1, _MOST_CELLS).astype(np.int64)
         self.corner = low
@@ -148,7 +150,8 @@ class LensRays:
             x = levels[-1]
             odd = ((0, 0), (0, x.shape[1] % 2), (0, x.shape[2] % 2))
             x = np.pad(x, odd, constant_values=np.inf)
-            levels.append(x.reshape(4, x.shape[1] // 2, 2, x.shape[2] // 2, 2).min((2, 4)))
+            x = np.minimum(x[:, ::2], x[:, 1::2])
+            levels.append(np.minimum(x[:, :, ::2], x[:, :, 1::2]))
         self.count = count
         self.cells = lib.Float(np.concatenate([x.reshape(4, -1).T.reshape(-1) for x in levels]))
         starts = np.cumsum([0, *(x[0].size for x in levels)])[:-1]
@@ -234,6 +237,21 @@ def _length(pinhole: list[Float], x: Float, y: Float) -> Float:
     return dr.sqrt(dr.fma(u, u, dr.fma(v, v, 1)))
 
 
+def guides_of(guide: Guide, K: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """(P, 2) guides of directions (P, 3) in camera axes, in pixels."""
+    return pixels_of(K, {"plane": on_plane, "fisheye": equidistant, "panorama": _panorama}[guide](d))
+
+
+def _panorama(d: np.ndarray) -> np.ndarray:
+    """(P, 2) longitude and latitude of directions, in radians."""
+    return LENS_MODELS["equirectangular"].project(d, ())
+
+
+def _finite(values: np.ndarray) -> np.ndarray:
+    """(P,) bool: rows of (P, C) whose numbers all are finite; by columns, which is faster than along short rows."""
+    return np.logical_and.reduce([np.isfinite(x) for x in values.T])
+
+
 def on_plane(d: np.ndarray) -> np.ndarray:
     """(P, 2) of directions on the plane z = 1."""
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
@@ -266,8 +284,12 @@ def tile_boxes(values: np.ndarray, tile: int, centers: bool) -> np.ndarray:
     rows, columns = -(-height // tile), -(-width // tile)
     padded = np.full((rows * tile, columns * tile, channels), np.nan)
     padded[:height, :width] = values
-    cells = padded.reshape(rows, tile, columns, tile, channels).swapaxes(1, 2).reshape(rows * columns, -1, channels)
-    least, most = np.fmin.reduce(cells, 1), np.fmax.reduce(cells, 1)
+    # Rows first: these are long runs in memory.
+    lines = padded.reshape(rows, tile, -1)
+    least, most = (
+        reduce(reduce(lines, 1).reshape(rows * columns, tile, channels), 1)
+        for reduce in (np.fmin.reduce, np.fmax.reduce)
+    )
     middle = 0.5 * (least + most)
     middle = (np.floor(middle) + 0.5 if centers else middle).astype(np.float32)
     half = np.nextafter(np.maximum(most - middle, middle - least).astype(np.float32), np.float32(np.inf))

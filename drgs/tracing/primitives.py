@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Protocol
 
 import drjit as dr
 
+from drgs.lenses import Guide
 from drgs.settings import RenderSettings
 from drgs.tracing.arrays import Float, Lib, Mask
 from drgs.tracing.harmonics import sh_basis, sh_color
@@ -47,11 +48,12 @@ class Lens(Protocol):
     """What bounds on the image ask of a lens (lens_rays.py).
 
     Attributes:
-        fisheye: Guides are those of the equidistant fisheye; else pixels of the pinhole camera.
+        guide: What guides are of: pixels of the pinhole camera (plane), the equidistant fisheye, or longitude and
+            latitude (panorama).
         reach: How far off the camera center rays start at most, in scene units; 0 if all start there.
     """
 
-    fisheye: bool
+    guide: Guide
     reach: float
 
     def pixels(self, guides: list[Float]) -> list[Float]:

@@ -11,6 +11,10 @@ the camera: both coordinates of the fisheye grow with that of the plane. And a s
 within delta of the mean's azimuth: delta from the planes that contain the axis of the camera; theta from those that
 contain the direction e_t in which the azimuth grows, between which all directions lie at angles phi to the axis, with
 tan theta = tan phi / cos(azimuth).
+
+A panorama shows longitude and latitude: the azimuth and the angle of the same sector, around the vertical axis of the
+camera in place of the one along which it looks. What crosses the seam behind the camera, or holds a pole, is looked for
+at every longitude.
 """
 
 from __future__ import annotations
@@ -68,8 +72,8 @@ def silhouette(g: Activated, screen: Screen) -> tuple[list[Float], Mask]:
         axes = [[dr.detach(x * s) * extent for x, s in zip(row, g.scale, strict=True)] for row in g.from_local]
         seen = _on_plane(g, extent, g.scale)
     center = dr.detach(g.center)
-    if lens is not None and lens.fisheye:
-        low, high = _fisheye(center, axes, seen)
+    if lens is not None and lens.guide != "plane":
+        low, high = _fisheye(center, axes, seen) if lens.guide == "fisheye" else _panorama(center, axes)
         middle = [0.5 * (a + b) for a, b in zip(low, high, strict=True)]
         half = [0.5 * (b - a) for a, b in zip(low, high, strict=True)]
         bounds = _in_pixels(screen, middle, half)
@@ -155,6 +159,26 @@ def _fisheye(c: list[Float], axes: list[list[Float]], seen: _Plane) -> tuple[lis
     return low, high
 
 
+def _panorama(c: list[Float], axes: list[list[Float]]) -> tuple[list[Float], list[Float]]:
+    """Least and largest longitude and latitude, in radians; arguments as `_fisheye`."""
+    # With the axis that points up first, z grows from the lower pole to the upper one.
+    turned = [c[2], c[0], -c[1]]
+    sector = _cone(turned, [axes[2], axes[0], [-a for a in axes[1]]])
+    longitude = dr.atan2(turned[1], turned[0])
+    west, east = longitude + dr.atan(sector.left), longitude + dr.atan(sector.right)
+    around = sector.axial | (west < -math.pi) | (east > math.pi)
+    west, east = dr.select(around, -_WHOLE, west), dr.select(around, _WHOLE, east)
+    # Latitude counts downwards, from the horizon; the angle from the upper pole, upwards, from it.
+    top = dr.select(sector.axial, sector.theta - sector.width, sector.first)
+    bottom = dr.select(sector.axial, sector.theta + sector.width, sector.last)
+    north, south = top - math.pi / 2, bottom - math.pi / 2
+    whole = sector.surrounds
+    return (
+        [west, dr.select(whole, -_WHOLE, north)],
+        [east, dr.select(whole, _WHOLE, south)],
+    )
+
+
 def _seen_at(x: Float, y: Float) -> Float:
     """First coordinate under the equidistant fisheye of a point (x, y) of the plane z = 1."""
     r = dr.sqrt(x * x + y * y)
@@ -162,8 +186,52 @@ def _seen_at(x: Float, y: Float) -> Float:
     return x * dr.select(r > 0, dr.atan(r) / dr.select(r > 0, r, 1), 1)
 
 
+class _Sector(NamedTuple):
+    """Directions about that to a mean, in spherical coordinates around the third axis.
+
+    Attributes:
+        theta: Angle of the mean to the axis.
+        e: First two coordinates of the mean's azimuth, as a unit vector.
+        left, right: Tangents of the least and the largest azimuth, from the mean's on.
+        cos_left, cos_right: Cosines of these angles.
+        first, last: Least and largest angle to the axis.
+        width: No direction is farther than this from that to the mean, in radians.
+        axial: The ellipsoid may meet the axis: azimuths, `first` and `last` mean nothing.
+        surrounds: It holds the camera: nothing means anything.
+    """
+
+    theta: Float
+    e: list[Float]
+    left: Float
+    right: Float
+    cos_left: Float
+    cos_right: Float
+    first: Float
+    last: Float
+    width: Float
+    axial: Mask
+    surrounds: Mask
+
+
 def _sector(c: list[Float], axes: list[list[Float]]) -> list[tuple[Float, Float]]:
-    """Least and largest x, and y, of the sector."""
+    """Least and largest x, and y, of the sector under the equidistant fisheye."""
+    s = _cone(c, axes)
+    # Around the axis: no farther from it than the cone that holds both pairs of planes.
+    disc = dr.select(s.surrounds, _WHOLE, dr.minimum(s.theta + s.width, math.pi))
+    cos_delta = dr.minimum(s.cos_left, s.cos_right)
+    outward = dr.select(s.axial, -disc, s.first * cos_delta), dr.select(s.axial, disc, s.last)
+    left, right = s.last * s.left * s.cos_left, s.last * s.right * s.cos_right
+    across = dr.select(s.axial, -disc, left), dr.select(s.axial, disc, right)
+    boxes = []
+    for a, b in ((s.e[0], -s.e[1]), (s.e[1], s.e[0])):
+        products = [(k * r[0], k * r[1]) for k, r in ((a, outward), (b, across))]
+        ends = [(dr.minimum(*pair), dr.maximum(*pair)) for pair in products]
+        boxes.append((ends[0][0] + ends[1][0], ends[0][1] + ends[1][1]))
+    return boxes
+
+
+def _cone(c: list[Float], axes: list[list[Float]]) -> _Sector:
+    """The sector of ellipsoids with means `c` and half axes in the rows of `axes`."""
     rho2 = c[0] * c[0] + c[1] * c[1]
     rho = dr.sqrt(rho2)
     off = rho > 0
@@ -181,11 +249,9 @@ def _sector(c: list[Float], axes: list[list[Float]]) -> list[tuple[Float, Float]
     down, rise, surrounds = _slopes(dot(to, to), dot(to, up), dot(up, up), D2)
     left_, right_, _ = _slopes(dot(to, to), dot(to, around), dot(around, around), D2)
     theta = dr.atan2(rho, c[2])
-    # Around the axis: no farther from it than the cone that holds both pairs of planes.
     steep = dr.maximum(abs(down), rise)
     broad = dr.maximum(abs(left_), right_)
-    disc = dr.minimum(theta + dr.atan(dr.sqrt(steep * steep + broad * broad)), math.pi)
-    disc = dr.select(surrounds, _WHOLE, disc)
+    width = dr.atan(dr.sqrt(steep * steep + broad * broad))
     # Off the axis. cos(delta), and how theta differs from phi at it.
     cos_left, cos_right = dr.rsqrt(1 + left * left), dr.rsqrt(1 + right * right)
     cos_delta = dr.minimum(cos_left, cos_right)
@@ -193,14 +259,7 @@ def _sector(c: list[Float], axes: list[list[Float]]) -> list[tuple[Float, Float]
     first = dr.select(phi0 <= math.pi / 2, phi0, dr.atan2(dr.sin(phi0), dr.cos(phi0) * cos_delta))
     last = dr.select(phi1 >= math.pi / 2, phi1, dr.atan2(dr.sin(phi1), dr.cos(phi1) * cos_delta))
     axial = wraps | surrounds
-    outward = dr.select(axial, -disc, first * cos_delta), dr.select(axial, disc, last)
-    across = dr.select(axial, -disc, last * left * cos_left), dr.select(axial, disc, last * right * cos_right)
-    boxes = []
-    for a, b in ((e[0], -e[1]), (e[1], e[0])):
-        products = [(k * r[0], k * r[1]) for k, r in ((a, outward), (b, across))]
-        ends = [(dr.minimum(*pair), dr.maximum(*pair)) for pair in products]
-        boxes.append((ends[0][0] + ends[1][0], ends[0][1] + ends[1][1]))
-    return boxes
+    return _Sector(theta, e, left, right, cos_left, cos_right, first, last, width, axial, surrounds)
 
 
 def _slopes(aa: Float, ab: Float, bb: Float, distance2: Float) -> tuple[Float, Float, Mask]:

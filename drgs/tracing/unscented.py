@@ -95,8 +95,8 @@ def _pixels(lib: Lib, g: Activated, camera: Camera, origin: torch.Tensor) -> lis
     axes = [[dr.detach(g.rotation[r][k]) * scale[k] for r in range(3)] for k in range(3)]
     zero = dr.zeros(lib.Float64, dr.width(mean[0]))
     points = [np.stack([(x + zero).numpy() for x in point], 1) for point in _around(mean, axes)]
-    pixels, z = camera.project(np.concatenate(points))
-    front = np.isfinite(pixels).all(1) & ((z > 0) | (camera.model != "pinhole"))
+    pixels, _ = camera.project(np.concatenate(points))
+    front = np.isfinite(pixels).all(1)
     pixels = np.where(front[:, None], pixels, 0.0)
     columns = [np.split(x, 7) for x in (pixels[:, 0], pixels[:, 1], front)]
     floats = [[lib.Float64(np.ascontiguousarray(x)) for x in column] for column in columns[:2]]
