@@ -200,7 +200,7 @@ class Camera:
         # Not `@`: the threads of NumPy's BLAS spin for 25 ms after it, on the cores that render next.
         if not self.is_rolling:
             return np.einsum("hwk,jk->hwj", local, self.c2w[:3, :3])
-        turns = self._line_poses()[:, :3, :3]
+        turns = self.line_poses()[:, :3, :3]
         return np.einsum("hwk,wkj->hwj" if self.shutter in BY_COLUMN else "hwk,hkj->hwj", local, turns)
 
     def pixel_origins(self) -> np.ndarray:
@@ -209,10 +209,15 @@ class Camera:
         """
         if not self.is_rolling:
             return np.broadcast_to(self.center, (self.height, self.width, 3))
-        poses = self._line_poses()
+        poses = self.line_poses()
         centers = -np.einsum("tkj,tk->tj", poses[:, :3, :3], poses[:, :3, 3])
         by_line = centers[None] if self.shutter in BY_COLUMN else centers[:, None]
         return np.broadcast_to(by_line, (self.height, self.width, 3))
+
+    def line_poses(self) -> np.ndarray:
+        """(T,4,4) float64 poses of the lines of a rolling shutter (detached)."""
+        start, end = (_homogeneous(*self._rigid(name)) for name in ("w2c", "w2c_end"))
+        return line_poses(start, end, line_times(self.shutter, self.width, self.height))
 
     def local_directions(self) -> np.ndarray:
         """(H,W,3) float64 unit directions through the pixel centers in camera axes, lens included; warns as
@@ -303,11 +308,6 @@ class Camera:
         pose = getattr(self, name)
         w2c = as_numpy(pose).astype(np.float64)
         return rigid(w2c) if is_tensor(pose) else (w2c[:3, :3], w2c[:3, 3])
-
-    def _line_poses(self) -> np.ndarray:
-        """(T,4,4) float64 poses of the lines of a rolling shutter (detached)."""
-        start, end = (_homogeneous(*self._rigid(name)) for name in ("w2c", "w2c_end"))
-        return line_poses(start, end, line_times(self.shutter, self.width, self.height))
 
     def _camera_directions(self, pixels: np.ndarray) -> np.ndarray:
         """(P,3) unit directions in the camera's frame through pixels (P,2)."""

@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 
 from drgs.guards.arguments import ArgumentError
@@ -55,9 +56,7 @@ _INSTEAD = {
     "distributed": "one process renders; split the cameras among processes yourself",
     "lidar_coeffs": _RAYS,
     "external_distortion_coeffs": _RAYS,
-    "ftheta_coeffs": _RAYS,
     "camera_model='ortho'": _RAYS,
-    "camera_model='ftheta'": _RAYS,
     "camera_model='lidar'": _RAYS,
     "with_ut without with_eval3d": "the image plane's Gaussians are those of the EWA model here; pass both, or neither",
 }
@@ -136,13 +135,20 @@ def lenses_of(
     radial: torch.Tensor | None,
     tangential: torch.Tensor | None,
     prism: torch.Tensor | None,
+    ftheta: Any,
+    Ks: torch.Tensor,
 ) -> list[list[dict[str, Any]]]:
     """Of each batch and camera, the fields of `Camera` that say what lens it has; empty ones of pinholes.
 
     gsplat's radial coefficients of a pinhole are OpenCV's k1 to k6, whose order has the tangential p1, p2 behind k2; of
     a fisheye its k1 to k4.
     """
-    one_of("camera_model", model, ("pinhole", "fisheye"))
+    one_of("camera_model", model, ("pinhole", "fisheye", "ftheta"))
+    if (model == "ftheta") != (ftheta is not None):
+        raise ArgumentError(
+            f"rasterization: ftheta_coeffs must come with camera_model='ftheta', and with no other, got {model!r} and "
+            f"{'none' if ftheta is None else 'some'}; change one of them"
+        )
     given = {
         "radial_coeffs": (radial, 4 if model == "fisheye" else 6),
         "tangential_coeffs": (tangential, 2),
@@ -152,8 +158,8 @@ def lenses_of(
     for name, (x, width) in given.items():
         if x is None:
             continue
-        if model == "fisheye" and name != "radial_coeffs":
-            raise ArgumentError(f"rasterization: {name} must be of camera_model='pinhole', got fisheye; drop it")
+        if model == "ftheta" or (model == "fisheye" and name != "radial_coeffs"):
+            raise ArgumentError(f"rasterization: {name} must be of camera_model='pinhole', got {model}; drop it")
         if tuple(x.shape) != (*lead, count, width):
             raise ArgumentError(
                 f"rasterization: {name} must have shape {(*lead, count, width)} for camera_model={model!r}, got "
@@ -161,6 +167,9 @@ def lenses_of(
             )
         values[name] = x.detach().cpu().double().reshape(-1, count, width)  # as of intrinsics, no gradient
     batches = math.prod(lead)
+    if model == "ftheta":
+        centers = Ks.detach().cpu().double().reshape(batches, count, 3, 3)[..., :2, 2]  # no gradient, as of others
+        return [[_ftheta(ftheta, *center.tolist()) for center in batch] for batch in centers]
     if model == "pinhole" and not values:
         return [[{} for _ in range(count)] for _ in range(batches)]
     zeros = {name: torch.zeros(batches, count, width, dtype=torch.float64) for name, (_, width) in given.items()}
@@ -169,6 +178,22 @@ def lenses_of(
         return [[{"model": "opencv_fisheye", "distortion": tuple(row.tolist())} for row in batch] for batch in k]
     every = torch.cat([k[..., :2], p, k[..., 2:], *([s] if "thin_prism_coeffs" in values else [])], -1)
     return [[{"model": "opencv", "distortion": tuple(row.tolist())} for row in batch] for batch in every]
+
+
+def _ftheta(coefficients: Any, cx: float, cy: float) -> dict[str, Any]:
+    """Fields of `Camera` of gsplat's `FThetaCameraDistortionParameters`: its polynomial from angles to pixels, whose
+    principal point counts from the center of the first pixel. `max_angle` plays no role for rays.
+    """
+    kind = str(getattr(coefficients.reference_poly, "name", coefficients.reference_poly))
+    polynomial = [float(x) for x in coefficients.angle_to_pixeldist_poly]
+    if not kind.endswith("ANGLE_TO_PIXELDIST") or polynomial[0] != 0:
+        raise NotImplementedError(
+            "rasterization: ftheta_coeffs must have the reference polynomial ANGLE_TO_PIXELDIST without a constant "
+            f"term, got {kind} with {polynomial[0]:g}; {_RAYS}"
+        )
+    K = np.array([[1.0, 0.0, cx + 0.5], [0.0, 1.0, cy + 0.5], [0.0, 0.0, 1.0]])
+    linear = [float(x) for x in coefficients.linear_cde]
+    return {"K": K, "model": "ftheta", "distortion": (*polynomial[1:], *linear)}
 
 
 def shutter_of(rolling_shutter: Any, viewmats_rs: torch.Tensor | None) -> str:

@@ -109,7 +109,7 @@ def rasterization(
         absgrad: Whether a backward pass leaves the sum over all pixels of the absolute gradients by projected means in
             `meta["means2d"].absgrad`, in pixels; of the rasterizer's own model.
         rasterize_mode: classic, or antialiased: opacities times sqrt(det Sigma / det (Sigma + eps2d I)).
-        camera_model: One of pinhole and fisheye, which are OpenCV's.
+        camera_model: One of pinhole and fisheye, which are OpenCV's, and ftheta, NVIDIA's.
         covars: (..., N, 3, 3) covariances instead of `quats` and `scales`; differentiated in reverse mode. Where two
             eigenvalues of one are nearly the same, its derivative takes two more images.
         with_eval3d: Gaussians are evaluated along rays, as 3DGUT does: preset `3dgut`.
@@ -121,6 +121,8 @@ def rasterization(
         radial_coeffs: (..., C, 6) k1 to k6 of a pinhole, (..., C, 4) k1 to k4 of a fisheye; no gradient.
         tangential_coeffs: (..., C, 2) p1, p2.
         thin_prism_coeffs: (..., C, 4) s1 to s4.
+        ftheta_coeffs: gsplat's `FThetaCameraDistortionParameters`, or what has its attributes, whose reference is the
+            polynomial from angles to pixels.
         rolling_shutter: A member of gsplat's `RollingShutterType`, or its name.
         viewmats_rs: (..., C, 4, 4) poses at the end of the exposure, of rolling shutters.
         extra_signals: (..., N, E) or (..., C, N, E), more channels, drawn to `meta["render_extra_signals"]` (..., C, H,
@@ -156,8 +158,7 @@ def rasterization(
         distributed=distributed,
         lidar_coeffs=lidar_coeffs is not None,
         external_distortion_coeffs=external_distortion_coeffs is not None,
-        ftheta_coeffs=ftheta_coeffs is not None,
-        **{f"camera_model={name!r}": camera_model == name for name in ("ortho", "ftheta", "lidar")},
+        **{f"camera_model={name!r}": camera_model == name for name in ("ortho", "lidar")},
         **{"with_ut without with_eval3d": with_ut and not with_eval3d and preset is None},
     )
     check_unscented(ut_params)
@@ -198,7 +199,8 @@ def rasterization(
             f"rasterization: viewmats must hold at least one camera, got shape {tuple(viewmats.shape)}; skip the call"
         )
     shutter = shutter_of(rolling_shutter, viewmats_rs)
-    lenses = lenses_of(camera_model, lead, count, radial_coeffs, tangential_coeffs, thin_prism_coeffs)
+    coefficients = radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs
+    lenses = lenses_of(camera_model, lead, count, *coefficients, Ks)
     _check_along_rays(settings, shutter != "global", bool(lenses[0][0]), rays, mode, return_normals)
     _check_rays(rays, (*lead, count, height, width, 6))
     extra = None if extra_signals is None else _for_batches(extra_signals, extra_signals_sh_degree, lead)
@@ -452,7 +454,7 @@ def _check_along_rays(
     """Refuse what only responses along rays have."""
     asked = {
         "rolling_shutter": rolling,
-        "distortion coefficients and camera_model='fisheye'": lens,
+        "distortion coefficients and camera models other than pinhole": lens,
         "rays": rays is not None,
         "render modes with d and Ed": mode.depth == "hit",
         "return_normals": normals,

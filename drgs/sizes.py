@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.shutters import BY_COLUMN, FORWARD
+
 if TYPE_CHECKING:
     from drgs.cameras import Camera
 
@@ -35,10 +37,19 @@ def by_share(camera: Camera, share: float) -> Camera:
 
 
 def cropped(camera: Camera, x: int, y: int, width: int, height: int) -> Camera:
-    """A camera that shows a part of another one's image: column `x` and row `y` of that are its first ones."""
+    """A camera that shows a part of another one's image: column `x` and row `y` of that are its first ones.
+
+    Of a rolling shutter each line keeps the pose that it has in the whole; poses are then numbers.
+    """
     K = np.array(camera.K, float)
     K[:2, 2] -= x, y
-    return dataclasses.replace(camera, K=K, width=width, height=height)
+    part = dataclasses.replace(camera, K=K, width=width, height=height)
+    if not camera.is_rolling:
+        return part
+    start, count = (x, width) if camera.shutter in BY_COLUMN else (y, height)
+    poses = camera.line_poses()[start : start + count]
+    first, last = (poses[0], poses[-1]) if camera.shutter in FORWARD else (poses[-1], poses[0])
+    return dataclasses.replace(part, w2c=first, w2c_end=last)
 
 
 def resized_alike(camera: Camera, sizes: dict[tuple[int, int], tuple[int, int]]) -> Camera:

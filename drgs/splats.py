@@ -153,15 +153,15 @@ def cameras_of(
 
     Args:
         viewmats, Ks, width, height: Arguments of `drgs.rasterization`.
-        lenses: Fields of `Camera` that say what lens and shutter each camera has; empty: pinholes.
+        lenses: Fields of `Camera` that say what lens and shutter each camera has, K among them where it is not that of
+            `Ks`; empty: pinholes.
     """
     return [
         Camera(
-            K=runtime.unwrapped(K, lambda K: K.cpu().double().numpy()),
+            **{"K": runtime.unwrapped(K, lambda K: K.cpu().double().numpy()), **lens},
             w2c=viewmat,
             width=width,
             height=height,
-            **lens,
         )
         for viewmat, K, lens in zip(viewmats, Ks, lenses or [{}] * len(Ks), strict=True)
     ]

@@ -355,9 +355,9 @@ def test_forward_mode_is_the_transpose():
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        ({"camera_model": "fisheye"}, ValueError, "camera_model='fisheye' must come with with_eval3d=True"),
+        ({"camera_model": "fisheye"}, ValueError, "camera models other than pinhole must come with with_eval3d=True"),
         ({"camera_model": "ortho"}, NotImplementedError, "camera_model='ortho' is not supported; pass its rays"),
-        ({"camera_model": "mirror"}, ValueError, "camera_model must be one of pinhole, fisheye, got 'mirror'"),
+        ({"camera_model": "mirror"}, ValueError, "camera_model must be one of pinhole, fisheye, ftheta, got 'mirror'"),
         ({"lidar_coeffs": 1}, NotImplementedError, "lidar_coeffs is not supported; pass its rays as rays="),
         ({"covars": torch.eye(3)}, ValueError, r"covars must be a tensor of shape .*got \(3, 3\)"),
         ({"quats": None}, ValueError, "quats and scales must be tensors where there are no covars"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import enum
 import math
+import types
 
 import pytest
 import torch
@@ -100,6 +101,49 @@ def test_images_and_gradients_through_lenses(lens):
     expected = torch.autograd.grad((image * u).sum(), list(theirs.values()))
     for name, a, b in zip(names, mine, expected, strict=True):
         assert float((a - b).norm()) < 2e-4 * float(b.norm()), name
+
+
+def test_ftheta():
+    """gsplat's own parameters: pixels by a polynomial of the angle, from the center of the first pixel."""
+    given = arguments(n=30, width=30, height=26)
+    polynomial = (0.0, 16.0, 0.3, -0.5, 0.1, 0.0)
+    made = types.SimpleNamespace(
+        reference_poly=types.SimpleNamespace(name="ANGLE_TO_PIXELDIST"),
+        angle_to_pixeldist_poly=polynomial,
+        linear_cde=(1.02, 0.01, -0.02),
+        max_angle=2.0,
+    )
+    found = drgs.rasterization(**given, camera_model="ftheta", ftheta_coeffs=made, with_ut=True, with_eval3d=True)[0]
+    K = given["Ks"][0].numpy()
+    x, y = (torch.arange(n, dtype=torch.float64) for n in (30, 26))  # pixel centers, as that model counts them
+    u, v = torch.meshgrid(x - K[0, 2], y - K[1, 2], indexing="xy")
+    c, d, e = made.linear_cde
+    p, q = (u - d * v) / (c - e * d), (c * v - e * u) / (c - e * d)
+    radius = torch.hypot(p, q)
+    angle = radius / polynomial[1]
+    for _ in range(50):
+        value = sum(k * angle**i for i, k in enumerate(polynomial))
+        slope = sum(i * k * angle ** (i - 1) for i, k in enumerate(polynomial) if i)
+        angle = angle - (value - radius) / slope
+    scale = torch.where(radius > 0, angle.sin() / radius, 0.0)
+    local = torch.stack([p * scale, q * scale, angle.cos()], -1)
+    w2c = given["viewmats"][0]
+    d = local @ w2c[:3, :3]
+    rays = (-w2c[:3, 3] @ w2c[:3, :3]).expand_as(d), d
+    out, image = oracle(given, {}, RenderSettings.preset("3dgut", culling="extent"), rays=rays)
+    whole = drgs.rasterization(**given, camera_model="ftheta", ftheta_coeffs=made, with_eval3d=True)[0]
+    assert float((whole[0] - image).abs()[~out.ambiguous].max()) < 2e-5
+    own = {"model": "ftheta", "distortion": (*polynomial[1:], *made.linear_cde)}
+    own["K"] = [[1.0, 0.0, K[0, 2] + 0.5], [0.0, 1.0, K[1, 2] + 0.5], [0.0, 0.0, 1.0]]
+    camera = Camera(w2c=w2c, width=30, height=26, **own)
+    culled = reference.render(gaussians_of(given), camera, UT, tolerance=1e-5)
+    seen = culled.rgb + (1 - culled.alpha[..., None]) * given["backgrounds"][0]
+    assert float((found[0] - seen).abs()[~culled.ambiguous].max()) < 2e-5
+    made.reference_poly = "PIXELDIST_TO_ANGLE"
+    with pytest.raises(NotImplementedError, match="must have the reference polynomial ANGLE_TO_PIXELDIST.*rays="):
+        drgs.rasterization(**given, camera_model="ftheta", ftheta_coeffs=made, with_eval3d=True)
+    with pytest.raises(ValueError, match="ftheta_coeffs must come with camera_model='ftheta'"):
+        drgs.rasterization(**given, camera_model="ftheta", with_eval3d=True)
 
 
 @pytest.mark.parametrize("lens", ["pinhole", "opencv"])

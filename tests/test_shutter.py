@@ -15,6 +15,7 @@ from drgs import fisher, reference, render, render_jvp
 from drgs.cameras import Camera
 from drgs.settings import RenderSettings
 from drgs.shutters import SHUTTERS, line_poses, line_times
+from drgs.sizes import cropped
 from drgs.tracing import tiles
 from drgs.tracing.free_rays import FreeRays
 
@@ -230,6 +231,17 @@ def test_points_are_seen_by_their_own_line(rng, shutter):
         columns, rows = np.meshgrid(np.arange(cam.width) + 0.5, np.arange(cam.height) + 0.5)
         assert np.abs(pixels - np.stack([columns, rows], -1).reshape(-1, 2)).max() < 1e-6
         assert model == "opencv_fisheye" or (z > 0).all()
+
+
+@pytest.mark.parametrize("shutter", ROLLING)
+def test_crops_keep_the_poses_of_lines(rng, shutter):
+    """A part of an image has the pixels of the whole one, whose order along each ray is its own."""
+    cam = rolling(rng, shutter, "opencv", (40, 30), tensors=False)
+    g = gaussians(rng, 30, 1).detach()
+    settings = RenderSettings(order="ray")
+    part = cropped(cam, 9, 7, 17, 14)
+    whole = render(g, cam, settings).rgb[7:21, 9:26]
+    assert (render(g, part, settings).rgb - whole).abs().max() < 1e-5
 
 
 def test_errors_are_one_line(rng):
