@@ -5,8 +5,8 @@
 
 Fits with and without --undistort, both seen on the held-out photographs as they were taken and on undistorted ones:
 one row a fit in benchmarks/lenses.jsonl, and the table of docs/real-data.md. `--times` measures a frame of the wolf
-through three lenses, in turn in one process, and writes the other table. Scenes are captures by name, or folders. One
-thread.
+through lenses and a rolling shutter, in turn in one process, and writes the other table. Scenes are captures by name,
+or folders. One thread.
 """
 
 from __future__ import annotations
@@ -48,6 +48,12 @@ KEY = ("scene", "undistort", "seed", "offset", "max_steps", "max_pixels", "max_g
 WOLF = DATA / "splats" / "wolf" / "wolf.ply"
 WIDTH, HEIGHT = 480, 320
 TURNS = 9
+SETTINGS = {
+    "`fast`": RenderSettings.preset("fast"),
+    "`3dgut`": RenderSettings.preset("3dgut"),
+    "`3dgut`, `culling=extent`": RenderSettings.preset("3dgut", culling="extent"),
+    "`exact`": RenderSettings.preset("exact"),
+}
 
 
 def cropped(camera: Camera) -> float:
@@ -103,14 +109,20 @@ def table(found: list[dict]) -> str:
 
 
 def cameras(center: np.ndarray, reach: float) -> dict[str, Camera]:
-    """A camera before the wolf, with three lenses of one focal length."""
+    """A camera before the wolf, with lenses of one focal length, and with a rolling shutter."""
     w2c = look_at(center + np.array([0.36, -0.24, -2.28]) * reach, center, (0, -1, 0))
     focal = 1.1 * WIDTH
     pinhole = Camera(intrinsics(focal, focal, WIDTH / 2 + 3, HEIGHT / 2 - 5), w2c, WIDTH, HEIGHT)
+    end = pinhole.w2c.copy()
+    end[:3, 3] += np.array([0.02, 0.01, 0.0]) * reach
     return {
         "pinhole": pinhole,
         "opencv": dataclasses.replace(pinhole, model="opencv", distortion=(-0.1, 0.02, 1e-3, -5e-4)),
         "fisheye": dataclasses.replace(pinhole, model="opencv_fisheye", distortion=(0.03, -0.01, 0.004, -0.001)),
+        "f-theta": dataclasses.replace(
+            pinhole, model="ftheta", distortion=(1.0, 0.01, -0.02, 0.004, -0.001, 1.0, 0.0, 0.0)
+        ),
+        "rolling": dataclasses.replace(pinhole, shutter="rolling_top_to_bottom", w2c_end=end),
     }
 
 
@@ -137,9 +149,9 @@ def times() -> dict:
     center = np.median(means, 0)
     views = cameras(center, float(np.quantile(np.linalg.norm(means - center, axis=1), 0.9)))
     found = []
-    for preset in ("fast", "3dgut", "exact"):
+    for preset, settings in SETTINGS.items():
         for backward in (False, True):
-            runs = {name: frame(g, view, RenderSettings.preset(preset), backward) for name, view in views.items()}
+            runs = {name: frame(g, view, settings, backward) for name, view in views.items()}
             took = interleaved(runs, TURNS, time.process_time)
             found.append({"preset": preset, "backward": backward, "ms": {name: 1000 * x for name, x in took.items()}})
     return {"gaussians": len(g), "times": found, **ran()}
@@ -147,12 +159,13 @@ def times() -> dict:
 
 def times_table(result: dict) -> str:
     """Milliseconds of a pinhole's frame, and what lenses take over it."""
-    lines = ["| preset | | pinhole | `opencv` | `opencv_fisheye` |", "|---|---|---|---|---|"]
+    lines = ["| preset | | pinhole | `opencv` | `opencv_fisheye` | `ftheta` | rolling shutter |"]
+    lines += ["|---|---|---|---|---|---|---|"]
     for row in result["times"]:
         plain = row["ms"]["pinhole"]
-        ratios = [f"{row['ms'][name] / plain:.2f}" for name in ("opencv", "fisheye")]
+        ratios = [f"{row['ms'][name] / plain:.2f}" for name in ("opencv", "fisheye", "f-theta", "rolling")]
         what = "image and gradients" if row["backward"] else "image"
-        lines.append(f"| `{row['preset']}` | {what} | {plain:.0f} ms | {' | '.join(ratios)} |")
+        lines.append(f"| {row['preset']} | {what} | {plain:.0f} ms | {' | '.join(ratios)} |")
     return "\n".join(lines)
 
 
