@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -12,11 +11,9 @@ from drgs.cameras import Camera
 from drgs.ellipsoids import semi_axes
 from drgs.settings import RenderSettings
 from drgs.splats import Splats
+from drgs.tracing.unscented import DILATION, EXTENT, LEAST_OPACITY, MARGIN, OF_COVARIANCE, OF_MEAN, SPREAD
 
 __all__ = ["projected", "unscented"]
-
-_EXTENT = 3.33  # standard deviations
-_OPACITY = 1 / 255
 
 
 def projected(
@@ -65,8 +62,8 @@ def projected(
             compensation = (sharp.clamp_min(1e-30) / blurred).sqrt().to(splats.means.dtype)
     with torch.no_grad():  # `meta` has no graph
         opacity = splats.opacities.to(**like) * (1 if compensation is None else compensation)
-        extent = (2 * (opacity / _OPACITY).clamp_min(1).log()).sqrt().clamp_max(_EXTENT)
-        valid = valid & (opacity >= _OPACITY)  # not in place: the graph of z keeps the mask
+        extent = (2 * (opacity / LEAST_OPACITY).clamp_min(1).log()).sqrt().clamp_max(EXTENT)
+        valid = valid & (opacity >= LEAST_OPACITY)  # not in place: the graph of z keeps the mask
         radii = torch.ceil(extent[:, None] * torch.stack([xx + eps, yy + eps], 1).sqrt())
         covariance = torch.stack([xx + eps, xy, yy + eps], 1)
         meta = _meta(splats, camera, means2d.detach(), covariance, blurred, radii, valid, z)
@@ -82,30 +79,31 @@ def unscented(splats: Splats, camera: Camera, depths: torch.Tensor, near: float)
     """
     with torch.no_grad():  # `meta` has no graph
         means = splats.means.detach().cpu().double()
-        steps = math.sqrt(0.03) * semi_axes(splats.quats.detach().cpu().double(), splats.scales.detach().cpu().double())
+        steps = SPREAD * semi_axes(splats.quats.detach().cpu().double(), splats.scales.detach().cpu().double())
         steps = steps.mT  # rows are half axes
         points = torch.cat([means[:, None], means[:, None] + steps, means[:, None] - steps], 1)
         at, _ = camera.project(points.reshape(-1, 3).numpy())
         seen = np.isfinite(at).all(1)
         pixels = torch.from_numpy(np.where(seen[:, None], at, 0.0)).reshape(-1, 7, 2)
         size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
-        within = ((pixels >= -0.1 * size) & (pixels < 1.1 * size)).all(-1) & torch.from_numpy(seen).reshape(-1, 7)
-        weights = torch.tensor([1 - 3 / 0.03, *[0.5 / 0.03] * 6], dtype=torch.float64)
-        means2d = torch.einsum("k,nki->ni", weights, pixels)
-        weights[0] += 1 - 0.01 + 2
+        within = ((pixels >= -MARGIN * size) & (pixels < (1 + MARGIN) * size)).all(-1) & torch.from_numpy(seen).reshape(
+            -1, 7
+        )
+        of_mean, of_covariance = (torch.tensor(x, dtype=torch.float64) for x in (OF_MEAN, OF_COVARIANCE))
+        means2d = torch.einsum("k,nki->ni", of_mean, pixels)
         off = pixels - means2d[:, None]
         xx, xy, yy = (
-            torch.einsum("k,nk,nk->n", weights, off[..., i], off[..., j]) for i, j in ((0, 0), (0, 1), (1, 1))
+            torch.einsum("k,nk,nk->n", of_covariance, off[..., i], off[..., j]) for i, j in ((0, 0), (0, 1), (1, 1))
         )
-        xx, yy = xx + 0.3, yy + 0.3
+        xx, yy = xx + DILATION, yy + DILATION
         det = xx * yy - xy * xy
         opacity = splats.opacities.detach().cpu().double()
-        extent = (2 * (opacity / _OPACITY).clamp_min(1).log()).sqrt().clamp_max(_EXTENT)
+        extent = (2 * (opacity / LEAST_OPACITY).clamp_min(1).log()).sqrt().clamp_max(EXTENT)
         middle = 0.5 * (xx + yy)
         largest = middle + (middle * middle - det).clamp_min(0.01).sqrt()
         variance = torch.minimum(torch.stack([xx, yy], 1), largest[:, None]).clamp_min(0)
         radii = torch.ceil(extent[:, None] * variance.sqrt())
-        valid = within.any(1) & (det > 0) & (depths.detach().cpu() > near) & (opacity >= _OPACITY)
+        valid = within.any(1) & (det > 0) & (depths.detach().cpu() > near) & (opacity >= LEAST_OPACITY)
         covariance = torch.stack([xx, xy, yy], 1)
         return _meta(splats, camera, means2d, covariance, det, radii, valid, depths.detach().cpu().double())
 

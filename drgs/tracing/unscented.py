@@ -20,17 +20,32 @@ from drgs.lenses import distorted, fisheye_polynomial
 from drgs.tracing.arrays import Float, Lib, Mask
 from drgs.tracing.primitives import Activated
 
-__all__ = ["unscented_boxes"]
+__all__ = [
+    "DILATION",
+    "EXTENT",
+    "LEAST_OPACITY",
+    "MARGIN",
+    "OF_COVARIANCE",
+    "OF_MEAN",
+    "SPREAD",
+    "unscented_boxes",
+]
 
 _ALPHA, _BETA = 0.1, 2.0
-_SPREAD = _ALPHA * math.sqrt(3.0)  # standard deviations
-_OTHERS = 1 / (2 * _SPREAD**2)  # weight of each point but the mean
-_MEAN = 1 - 6 * _OTHERS  # weight of the mean's projection in the mean, and
-_MEAN_COVARIANCE = _MEAN + 1 - _ALPHA**2 + _BETA  # in the covariance
-_MARGIN = 0.1  # of the image, around it: a Gaussian without a point within is not drawn
-_DILATION = 0.3  # px^2, gsplat's default
-_EXTENT = 3.33  # standard deviations, or where the opacity falls to
-_OPACITY = 1 / 255
+SPREAD = _ALPHA * math.sqrt(3.0)
+"""Distance of the six points from the mean, in standard deviations."""
+_OTHERS = 1 / (2 * SPREAD**2)
+OF_MEAN = (1 - 6 * _OTHERS, *[_OTHERS] * 6)
+"""Weights of the mean's and the six points' places in the mean on the image."""
+OF_COVARIANCE = (OF_MEAN[0] + 1 - _ALPHA**2 + _BETA, *OF_MEAN[1:])
+"""The same in the covariance."""
+MARGIN = 0.1
+"""Of the image, around it: a Gaussian without a point within is not drawn."""
+DILATION = 0.3
+"""px^2, added to the covariance: gsplat's default."""
+EXTENT = 3.33
+"""Standard deviations of a box, or where the opacity falls to `LEAST_OPACITY`."""
+LEAST_OPACITY = 1 / 255
 _FINE, _COARSE = 8, 16  # pixels of gsplat's tiles: in images of less than `_HIGH` rows, and in others
 _HIGH = 1080
 _INSIDE = 0.25  # px, off the edge of a tile, so that rounding does not take its neighbor
@@ -49,25 +64,25 @@ def unscented_boxes(lib: Lib, g: Activated, camera: Camera, origin: torch.Tensor
     points = _pixels(lib, g, camera, origin)
     there = lib.Bool(False)
     for x, y, front in points:
-        margin_x, margin_y = _MARGIN * camera.width, _MARGIN * camera.height
+        margin_x, margin_y = MARGIN * camera.width, MARGIN * camera.height
         inside = (x >= -margin_x) & (x < camera.width + margin_x)
         there |= front & inside & (y >= -margin_y) & (y < camera.height + margin_y)
-    weights = [_MEAN, *[_OTHERS] * 6]
-    mean = [sum(w * p[k] for w, p in zip(weights, points, strict=True)) for k in range(2)]
-    weights[0] = _MEAN_COVARIANCE
+    mean = [sum(w * p[k] for w, p in zip(OF_MEAN, points, strict=True)) for k in range(2)]
     off = [(p[0] - mean[0], p[1] - mean[1]) for p in points]
-    xx, xy, yy = (sum(w * o[i] * o[j] for w, o in zip(weights, off, strict=True)) for i, j in ((0, 0), (0, 1), (1, 1)))
-    xx += _DILATION
-    yy += _DILATION
+    xx, xy, yy = (
+        sum(w * o[i] * o[j] for w, o in zip(OF_COVARIANCE, off, strict=True)) for i, j in ((0, 0), (0, 1), (1, 1))
+    )
+    xx += DILATION
+    yy += DILATION
     det = xx * yy - xy * xy
     opacity = dr.detach(g.opacity)  # boxes have no derivative
-    extent = dr.minimum(dr.sqrt(2 * dr.log(dr.maximum(opacity / _OPACITY, 1))), _EXTENT)
+    extent = dr.minimum(dr.sqrt(2 * dr.log(dr.maximum(opacity / LEAST_OPACITY, 1))), EXTENT)
     middle = 0.5 * (xx + yy)
     largest = middle + dr.sqrt(dr.maximum(middle * middle - det, 0.01))
     size = F(camera.width), F(camera.height)
     tile = _FINE if camera.height < _HIGH else _COARSE
     low, high = [], []
-    seen = there & (det > 0) & (opacity >= _OPACITY)
+    seen = there & (det > 0) & (opacity >= LEAST_OPACITY)
     for m, variance, side in zip(mean, (xx, yy), size, strict=True):
         radius = dr.ceil(extent * dr.sqrt(dr.minimum(variance, largest)))
         seen &= (m + radius > 0) & (m - radius < side) & (radius > 0)
@@ -79,7 +94,7 @@ def unscented_boxes(lib: Lib, g: Activated, camera: Camera, origin: torch.Tensor
 def _pixels(lib: Lib, g: Activated, camera: Camera, origin: torch.Tensor) -> list[tuple[Float, Float, Mask]]:
     """Pixel of the mean and of the six points around it, and whether it is in front of the camera; else at (0, 0)."""
     center = [dr.detach(x) for x in g.center]  # numbers, as all of this
-    scale = [dr.detach(s) * _SPREAD for s in g.scale]
+    scale = [dr.detach(s) * SPREAD for s in g.scale]
     if not camera.is_rolling and camera.model in _PLANES:
         axes = [[dr.detach(g.from_local[r][k]) * scale[k] for r in range(3)] for k in range(3)]
         fx, skew, cx, fy, cy = (
