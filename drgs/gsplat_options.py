@@ -111,6 +111,8 @@ def settings_of(
         key = "z" if by_z else "distance"
         if along_rays:
             culling = "ut" if with_ut else "extent"
+            # What is too near by its distance is left out by `rasterization`.
+            near = near if by_z else 0.0
             settings = RenderSettings.preset("3dgut", depth_key=key, culling=culling, near=near)
         else:
             settings = RenderSettings.preset("gsplat", depth_key=key, dilation=eps2d, near=near)

@@ -17,6 +17,7 @@ __all__ = ["projected", "unscented"]
 
 _EXTENT = 3.33  # standard deviations
 _OPACITY = 1 / 255
+_COMPENSATION = 0.005  # the least factor of opacities for the dilation
 
 
 def projected(
@@ -61,8 +62,7 @@ def projected(
         blurred = sharp + eps * (xx + yy + eps)
         compensation = None
         if antialiased:
-            # The square root has no derivative at 0, where the opacity is 0 anyway.
-            compensation = (sharp.clamp_min(1e-30) / blurred).sqrt().to(splats.means.dtype)
+            compensation = (sharp / blurred).clamp_min(_COMPENSATION**2).sqrt().to(splats.means.dtype)
     with torch.no_grad():  # `meta` has no graph
         opacity = splats.opacities.to(**like) * (1 if compensation is None else compensation)
         extent = (2 * (opacity / _OPACITY).clamp_min(1).log()).sqrt().clamp_max(_EXTENT)
@@ -77,8 +77,8 @@ def unscented(splats: Splats, camera: Camera, depths: torch.Tensor, near: float)
     """gsplat's `meta` of a view by the unscented transform (3DGUT: alpha 0.1, beta 2, kappa 0), without a graph.
 
     Args:
-        depths: (N,) camera z of the means, of a rolling shutter in the middle of the exposure.
-        near: Means nearer than that are left out.
+        depths: (N,) camera z or distance of the means, of a rolling shutter in the middle of the exposure.
+        near: Means of no larger depth are left out.
     """
     with torch.no_grad():  # `meta` has no graph
         means = splats.means.detach().cpu().double()
@@ -97,9 +97,12 @@ def unscented(splats: Splats, camera: Camera, depths: torch.Tensor, near: float)
         xx, xy, yy = (
             torch.einsum("k,nk,nk->n", weights, off[..., i], off[..., j]) for i, j in ((0, 0), (0, 1), (1, 1))
         )
+        sharp = xx * yy - xy * xy
         xx, yy = xx + 0.3, yy + 0.3
         det = xx * yy - xy * xy
-        opacity = splats.opacities.detach().cpu().double()
+        # As if what the dilation widens was made fainter, although the opacity along rays is not.
+        shrunk = (sharp / det.clamp_min(1e-30)).clamp_min(_COMPENSATION**2).sqrt()
+        opacity = splats.opacities.detach().cpu().double() * shrunk
         extent = (2 * (opacity / _OPACITY).clamp_min(1).log()).sqrt().clamp_max(_EXTENT)
         middle = 0.5 * (xx + yy)
         largest = middle + (middle * middle - det).clamp_min(0.01).sqrt()

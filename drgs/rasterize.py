@@ -99,7 +99,8 @@ def rasterization(
         viewmats: (..., C, 4, 4) world to camera, OpenCV axes.
         Ks: (..., C, 3, 3) in pixels, pixel centers at +0.5. A skew is followed (gsplat ignores it).
         width, height: Size of every image, in pixels.
-        near_plane, far_plane: Means outside of (near_plane, far_plane] in camera z are left out.
+        near_plane, far_plane: Means outside of (near_plane, far_plane] in camera z are left out, in distance with
+            `with_eval3d` and `global_z_order=False`.
         radius_clip: Gaussians whose radius (`meta["radii"]`) is at most this many pixels in both axes are left out.
         eps2d: Added to the diagonal of the projected covariance, in px^2.
         sh_degree: 0 to 3, or None for plain colors.
@@ -225,6 +226,7 @@ def rasterization(
                     antialiased,
                     with_ut and with_eval3d,
                     with_eval3d and preset is None,
+                    near_plane if with_eval3d and preset is None else settings.near,
                     far_plane,
                     radius_clip,
                     None if backgrounds is None else of(backgrounds)[b, c],
@@ -264,6 +266,7 @@ class _View:
     antialiased: bool
     with_ut: bool
     gsplat_depth: bool
+    near: float
     far: float
     clip: float
     background: torch.Tensor | None
@@ -278,7 +281,9 @@ class _View:
         """The image (H, W, X), its alpha (H, W, 1), and the arrays of `meta`."""
         camera, settings, splats = self.camera, self.settings, self.splats
         local, center = self._seen()
-        meta, compensation = self._projected(local[:, 2].detach())
+        own = local[:, 2:] if settings.depth_key == "z" else local.norm(dim=1, keepdim=True)
+        cut = (own[:, 0] if self.gsplat_depth else local[:, 2]).detach()  # what near and far planes look at
+        meta, compensation = self._projected(cut)
         if compensation is not None:
             splats = dataclasses.replace(splats, opacities=inside_opacities(splats.opacities * compensation))
         # `meta` is to be looked at: no gradient passes through it.
@@ -291,14 +296,13 @@ class _View:
             colors = _evaluated(splats.colors, splats.degree, splats.means - center).clamp_min(0)
             splats = dataclasses.replace(splats, colors=colors, degree=None)
         added = [] if extra is None else [extra]
-        depth = local[:, 2:] if settings.depth_key == "z" else local.norm(dim=1, keepdim=True)
         if self.mode.depth == "gaussian" and self.gsplat_depth:
-            added.append(depth.to(splats.means.dtype))
+            added.append(own.to(splats.means.dtype))
         offsets = None if self.leaf is None else self.leaf - self.leaf.detach()  # zeros with its derivative
         absolute = self.absolute
-        kept = self._kept(meta, local[:, 2].detach())
+        kept = self._kept(meta, cut)
         meta["radii"] = meta["radii"] * kept[:, None]
-        if not bool(kept.all()) and (self.far < _FAR or self.clip > 0):
+        if not bool(kept.all()) and (self.far < _FAR or self.clip > 0 or self.near > settings.near):
             index = kept.nonzero()[:, 0]
             splats = splats.take(index)
             added = [x[index] for x in added]
@@ -357,18 +361,18 @@ class _View:
             center = 0.5 * (center - end[:, 3] @ end[:, :3])
         return means @ pose[:, :3].T + pose[:, 3], center.to(self.splats.means.dtype)
 
-    def _projected(self, z: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor | None]:
+    def _projected(self, depths: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor | None]:
         """`meta`, and what opacities are multiplied with."""
         if self.with_ut or self.camera.is_distorted or self.camera.is_rolling:
-            return unscented(self.splats, self.camera, z, self.settings.near), None
+            return unscented(self.splats, self.camera, depths, self.near), None
         return projected(self.splats, self.camera, self.settings, self.antialiased)
 
-    def _kept(self, meta: dict[str, torch.Tensor], z: torch.Tensor) -> torch.Tensor:
+    def _kept(self, meta: dict[str, torch.Tensor], depths: torch.Tensor) -> torch.Tensor:
         """(N,) which Gaussians are drawn: the renderer itself knows no far plane and no smallest radius."""
-        depths = meta["depths"] if self.settings.planar else z
+        depths = meta["depths"] if self.settings.planar else depths
         kept = depths <= self.far
-        if self.settings.planar or self.settings.near > 0:
-            kept &= depths > self.settings.near
+        if self.settings.planar or self.near > 0:
+            kept &= depths > self.near
         if self.clip > 0:
             kept &= (meta["radii"] > self.clip).any(-1)
         return kept

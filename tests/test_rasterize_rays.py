@@ -321,3 +321,23 @@ def test_meta_by_the_unscented_transform(lens):
         high = ((meta["means2d"][0, i] + radius) / 8).ceil() * 8
         inside = (columns + 0.5 > low[0]) & (columns + 0.5 < high[0]) & (rows + 0.5 > low[1]) & (rows + 0.5 < high[1])
         assert bool(inside.all())
+
+
+def test_near_and_far_are_distances_of_what_is_sorted_by_distance():
+    """A fisheye sees behind itself, and gsplat leaves nothing out there when it sorts by distance."""
+    given = {**arguments(n=60, channels=3), "backgrounds": None}
+    given["viewmats"] = torch.eye(4, dtype=torch.float64)[None]
+    given["means"] = given["means"] - torch.tensor([0.0, 0.0, 3.0])  # all around
+    options = {"camera_model": "fisheye", "with_ut": True, "with_eval3d": True}
+    given["Ks"] = torch.tensor([[[8.0, 0.0, 24.0], [0.0, 8.0, 20.0], [0.0, 0.0, 1.0]]], dtype=torch.float64)
+    z, distance = given["means"][:, 2], given["means"].norm(dim=1)
+    for by_z, depths in ((True, z), (False, distance)):
+        _, alpha, meta = drgs.rasterization(**given, **options, global_z_order=by_z, near_plane=0.5, far_plane=2.5)
+        seen = (meta["radii"][0] > 0).all(-1)
+        assert bool(((depths > 0.5) & (depths <= 2.5))[seen].all())
+        assert torch.allclose(meta["depths"][0][seen], depths[seen])
+        left = {name: given[name][seen] for name in ("means", "quats", "scales", "opacities", "colors")}
+        alone = drgs.rasterization(**{**given, **left}, **options, global_z_order=by_z, near_plane=0.0)[1]
+        assert torch.allclose(alpha, alone, atol=1e-6)
+        assert alpha.any()
+        assert bool((z[seen] < 0).any()) is not by_z

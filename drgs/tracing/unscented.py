@@ -3,8 +3,9 @@ transform estimates it.
 
 The transform (Julier and Uhlmann 1997; Wan and van der Merwe 2000, alpha = 0.1, beta = 2, kappa = 0, as in 3DGUT: Wu
 et al. 2025) projects the mean and six points at sqrt(3) alpha standard deviations around it, and takes a weighted mean
-and covariance of what it finds. What a large Gaussian near the camera covers beyond that box is not drawn: `culling`
-`ut` leaves it out, too. Boxes are of whole tiles and have no derivative.
+and covariance of what it finds. The box reaches to where the opacity, times the square root of by how much the dilation
+shrinks the determinant of that covariance, falls to 1/255. What a large Gaussian near the camera covers beyond it is not
+drawn: `culling` `ut` leaves it out, too. Boxes are of whole tiles and have no derivative.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ _MEAN = 1 - 6 * _OTHERS  # weight of the mean's projection in the mean, and
 _MEAN_COVARIANCE = _MEAN + 1 - _ALPHA**2 + _BETA  # in the covariance
 _MARGIN = 0.1  # of the image, around it: a Gaussian without a point within is not drawn
 _DILATION = 0.3  # px^2, gsplat's default
+_COMPENSATION = 0.005  # the least factor of opacities for it
 _EXTENT = 3.33  # standard deviations, or where the opacity falls to
 _OPACITY = 1 / 255
 _FINE, _COARSE = 8, 16  # pixels of gsplat's tiles: in images of less than `_HIGH` rows, and in others
@@ -57,10 +59,12 @@ def unscented_boxes(lib: Lib, g: Activated, camera: Camera, origin: torch.Tensor
     weights[0] = _MEAN_COVARIANCE
     off = [(p[0] - mean[0], p[1] - mean[1]) for p in points]
     xx, xy, yy = (sum(w * o[i] * o[j] for w, o in zip(weights, off, strict=True)) for i, j in ((0, 0), (0, 1), (1, 1)))
+    sharp = xx * yy - xy * xy
     xx += _DILATION
     yy += _DILATION
     det = xx * yy - xy * xy
-    opacity = dr.detach(g.opacity)  # boxes have no derivative
+    shrunk = dr.sqrt(dr.maximum(sharp / dr.select(det > 0, det, 1), _COMPENSATION**2))
+    opacity = dr.detach(g.opacity) * shrunk  # boxes have no derivative
     extent = dr.minimum(dr.sqrt(2 * dr.log(dr.maximum(opacity / _OPACITY, 1))), _EXTENT)
     middle = 0.5 * (xx + yy)
     largest = middle + dr.sqrt(dr.maximum(middle * middle - det, 0.01))
