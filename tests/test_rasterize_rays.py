@@ -341,3 +341,26 @@ def test_near_and_far_are_distances_of_what_is_sorted_by_distance():
         assert torch.allclose(alpha, alone, atol=1e-6)
         assert alpha.any()
         assert bool((z[seen] < 0).any()) is not by_z
+
+
+def test_a_hit_counts_down_to_the_least_opacity():
+    """gsplat 1.6's kernels have no other cut: what is 3.2 standard deviations off a ray counts if it is opaque."""
+    given = {
+        "means": torch.tensor([[0.0, 0.0, 4.0]], dtype=torch.float64),
+        "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64),
+        "scales": torch.full((1, 3), 0.2, dtype=torch.float64),
+        "colors": torch.ones(1, 1, dtype=torch.float64),
+        "viewmats": torch.eye(4, dtype=torch.float64)[None],
+        "Ks": torch.tensor([[[100.0, 0.0, 32.5], [0.0, 100.0, 0.5], [0.0, 0.0, 1.0]]], dtype=torch.float64),
+        "width": 65,
+        "height": 1,
+    }
+    x = (torch.arange(65, dtype=torch.float64) - 32) / 100
+    rho = 20 * x / (1 + x * x).sqrt()
+    for opacity in (1.0, 0.5):
+        response = opacity * torch.exp(-0.5 * rho**2)
+        expected = torch.where(response < 1 / 255, 0.0, response.clamp(max=0.99))
+        opacities = torch.tensor([opacity], dtype=torch.float64)
+        alpha = drgs.rasterization(**given, opacities=opacities, with_ut=True, with_eval3d=True)[1][0, 0, :, 0]
+        assert float((alpha - expected).abs().max()) < 1e-5
+        assert float(rho[alpha > 0].max()) == pytest.approx(3.2 if opacity == 1 else 3.0, abs=0.15)
