@@ -72,7 +72,8 @@ def refuse(**asked: bool) -> None:
 
 def check_unscented(params: object) -> None:
     """Raise NotImplementedError for parameters of the unscented transform that are not gsplat's defaults."""
-    for name, usual in (("alpha", 0.1), ("beta", 2.0), ("kappa", 0.0), ("in_image_margin_factor", 0.1)):
+    defaults = {"alpha": 0.1, "beta": 2.0, "kappa": 0.0, "in_image_margin_factor": 0.1}
+    for name, usual in {**defaults, "require_all_sigma_points_valid": False}.items():
         value = getattr(params, name, usual)
         if value != usual:
             raise NotImplementedError(

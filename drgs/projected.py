@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from drgs.cameras import Camera
+from drgs.covariances import strained
 from drgs.ellipsoids import semi_axes
 from drgs.settings import RenderSettings
 from drgs.splats import Splats
@@ -47,11 +48,10 @@ def projected(
             u, v = (a.clamp(-0.65 * n / f, 0.65 * n / f) for a, n, f in ((u, camera.width, fx), (v, camera.height, fy)))
         zero = torch.zeros_like(z)
         rows = [fx / z, skew / z + zero, -(fx * u + skew * v) / z, zero, fy / z, -fy * v / z]
-        half_axes = (
-            torch.stack(rows, 1).reshape(-1, 2, 3)
-            @ w2c[:3, :3]
-            @ semi_axes(splats.quats.to(**like), splats.scales.to(**like))
-        )
+        axes = semi_axes(splats.quats.to(**like), splats.scales.to(**like))
+        if splats.strains is not None:
+            axes = strained(axes, splats.strains)
+        half_axes = torch.stack(rows, 1).reshape(-1, 2, 3) @ w2c[:3, :3] @ axes
         a, b = half_axes.unbind(1)
         # The Gram determinant of the rows: thin projections do not cancel as in xx yy - xy^2.
         sharp = torch.linalg.cross(a, b).square().sum(1)

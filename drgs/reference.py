@@ -219,8 +219,8 @@ def _project(
 
 def _unscented(scene: OracleScene, cam: Any, view: OracleRays, offset: Tensor, tolerance: float) -> Tiles:
     """The tiles of gsplat's 3DGUT: of the box of the mean and covariance that the unscented transform finds on the
-    image, with alpha = 0.1, beta = 2, kappa = 0 for three dimensions, hence lambda = alpha^2 3 - 3; opacities fainter by the
-    square root of the ratio of its determinants without and with dilation, no less than 0.005.
+    image, with alpha = 0.1, beta = 2, kappa = 0 for three dimensions, hence lambda = alpha^2 3 - 3; opacities fainter
+    by the square root of the ratio of its determinants without and with dilation, no less than 0.005.
     """
     alpha, beta, dimensions = 0.1, 2.0, 3
     lamb = alpha**2 * dimensions - dimensions

@@ -3,9 +3,9 @@ transform estimates it.
 
 The transform (Julier and Uhlmann 1997; Wan and van der Merwe 2000, alpha = 0.1, beta = 2, kappa = 0, as in 3DGUT: Wu
 et al. 2025) projects the mean and six points at sqrt(3) alpha standard deviations around it, and takes a weighted mean
-and covariance of what it finds. The box reaches to where the opacity, times the square root of by how much the dilation
-shrinks the determinant of that covariance, falls to 1/255. What a large Gaussian near the camera covers beyond it is not
-drawn: `culling` `ut` leaves it out, too. Boxes are of whole tiles and have no derivative.
+and covariance of what it finds. The box reaches to where the opacity, times the root of the ratio of the determinants
+of that covariance without and with dilation, falls to 1/255. What a large Gaussian near the camera covers beyond it is
+not drawn: `culling` `ut` leaves it out, too. Boxes are of whole tiles and have no derivative.
 """
 
 from __future__ import annotations
