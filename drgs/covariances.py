@@ -38,9 +38,11 @@ def factors(
     Raises:
         ValueError: If one is not symmetric, not finite, or has a negative eigenvalue.
     """
-    shape = (*(covars.shape[:-2] if lead is None else lead), 3, 3)
-    if tuple(covars.shape) != shape:
-        raise ArgumentError(f"{where}: covars must have shape {tuple(shape)}, got {tuple(covars.shape)}")
+    is_tensor = isinstance(covars, torch.Tensor)
+    shape = (*(covars.shape[:-2] if is_tensor and lead is None else lead or ()), 3, 3)
+    if not is_tensor or tuple(covars.shape) != shape:
+        got = tuple(covars.shape) if is_tensor else type(covars).__name__
+        raise ArgumentError(f"{where}: covars must be a tensor of shape {shape}, got {got}; pass matrices")
     x = covars.to(torch.float64)
     fixed = x.detach()  # the axes that a change is looked at in have no derivative
     size = fixed.abs().amax((-1, -2)).clamp_min(1e-300)

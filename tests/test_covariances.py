@@ -117,7 +117,8 @@ def test_covariances_that_are_none():
     for bad, message in (
         (covars - 2 * torch.eye(3), "without a negative eigenvalue"),
         (covars + torch.ones(3, 3).triu(1), "symmetric to 1e-5"),
-        (covars[:4], r"covars must have shape \(8, 3, 3\), got \(4, 3, 3\)"),
+        (covars[:4], r"covars must be a tensor of shape \(8, 3, 3\), got \(4, 3, 3\); pass matrices"),
+        (covars.numpy(), r"covars must be a tensor of shape \(8, 3, 3\), got ndarray; pass matrices"),
         (covars * math.nan, "covars must be finite"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -243,9 +243,11 @@ def test_no_ray_shows_the_background():
 
 
 def test_arguments_of_speed_and_memory_change_nothing():
-    """Tile size, renderer, unscented transform, packing and sorting: gsplat's business."""
+    """Tile size, renderer, packing and sorting: gsplat's business. So are boxes, but for what lies at their edges."""
     given = scene()
-    plain = drgs.rasterization(**given, with_eval3d=True)[0]
+    plain = drgs.rasterization(**given, with_ut=True, with_eval3d=True)[0]
+    whole = drgs.rasterization(**given, with_eval3d=True)[0]
+    torch.testing.assert_close(plain, whole, rtol=0, atol=1 / 255)
     kernel = types.SimpleNamespace(name="RendererConfig_ParallelBatch")
     free = {"tile_size": 8, "renderer_config": kernel, "ut_params": kernel, "packed": False, "segmented": True}
     same = drgs.rasterization(**given, with_ut=True, with_eval3d=True, channel_chunk=1, eps2d=0.1, **free)[0]
