@@ -71,7 +71,8 @@ def refuse(**asked: bool) -> None:
 
 def check_unscented(params: object) -> None:
     """Raise NotImplementedError for parameters of the unscented transform that are not gsplat's defaults."""
-    for name, usual in (("alpha", 0.1), ("beta", 2.0), ("kappa", 0.0), ("in_image_margin_factor", 0.1)):
+    defaults = {"alpha": 0.1, "beta": 2.0, "kappa": 0.0, "in_image_margin_factor": 0.1}
+    for name, usual in {**defaults, "require_all_sigma_points_valid": False}.items():
         value = getattr(params, name, usual)
         if value != usual:
             raise NotImplementedError(
@@ -110,6 +111,8 @@ def settings_of(
         key = "z" if by_z else "distance"
         if along_rays:
             culling = "ut" if with_ut else "extent"
+            # What is too near by its distance is left out by `rasterization`.
+            near = near if by_z else 0.0
             settings = RenderSettings.preset("3dgut", depth_key=key, culling=culling, near=near)
         else:
             settings = RenderSettings.preset("gsplat", depth_key=key, dilation=eps2d, near=near)

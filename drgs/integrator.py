@@ -186,8 +186,10 @@ def render_with_offsets(
     rays: torch.Tensor | np.ndarray | None = None,
     mean_offsets: torch.Tensor | None = None,
     mean_absolute: torch.Tensor | None = None,
+    strains: torch.Tensor | None = None,
 ) -> Output:
-    """What `render` gives, whose Gaussians' projected means can be moved: what density control of rasterizers reads.
+    """What `render` gives, with derivatives by what is no parameter of Gaussians: by projected means, which density
+    control of rasterizers reads, and by covariances.
 
     Args:
         gaussians, camera, settings, outputs, rays: Arguments of `render`.
@@ -195,6 +197,8 @@ def render_with_offsets(
             by them is that by the projected means, all else held.
         mean_absolute: (N, 2) zeros; what a backward pass gives as their gradient is the sum over all pixels of the
             absolute value of each pixel's gradient by the projected means (Ye et al. 2024, AbsGS).
+        strains: (N, 6) zeros, the elements xx, xy, xz, yy, yz, zz of a symmetric E that stretches each Gaussian by
+            I + E: `drgs.covariances.factors`.
     """
     check_view("render", gaussians, camera, settings)
     call = Call(
@@ -205,6 +209,7 @@ def render_with_offsets(
         pixel_rays=rays,
         mean_offsets=mean_offsets,
         mean_absolute=mean_absolute,
+        strains=strains,
     )
     with own_errors():
         return call.output(differentiable(call))

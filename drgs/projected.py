@@ -8,10 +8,20 @@ import numpy as np
 import torch
 
 from drgs.cameras import Camera
+from drgs.covariances import strained
 from drgs.ellipsoids import semi_axes
 from drgs.settings import RenderSettings
 from drgs.splats import Splats
-from drgs.tracing.unscented import DILATION, EXTENT, LEAST_OPACITY, MARGIN, OF_COVARIANCE, OF_MEAN, SPREAD
+from drgs.tracing.unscented import (
+    DILATION,
+    EXTENT,
+    LEAST_COMPENSATION,
+    LEAST_OPACITY,
+    MARGIN,
+    OF_COVARIANCE,
+    OF_MEAN,
+    SPREAD,
+)
 
 __all__ = ["projected", "unscented"]
 
@@ -43,11 +53,10 @@ def projected(
             u, v = (a.clamp(-0.65 * n / f, 0.65 * n / f) for a, n, f in ((u, camera.width, fx), (v, camera.height, fy)))
         zero = torch.zeros_like(z)
         rows = [fx / z, skew / z + zero, -(fx * u + skew * v) / z, zero, fy / z, -fy * v / z]
-        half_axes = (
-            torch.stack(rows, 1).reshape(-1, 2, 3)
-            @ w2c[:3, :3]
-            @ semi_axes(splats.quats.to(**like), splats.scales.to(**like))
-        )
+        axes = semi_axes(splats.quats.to(**like), splats.scales.to(**like))
+        if splats.strains is not None:
+            axes = strained(axes, splats.strains)
+        half_axes = torch.stack(rows, 1).reshape(-1, 2, 3) @ w2c[:3, :3] @ axes
         a, b = half_axes.unbind(1)
         # The Gram determinant of the rows: thin projections do not cancel as in xx yy - xy^2.
         sharp = torch.linalg.cross(a, b).square().sum(1)
@@ -58,8 +67,7 @@ def projected(
         blurred = sharp + eps * (xx + yy + eps)
         compensation = None
         if antialiased:
-            # The square root has no derivative at 0, where the opacity is 0 anyway.
-            compensation = (sharp.clamp_min(1e-30) / blurred).sqrt().to(splats.means.dtype)
+            compensation = (sharp / blurred).clamp_min(LEAST_COMPENSATION**2).sqrt().to(splats.means.dtype)
     with torch.no_grad():  # `meta` has no graph
         opacity = splats.opacities.to(**like) * (1 if compensation is None else compensation)
         extent = (2 * (opacity / LEAST_OPACITY).clamp_min(1).log()).sqrt().clamp_max(EXTENT)
@@ -74,8 +82,8 @@ def unscented(splats: Splats, camera: Camera, depths: torch.Tensor, near: float)
     """gsplat's `meta` of a view by the unscented transform (3DGUT: alpha 0.1, beta 2, kappa 0), without a graph.
 
     Args:
-        depths: (N,) camera z of the means, of a rolling shutter in the middle of the exposure.
-        near: Means nearer than that are left out.
+        depths: (N,) camera z or distance of the means, of a rolling shutter in the middle of the exposure.
+        near: Means of no larger depth are left out.
     """
     with torch.no_grad():  # `meta` has no graph
         means = splats.means.detach().cpu().double()
@@ -95,9 +103,12 @@ def unscented(splats: Splats, camera: Camera, depths: torch.Tensor, near: float)
         xx, xy, yy = (
             torch.einsum("k,nk,nk->n", of_covariance, off[..., i], off[..., j]) for i, j in ((0, 0), (0, 1), (1, 1))
         )
+        sharp = xx * yy - xy * xy
         xx, yy = xx + DILATION, yy + DILATION
         det = xx * yy - xy * xy
-        opacity = splats.opacities.detach().cpu().double()
+        # As if what the dilation widens was made fainter, although the opacity along rays is not.
+        shrunk = (sharp / det.clamp_min(1e-30)).clamp_min(LEAST_COMPENSATION**2).sqrt()
+        opacity = splats.opacities.detach().cpu().double() * shrunk
         extent = (2 * (opacity / LEAST_OPACITY).clamp_min(1).log()).sqrt().clamp_max(EXTENT)
         middle = 0.5 * (xx + yy)
         largest = middle + (middle * middle - det).clamp_min(0.01).sqrt()

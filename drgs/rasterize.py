@@ -18,7 +18,7 @@ from typing import Any
 import torch
 
 from drgs.cameras import Camera
-from drgs.covariances import SPREAD, check_covariances, factors, nearly_round
+from drgs.covariances import factors
 from drgs.ellipsoids import Y_00
 from drgs.gsplat_options import MODES, NEAR, Mode, check_unscented, lenses_of, one_of, refuse, settings_of, shutter_of
 from drgs.integrator import render_normals, render_with_offsets
@@ -99,7 +99,8 @@ def rasterization(
         viewmats: (..., C, 4, 4) world to camera, OpenCV axes.
         Ks: (..., C, 3, 3) in pixels, pixel centers at +0.5. A skew is followed (gsplat ignores it).
         width, height: Size of every image, in pixels.
-        near_plane, far_plane: Means outside of (near_plane, far_plane] in camera z are left out.
+        near_plane, far_plane: Means outside of (near_plane, far_plane] in camera z are left out, in distance with
+            `with_eval3d` and `global_z_order=False`.
         radius_clip: Gaussians whose radius (`meta["radii"]`) is at most this many pixels in both axes are left out.
         eps2d: Added to the diagonal of the projected covariance, in px^2.
         sh_degree: 0 to 3, or None for plain colors.
@@ -110,8 +111,8 @@ def rasterization(
             `meta["means2d"].absgrad`, in pixels; of the rasterizer's own model.
         rasterize_mode: classic, or antialiased: opacities times sqrt(det Sigma / det (Sigma + eps2d I)).
         camera_model: One of pinhole and fisheye, which are OpenCV's, and ftheta, NVIDIA's.
-        covars: (..., N, 3, 3) covariances instead of `quats` and `scales`; differentiated in reverse mode. Where two
-            eigenvalues of one are nearly the same, its derivative takes two more images.
+        covars: (..., N, 3, 3) covariances instead of `quats` and `scales`, symmetric: both elements off the diagonal
+            get half of the derivative by their common value.
         with_eval3d: Gaussians are evaluated along rays, as 3DGUT does: preset `3dgut`.
         with_ut: Whether, with `with_eval3d`, tiles are those of the boxes of the unscented transform, as gsplat's are;
             else nothing is left out.
@@ -150,7 +151,6 @@ def rasterization(
         V. Ye et al., gsplat, JMLR 26, 2025; Z. Yu et al., Mip-Splatting, CVPR 2024 (antialiased); Q. Wu et al., 3DGUT,
         CVPR 2025.
     """
-    given_here = {**locals(), "covars": None}
     one_of("render_mode", render_mode, list(MODES))
     one_of("rasterize_mode", rasterize_mode, ("classic", "antialiased"))
     refuse(
@@ -169,16 +169,14 @@ def rasterization(
     mode = MODES[render_mode]
     antialiased = rasterize_mode == "antialiased"
     settings = settings_of(preset, near_plane, eps2d, antialiased, with_eval3d, with_ut, global_z_order)
+    strains = None
     if covars is not None:
         if return_normals:
             raise NotImplementedError(
                 "rasterization: return_normals is not supported with covars, whose axes have no order; pass quats and "
                 "scales"
             )
-        check_covariances("rasterization", covars, tuple(means.shape[:-1]))
-        quats, scales = factors(covars)
-        if torch.is_grad_enabled() and covars.requires_grad and bool(nearly_round(covars).any()):
-            return _by_round_covariances(given_here, covars, quats.detach(), scales.detach())  # theirs is added there
+        quats, scales, strains = factors("rasterization", covars, tuple(means.shape[:-1]))
     if quats is None or scales is None:
         raise ValueError("rasterization: quats and scales must be tensors where there are no covars, got None")
     if colors is None or not mode.color:
@@ -217,16 +215,24 @@ def rasterization(
             if ends is not None:
                 lenses[b][c] |= {"shutter": shutter, "w2c_end": ends[b, c]}
         for c, camera in enumerate(cameras_of(flat["viewmats"][b], flat["Ks"][b], width, height, lenses[b])):
-            means_b, quats_b, scales_b, opacities_b = (flat[x][b] for x in ("means", "quats", "scales", "opacities"))
             views.append(
                 _View(
-                    Splats(means_b, quats_b, scales_b, opacities_b, _of_view(of(colors), b, c, sh_degree), sh_degree),
+                    Splats(
+                        means=flat["means"][b],
+                        quats=flat["quats"][b],
+                        scales=flat["scales"][b],
+                        opacities=flat["opacities"][b],
+                        colors=_of_view(of(colors), b, c, sh_degree),
+                        degree=sh_degree,
+                        strains=None if strains is None else of(strains)[b],
+                    ),
                     camera,
                     settings,
                     mode,
                     antialiased,
                     with_ut and with_eval3d,
                     with_eval3d and preset is None,
+                    near_plane if with_eval3d and preset is None else settings.near,
                     far_plane,
                     radius_clip,
                     None if backgrounds is None else of(backgrounds)[b, c],
@@ -266,6 +272,7 @@ class _View:
     antialiased: bool
     with_ut: bool
     gsplat_depth: bool
+    near: float
     far: float
     clip: float
     background: torch.Tensor | None
@@ -280,7 +287,9 @@ class _View:
         """The image (H, W, X), its alpha (H, W, 1), and the arrays of `meta`."""
         camera, settings, splats = self.camera, self.settings, self.splats
         local, center = self._seen()
-        meta, compensation = self._projected(local[:, 2].detach())
+        own = local[:, 2:] if settings.depth_key == "z" else local.norm(dim=1, keepdim=True)
+        cut = (own[:, 0] if self.gsplat_depth else local[:, 2]).detach()  # what near and far planes look at
+        meta, compensation = self._projected(cut)
         if compensation is not None:
             splats = dataclasses.replace(splats, opacities=inside_opacities(splats.opacities * compensation))
         # `meta` is to be looked at: no gradient passes through it.
@@ -293,14 +302,13 @@ class _View:
             colors = _evaluated(splats.colors, splats.degree, splats.means - center).clamp_min(0)
             splats = dataclasses.replace(splats, colors=colors, degree=None)
         added = [] if extra is None else [extra]
-        depth = local[:, 2:] if settings.depth_key == "z" else local.norm(dim=1, keepdim=True)
         if self.mode.depth == "gaussian" and self.gsplat_depth:
-            added.append(depth.to(splats.means.dtype))
+            added.append(own.to(splats.means.dtype))
         offsets = None if self.leaf is None else self.leaf - self.leaf.detach()  # zeros with its derivative
         absolute = self.absolute
-        kept = self._kept(meta, local[:, 2].detach())
+        kept = self._kept(meta, cut)
         meta["radii"] = meta["radii"] * kept[:, None]
-        if not bool(kept.all()) and (self.far < _FAR or self.clip > 0):
+        if not bool(kept.all()) and (self.far < _FAR or self.clip > 0 or self.near > settings.near):
             index = kept.nonzero()[:, 0]
             splats = splats.take(index)
             added = [x[index] for x in added]
@@ -311,7 +319,7 @@ class _View:
         if added:
             gaussians = gaussians.replace(features=torch.cat([x.to(features[0].dtype) for x in features], 1))
         asked = ("depth",) if self.mode.depth and not (self.gsplat_depth and self.mode.depth == "gaussian") else ()
-        out = render_with_offsets(gaussians, camera, settings, asked, self.rays, offsets, absolute)
+        out = render_with_offsets(gaussians, camera, settings, asked, self.rays, offsets, absolute, splats.strains)
         if self.normals:
             meta["normals"] = render_normals(gaussians.replace(features=None), camera, settings, self.rays)
         kind = splats.means.dtype
@@ -359,42 +367,21 @@ class _View:
             center = 0.5 * (center - end[:, 3] @ end[:, :3])
         return means @ pose[:, :3].T + pose[:, 3], center.to(self.splats.means.dtype)
 
-    def _projected(self, z: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor | None]:
+    def _projected(self, depths: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor | None]:
         """`meta`, and what opacities are multiplied with."""
         if self.with_ut or self.camera.is_distorted or self.camera.is_rolling:
-            return unscented(self.splats, self.camera, z, self.settings.near), None
+            return unscented(self.splats, self.camera, depths, self.near), None
         return projected(self.splats, self.camera, self.settings, self.antialiased)
 
-    def _kept(self, meta: dict[str, torch.Tensor], z: torch.Tensor) -> torch.Tensor:
+    def _kept(self, meta: dict[str, torch.Tensor], depths: torch.Tensor) -> torch.Tensor:
         """(N,) which Gaussians are drawn: the renderer itself knows no far plane and no smallest radius."""
-        depths = meta["depths"] if self.settings.planar else z
+        depths = meta["depths"] if self.settings.planar else depths
         kept = depths <= self.far
-        if self.settings.planar or self.settings.near > 0:
-            kept &= depths > self.settings.near
+        if self.settings.planar or self.near > 0:
+            kept &= depths > self.near
         if self.clip > 0:
             kept &= (meta["radii"] > self.clip).any(-1)
         return kept
-
-
-def _by_round_covariances(
-    given: dict[str, Any], covars: torch.Tensor, quats: torch.Tensor, scales: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor, dict]:
-    """The call with quaternions and scales of covariances, some of which have variances that are nearly the same.
-
-    By rotations about axes of equal variances there is no derivative, by the covariance there is: f'(0) is 2 f'(h) -
-    f'(2h) but for O(h^2), where h spreads the variances (covariances.py).
-    """
-    image, alpha, meta = rasterization(**{**given, "quats": quats, "scales": scales})
-    # Other tensors have their derivatives already.
-    others: dict[str, Any] = {name: x.detach() if isinstance(x, torch.Tensor) else x for name, x in given.items()}
-    for factor, spread in ((2.0, SPREAD), (-1.0, 2 * SPREAD)):
-        q, s = factors(covars, spread)
-        moved_image, moved_alpha, moved = rasterization(**{**others, "quats": q, "scales": s})
-        image = image + factor * (moved_image - moved_image.detach())  # 0, with a derivative
-        alpha = alpha + factor * (moved_alpha - moved_alpha.detach())  # as the image
-        if (name := "render_extra_signals") in meta:
-            meta[name] = meta[name] + factor * (moved[name] - moved[name].detach())  # as the image
-    return image, alpha, meta
 
 
 def _evaluated(coefficients: torch.Tensor, degree: int, towards: torch.Tensor) -> torch.Tensor:

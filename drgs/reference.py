@@ -219,7 +219,8 @@ def _project(
 
 def _unscented(scene: OracleScene, cam: Any, view: OracleRays, offset: Tensor, tolerance: float) -> Tiles:
     """The tiles of gsplat's 3DGUT: of the box of the mean and covariance that the unscented transform finds on the
-    image, with alpha = 0.1, beta = 2, kappa = 0 for three dimensions, hence lambda = alpha^2 3 - 3.
+    image, with alpha = 0.1, beta = 2, kappa = 0 for three dimensions, hence lambda = alpha^2 3 - 3; opacities fainter
+    by the square root of the ratio of its determinants without and with dilation, no less than 0.005.
     """
     alpha, beta, dimensions = 0.1, 2.0, 3
     lamb = alpha**2 * dimensions - dimensions
@@ -242,9 +243,11 @@ def _unscented(scene: OracleScene, cam: Any, view: OracleRays, offset: Tensor, t
     middle = torch.einsum("k,nki->ni", weights, pixels)
     weights[0] += 1 - alpha**2 + beta
     off = pixels - middle[:, None]
-    cov = torch.einsum("k,nki,nkj->nij", weights, off, off) + 0.3 * torch.eye(2, dtype=torch.float64)
+    sharp = torch.einsum("k,nki,nkj->nij", weights, off, off)
+    cov = sharp + 0.3 * torch.eye(2, dtype=torch.float64)
     det = torch.linalg.det(cov)
-    opacity = torch.sigmoid(scene.logits.detach())  # nor has this
+    shrunk = (torch.linalg.det(sharp) / det).clamp(min=0.005**2).sqrt()
+    opacity = torch.sigmoid(scene.logits.detach()) * shrunk  # nor has this
     extent = (2 * (255 * opacity).clamp(min=1).log()).sqrt().clamp(max=3.33)
     variance = cov.diagonal(dim1=1, dim2=2)
     mid = variance.mean(-1)

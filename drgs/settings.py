@@ -8,7 +8,6 @@ changes an image lives anywhere else. Symbols: `a` opacity of one hit, `alpha_i`
 from __future__ import annotations
 
 import dataclasses
-import math
 import typing
 from collections.abc import Iterable
 from typing import Any, Literal
@@ -80,7 +79,7 @@ _TABLE: dict[str, dict[str, Any]] = {
     },
     "3dgut": {
         "depth_key": "z",
-        "extent": math.sqrt(-2 * math.log(0.0113)),  # where the response falls to that
+        "extent": 3.33,
         "alpha_min": 1 / 255,
         "alpha_max": 0.99,
         "transmittance_min": 1e-4,

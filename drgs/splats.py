@@ -59,7 +59,7 @@ class SplatTensors(TypedDict, total=False):
 @dataclasses.dataclass
 class Splats:
     """One scene as gsplat stores it: means (N, 3), quats (N, 4), scales (N, 3), opacities (N,), and colors (N, D), or
-    with a degree (N, K, 3).
+    with a degree (N, K, 3); strains (N, 6) where Gaussians are given by covariances.
     """
 
     means: torch.Tensor
@@ -68,10 +68,11 @@ class Splats:
     opacities: torch.Tensor
     colors: torch.Tensor
     degree: int | None
+    strains: torch.Tensor | None = None
 
     def take(self, index: torch.Tensor) -> Splats:
         """The Gaussians at `index`."""
-        parts: dict[str, Any] = {name: x[index] for name, x in vars(self).items() if name != "degree"}
+        parts: dict[str, Any] = {name: x[index] for name, x in vars(self).items() if isinstance(x, torch.Tensor)}
         return Splats(**parts, degree=self.degree)
 
     def gaussians(self, with_color: bool = True) -> tuple[Gaussians, float]:

@@ -365,3 +365,46 @@ def test_meta_by_the_unscented_transform(lens):
         high = ((meta["means2d"][0, i] + radius) / 8).ceil() * 8
         inside = (columns + 0.5 > low[0]) & (columns + 0.5 < high[0]) & (rows + 0.5 > low[1]) & (rows + 0.5 < high[1])
         assert bool(inside.all())
+
+
+def test_near_and_far_are_distances_of_what_is_sorted_by_distance():
+    """A fisheye sees behind itself, and gsplat leaves nothing out there when it sorts by distance."""
+    given = {**arguments(n=60, channels=3), "backgrounds": None}
+    given["viewmats"] = torch.eye(4, dtype=torch.float64)[None]
+    given["means"] = given["means"] - torch.tensor([0.0, 0.0, 3.0])  # all around
+    options = {"camera_model": "fisheye", "with_ut": True, "with_eval3d": True}
+    given["Ks"] = torch.tensor([[[8.0, 0.0, 24.0], [0.0, 8.0, 20.0], [0.0, 0.0, 1.0]]], dtype=torch.float64)
+    z, distance = given["means"][:, 2], given["means"].norm(dim=1)
+    for by_z, depths in ((True, z), (False, distance)):
+        _, alpha, meta = drgs.rasterization(**given, **options, global_z_order=by_z, near_plane=0.5, far_plane=2.5)
+        seen = (meta["radii"][0] > 0).all(-1)
+        assert bool(((depths > 0.5) & (depths <= 2.5))[seen].all())
+        assert torch.allclose(meta["depths"][0][seen], depths[seen])
+        left = {name: given[name][seen] for name in ("means", "quats", "scales", "opacities", "colors")}
+        alone = drgs.rasterization(**{**given, **left}, **options, global_z_order=by_z, near_plane=0.0)[1]
+        assert torch.allclose(alpha, alone, atol=1e-6)
+        assert alpha.any()
+        assert bool((z[seen] < 0).any()) is not by_z
+
+
+def test_a_hit_counts_down_to_the_least_opacity():
+    """gsplat 1.6's kernels have no other cut: what is 3.2 standard deviations off a ray counts if it is opaque."""
+    given = {
+        "means": torch.tensor([[0.0, 0.0, 4.0]], dtype=torch.float64),
+        "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64),
+        "scales": torch.full((1, 3), 0.2, dtype=torch.float64),
+        "colors": torch.ones(1, 1, dtype=torch.float64),
+        "viewmats": torch.eye(4, dtype=torch.float64)[None],
+        "Ks": torch.tensor([[[100.0, 0.0, 32.5], [0.0, 100.0, 0.5], [0.0, 0.0, 1.0]]], dtype=torch.float64),
+        "width": 65,
+        "height": 1,
+    }
+    x = (torch.arange(65, dtype=torch.float64) - 32) / 100
+    rho = 20 * x / (1 + x * x).sqrt()
+    for opacity in (1.0, 0.5):
+        response = opacity * torch.exp(-0.5 * rho**2)
+        expected = torch.where(response < 1 / 255, 0.0, response.clamp(max=0.99))
+        opacities = torch.tensor([opacity], dtype=torch.float64)
+        alpha = drgs.rasterization(**given, opacities=opacities, with_ut=True, with_eval3d=True)[1][0, 0, :, 0]
+        assert float((alpha - expected).abs().max()) < 1e-5
+        assert float(rho[alpha > 0].max()) == pytest.approx(3.2 if opacity == 1 else 3.0, abs=0.15)

@@ -37,6 +37,7 @@ OF_VIEW = (
     "ray_shifts",
     "mean_offsets",
     "mean_absolute",
+    "strains",
 )  # inputs that are no parameters of the scene
 
 
@@ -82,6 +83,7 @@ class Call:
         mean_offsets: (N, 2) zeros in pixels, added to projected means, of a model of the image plane; differentiated.
         mean_absolute: (N, 2) zeros, whose gradient is to be the sum over all pixels of the absolute value of each
             pixel's gradient by projected means.
+        strains: (N, 6) zeros, by how much space is stretched around each mean: `drgs.covariances`; differentiated.
         oriented: The features, (N, 3), are axes that are turned towards each ray: `Channels.oriented`.
     Attributes:
         inputs: Torch tensors by name, what is differentiated: raw parameters of the Gaussians or of the scene, perhaps
@@ -110,6 +112,7 @@ class Call:
         pixel_rays: torch.Tensor | np.ndarray | None = None,
         mean_offsets: torch.Tensor | None = None,
         mean_absolute: torch.Tensor | None = None,
+        strains: torch.Tensor | None = None,
         oriented: bool = False,
     ):
         self.lib = runtime.dr_types()
@@ -159,7 +162,7 @@ class Call:
 
             self.field = Field(scene, camera.time, fields, middle, fixed)
         self.inputs = {name: self._move(x) for name, x in given.items()}
-        of_means = {"mean_offsets": mean_offsets, "mean_absolute": mean_absolute}
+        of_means = {"mean_offsets": mean_offsets, "mean_absolute": mean_absolute, "strains": strains}
         self.inputs |= {name: self._move(x) for name, x in of_means.items() if x is not None}
         self.count = len(gaussians)
         self.coefficients = gaussians.sh.shape[1]

@@ -155,7 +155,11 @@ class Activated:
         extent: Cut-off radius in standard deviations.
         view: (3, 4) rows of w2c.
         center: (3,) means in camera axes.
-        from_local: (3, 3) local axes to camera axes.
+        from_local: (3, 3) local axes to camera axes, of half axes R S: as the Gaussian is strained, if it is.
+        rotation_of_inverse: (3, 3) R in W = S^-1 R^T, which takes world vectors to the local frame: the same but for
+            strains, which shrink there what they stretch here.
+        inverse_from_local: (3, 3) the same in camera axes.
+        swelling: What part of itself the volume grows by under the strain; None without strains.
     """
 
     def __init__(
@@ -202,7 +206,21 @@ class Activated:
         self.center = [
             v[r][0] * self.mean[0] + v[r][1] * self.mean[1] + v[r][2] * self.mean[2] + v[r][3] for r in range(3)
         ]
-        self.from_local = [[sum(v[r][k] * self.rotation[k][c] for k in range(3)) for c in range(3)] for r in range(3)]
+        stretched = self.rotation_of_inverse = self.rotation
+        self.swelling: Float | None = None
+        if "strains" in p:
+            # The strain is 0, and moves the Gaussian to first order only: (I + E) R and (I - E) R.
+            xx, xy, xz, yy, yz, zz = (column("strains", k, 6) for k in range(6))
+            E = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
+            moved = [[sum(E[r][k] * self.rotation[k][c] for k in range(3)) for c in range(3)] for r in range(3)]
+            stretched, self.rotation_of_inverse = (
+                [[a + sign * b for a, b in zip(*rows, strict=True)] for rows in zip(self.rotation, moved, strict=True)]
+                for sign in (1, -1)
+            )
+            self.swelling = xx + yy + zz
+        self.from_local = _rotated(v, stretched)
+        same = self.rotation_of_inverse is self.rotation
+        self.inverse_from_local = self.from_local if same else _rotated(v, self.rotation_of_inverse)
 
     def _extent(self, count: int) -> Float:
         """Cut-off radius in standard deviations; a constant of the derivative, as every cut-off is."""
@@ -239,6 +257,11 @@ class Activated:
         basis = sh_basis(direction, coefficients)
         rgb = sh_color(basis, lambda k, c: Float(self.column("sh", k * 3 + c, 3 * coefficients)))
         return SeenColor(direction, Float(scale), basis, rgb)
+
+
+def _rotated(view: list, axes: list) -> list:
+    """Axes as columns (3, 3), world to camera."""
+    return [[sum(view[r][k] * axes[k][c] for k in range(3)) for c in range(3)] for r in range(3)]
 
 
 class Projected:

@@ -42,8 +42,8 @@ def project_screen(
 
     Args:
         lib: Dr.Jit types of the backend.
-        p: Flat parameter arrays: means, quats, log_scales, logit_opacities, sh, and mean_offsets if derivatives by
-            projected means are wanted.
+        p: Flat parameter arrays: means, quats, log_scales, logit_opacities, sh, and mean_offsets and strains if
+            derivatives by projected means and by covariances are wanted.
         w2c: Float64 of width 12, the upper rows of the world-to-camera matrix; differentiable.
         pinhole: Opaque Float64 (fx, skew, cx, fy, cy).
         settings: Settings of the render, with traversal `tiles`.
@@ -126,7 +126,8 @@ def project_world(
 
     Args:
         lib: Dr.Jit types of the backend.
-        p: Flat parameter arrays: means, quats, log_scales, logit_opacities, sh.
+        p: Flat parameter arrays: means, quats, log_scales, logit_opacities, sh, and strains if derivatives by
+            covariances are wanted.
         w2c: Float64 of width 12, the upper rows of the world-to-camera matrix; differentiable.
         settings: Settings of the render.
         coefficients: SH coefficients in `p["sh"]`.
@@ -140,7 +141,7 @@ def project_world(
     g = Activated(lib, p, w2c, settings, dr.width(p["logit_opacities"]), response.at_most_alpha)
     inverse = [dr.rcp(s) for s in g.scale]
     record = [Float(x) for x in g.mean]
-    record += [Float(inverse[r] * g.rotation[c][r]) for r in range(3) for c in range(3)]
+    record += [Float(inverse[r] * g.rotation_of_inverse[c][r]) for r in range(3) for c in range(3)]
     record += _common(lib, g, response, coefficients)
     # Keys order hits, and an order has no derivative.
     distance = dr.detach(g.distance())

@@ -3,8 +3,9 @@ transform estimates it.
 
 The transform (Julier and Uhlmann 1997; Wan and van der Merwe 2000, alpha = 0.1, beta = 2, kappa = 0, as in 3DGUT: Wu
 et al. 2025) projects the mean and six points at sqrt(3) alpha standard deviations around it, and takes a weighted mean
-and covariance of what it finds. What a large Gaussian near the camera covers beyond that box is not drawn: `culling`
-`ut` leaves it out, too. Boxes are of whole tiles and have no derivative.
+and covariance of what it finds. The box reaches to where the opacity, times the root of the ratio of the determinants
+of that covariance without and with dilation, falls to 1/255. What a large Gaussian near the camera covers beyond it is
+not drawn: `culling` `ut` leaves it out, too. Boxes are of whole tiles and have no derivative.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from drgs.tracing.primitives import Activated
 __all__ = [
     "DILATION",
     "EXTENT",
+    "LEAST_COMPENSATION",
     "LEAST_OPACITY",
     "MARGIN",
     "OF_COVARIANCE",
@@ -43,6 +45,8 @@ MARGIN = 0.1
 """Of the image, around it: a Gaussian without a point within is not drawn."""
 DILATION = 0.3
 """px^2, added to the covariance: gsplat's default."""
+LEAST_COMPENSATION = 0.005
+"""The least factor that opacities have for it."""
 EXTENT = 3.33
 """Standard deviations of a box, or where the opacity falls to `LEAST_OPACITY`."""
 LEAST_OPACITY = 1 / 255
@@ -72,10 +76,13 @@ def unscented_boxes(lib: Lib, g: Activated, camera: Camera, origin: torch.Tensor
     xx, xy, yy = (
         sum(w * o[i] * o[j] for w, o in zip(OF_COVARIANCE, off, strict=True)) for i, j in ((0, 0), (0, 1), (1, 1))
     )
+    sharp = xx * yy - xy * xy
     xx += DILATION
     yy += DILATION
     det = xx * yy - xy * xy
-    opacity = dr.detach(g.opacity)  # boxes have no derivative
+    # As if what the dilation widens was made fainter, although the opacity along rays is not.
+    shrunk = dr.sqrt(dr.maximum(sharp / dr.select(det > 0, det, 1), LEAST_COMPENSATION**2))
+    opacity = dr.detach(g.opacity) * shrunk  # boxes have no derivative
     extent = dr.minimum(dr.sqrt(2 * dr.log(dr.maximum(opacity / LEAST_OPACITY, 1))), EXTENT)
     middle = 0.5 * (xx + yy)
     largest = middle + dr.sqrt(dr.maximum(middle * middle - det, 0.01))

@@ -79,17 +79,22 @@ class Peak(AlphaStrength):
         inverse = [dr.rcp(s) for s in g.scale]
         volume = inverse[0] * inverse[1] * inverse[2]
         cofactor = [s * volume for s in g.scale]
-        f = g.from_local
+        if g.swelling is not None:
+            cofactor = [x * (1 - g.swelling) for x in cofactor]
 
-        def local(v: list[Float], weight: list[Float]) -> list[Float]:  # diag(weight) R^T v, from camera axes
-            return [weight[k] * (f[0][k] * v[0] + f[1][k] * v[1] + f[2][k] * v[2]) for k in range(3)]
+        # diag(weight) R^T v, from camera axes; R as in W, and as in det(W) W^-T, which cross products have.
+        def local(v: list[Float], weight: list[Float]) -> list[Float]:
+            return _weighted(g.inverse_from_local, v, weight)
+
+        def crossed(v: list[Float]) -> list[Float]:
+            return _weighted(g.from_local, v, cofactor)
 
         d = local(da, inverse)
         norm = dr.sqrt(dot(d, d))
         unit = dr.rcp(norm)
-        A = _scaled(local(cross(g.center, dx), cofactor), unit)
-        B = _scaled(local(cross(g.center, dy), cofactor), unit)
-        C = _scaled(local(cross(g.center, da), cofactor), unit)
+        A = _scaled(crossed(cross(g.center, dx)), unit)
+        B = _scaled(crossed(cross(g.center, dy)), unit)
+        C = _scaled(crossed(cross(g.center, da)), unit)
         # All three are perpendicular to W c: two components each say everything.
         u, v = _frame(local(g.center, inverse))
         r = [dot(u, A), dot(u, B), dot(u, C), dot(v, A), dot(v, B), dot(v, C)]
@@ -331,6 +336,11 @@ def _perpendicular(a: list[Float], n: list[Float]) -> list[Float]:
         here = size[k] == largest
         result.append(dr.select(here, -(n[i] * a[i] + n[j] * a[j]) / dr.select(here, n[k], 1), a[k]))
     return result
+
+
+def _weighted(f: list[list[Float]], v: list[Float], weight: list[Float]) -> list[Float]:
+    """diag(weight) f^T v."""
+    return [weight[k] * (f[0][k] * v[0] + f[1][k] * v[1] + f[2][k] * v[2]) for k in range(3)]
 
 
 def _scaled(a: list[Float], s: Float) -> list[Float]:
