@@ -122,8 +122,8 @@ def rasterization(
         radial_coeffs: (..., C, 6) k1 to k6 of a pinhole, (..., C, 4) k1 to k4 of a fisheye; no gradient.
         tangential_coeffs: (..., C, 2) p1, p2.
         thin_prism_coeffs: (..., C, 4) s1 to s4.
-        ftheta_coeffs: gsplat's `FThetaCameraDistortionParameters`, or what has its attributes, whose reference is the
-            polynomial from angles to pixels.
+        ftheta_coeffs: Parameters of camera_model ftheta: gsplat's `FThetaCameraDistortionParameters`, or what has its
+            attributes, whose reference is the polynomial from angles to pixels.
         rolling_shutter: A member of gsplat's `RollingShutterType`, or its name.
         viewmats_rs: (..., C, 4, 4) poses at the end of the exposure, of rolling shutters.
         extra_signals: (..., N, E) or (..., C, N, E), more channels, drawn to `meta["render_extra_signals"]` (..., C, H,

@@ -148,6 +148,17 @@ def test_colmap_places(tmp_path, place):
             "opencv_fisheye",
             (0.1, 0.02, 1e-3, 2e-3),
         ),
+        (
+            "FULL_OPENCV",
+            [20, 20, 12, 8, 0.1, 0.02, 1e-3, 2e-3, 0.03, 0.01, 0.02, 0.03],
+            "opencv",
+            (0.1, 0.02, 1e-3, 2e-3, 0.03, 0.01, 0.02, 0.03),
+        ),
+        ("SIMPLE_RADIAL_FISHEYE", [20, 12, 8, 0.1], "opencv_fisheye", (0.1, 0, 0, 0)),
+        ("RADIAL_FISHEYE", [20, 12, 8, 0.1, 0.02], "opencv_fisheye", (0.1, 0.02, 0, 0)),
+        ("SIMPLE_FISHEYE", [20, 12, 8], "opencv_fisheye", (0, 0, 0, 0)),
+        ("FISHEYE", [20, 21, 12, 8], "opencv_fisheye", (0, 0, 0, 0)),
+        ("EQUIRECTANGULAR", [WIDTH, HEIGHT], "equirectangular", ()),
     ],
 )
 def test_colmap_lenses_project_as_pycolmap_does(tmp_path, model, params, lens, distortion):

@@ -32,7 +32,14 @@ _MODELS = {
     "RADIAL": (3, 5),
     "OPENCV": (4, 8),
     "OPENCV_FISHEYE": (5, 8),
+    "FULL_OPENCV": (6, 12),
+    "SIMPLE_RADIAL_FISHEYE": (8, 4),
+    "RADIAL_FISHEYE": (9, 5),
+    "SIMPLE_FISHEYE": (14, 3),
+    "FISHEYE": (15, 4),
+    "EQUIRECTANGULAR": (17, 2),
 }
+_ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE")
 _REQUIRED = ("cameras", "images", "points3D")
 
 
@@ -117,9 +124,10 @@ def _reprojection(reconstruction: Any) -> float | None:
     errors = [error for error in errors if error > 0]  # of points that were never adjusted it is -1 or 0
     if not errors:
         return None
-    return float(
-        np.median(errors) / np.median([camera.mean_focal_length() for camera in reconstruction.cameras.values()])
-    )
+    cameras = reconstruction.cameras.values()
+    # At the middle of a panorama: pixels a radian.
+    focal = [c.width / (2 * math.pi) if c.model_name == "EQUIRECTANGULAR" else c.mean_focal_length() for c in cameras]
+    return float(np.median(errors) / np.median(focal))
 
 
 def _image_folder(path: Path, model: Path) -> Path:
@@ -145,7 +153,10 @@ def model_camera(reconstruction: Any, image: Any, where: str) -> Camera:
         raise ValueError(f"{where}: the pose must be finite, got NaN or Inf; remove this image from the model")
     p = [float(v) for v in camera.params]
     kind = camera.model_name
-    if kind in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
+    if kind == "EQUIRECTANGULAR":  # its parameters are the size
+        K = intrinsics(camera.width / (2 * np.pi), camera.height / np.pi, camera.width / 2, camera.height / 2)
+        rest = []
+    elif kind in _ONE_FOCAL:
         K = intrinsics(p[0], p[0], p[1], p[2])
         rest = p[3:]
     else:
@@ -153,9 +164,11 @@ def model_camera(reconstruction: Any, image: Any, where: str) -> Camera:
         rest = p[4:]
     model = "pinhole"
     distortion = ()
-    if kind == "OPENCV_FISHEYE":
+    if kind == "EQUIRECTANGULAR":
+        model = "equirectangular"
+    elif kind.endswith("FISHEYE"):
         model = "opencv_fisheye"
-        distortion = tuple(rest)
+        distortion = (*rest, *([0.0] * (4 - len(rest))))
     elif any(rest):
         model = "opencv"
         distortion = (*rest, *([0.0] * (4 - len(rest))))
@@ -285,7 +298,7 @@ _PAIR = struct.Struct("<II")
 _RIG_SENSOR = struct.Struct("<iIB")
 _FRAME = struct.Struct("<II7dI")
 # The least that one record of a file can take, to refuse a claimed count at once.
-_LEAST = {"cameras": 48, "images": 73, "points3D": _POINT.size, "rigs": 8, "frames": _FRAME.size}
+_LEAST = {"cameras": 40, "images": 73, "points3D": _POINT.size, "rigs": 8, "frames": _FRAME.size}
 
 
 def _check_binary(path: Path, kind: str) -> None:
