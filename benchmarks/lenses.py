@@ -1,12 +1,12 @@
 """What a lens costs on tiles, and what fits gain that see photographs as they were taken.
 
-    python benchmarks/lenses.py [--scenes street banana] [--seeds 2] [--page]
+    python benchmarks/lenses.py [--scenes street banana fisheye] [--seeds 2] [--page]
     python benchmarks/lenses.py --times
 
 Fits with and without --undistort, both seen on the held-out photographs as they were taken and on undistorted ones:
 one row a fit in benchmarks/lenses.jsonl, and the table of docs/real-data.md. `--times` measures a frame of the wolf
 through lenses and a rolling shutter, in turn in one process, and writes the other table. Scenes are captures by name,
-or folders. One thread.
+or folders; `fisheye` is made: photographs of 150 degrees, walked along Gaussians that are all around. One thread.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import json
 import os
 import statistics
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -33,7 +34,8 @@ from fits import fitted, psnr_by_renderer  # noqa: E402
 from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
 
 import drgs  # noqa: E402
-from drgs.cameras import Camera, intrinsics, look_at  # noqa: E402
+from drgs.cameras import Camera, c2w_to_opengl, intrinsics, look_at  # noqa: E402
+from drgs.display.pictures import write_png  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.fitting.frames import load_frames  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
@@ -42,7 +44,8 @@ from drgs.studies.tables import fill_between  # noqa: E402
 ROWS = ROOT / "benchmarks" / "lenses.jsonl"
 TIMES = ROOT / "benchmarks" / "lenses.json"
 PAGE = ROOT / "docs" / "real-data.md"
-SCENES = ("street", "banana")
+MADE = "fisheye"
+SCENES = ("street", "banana", MADE)
 SIZE = {"max_steps": 400, "max_pixels": 12_000, "max_gaussians": 8_000}
 KEY = ("scene", "undistort", "seed", "offset", "max_steps", "max_pixels", "max_gaussians")
 WOLF = DATA / "splats" / "wolf" / "wolf.ply"
@@ -54,6 +57,39 @@ SETTINGS = {
     "`3dgut`, `culling=extent`": RenderSettings.preset("3dgut", culling="extent"),
     "`exact`": RenderSettings.preset("exact"),
 }
+
+
+def made_fisheye(folder: Path) -> Path:
+    """A transforms.json of 25 photographs, 120x100, of 1,500 Gaussians before and beside a fisheye of 150 degrees."""
+    generator = torch.Generator().manual_seed(0)
+    count, width, height = 1_500, 120, 100
+    means = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
+    means *= 2 + 3 * torch.rand(count, 1, generator=generator)
+    means[:, 2] = means[:, 2].abs() - 0.3
+    quats = torch.randn(count, 4, generator=generator)
+    scales = 0.03 + 0.2 * torch.rand(count, 3, generator=generator)
+    colors = (torch.rand(count, 3, generator=generator) - 0.5) / 0.2820948
+    g = drgs.Gaussians.from_arrays(means, quats, scales, torch.full((count,), 0.9), colors)
+    focal = width / 2 / np.radians(75)
+    frames = []
+    for k in range(25):
+        eye = (0.08 * (k - 12), 0.25 * np.sin(2.0 * k), 0.2 * np.cos(1.3 * k))
+        pose = look_at(eye, (0.1 * np.sin(k), 0, 10), (0, -1, 0))
+        camera = Camera(
+            intrinsics(focal, focal, width / 2, height / 2), pose, width, height, "opencv_fisheye", (0,) * 4
+        )
+        with torch.no_grad():
+            write_png(folder / f"{k:02}.png", drgs.render(g, camera, RenderSettings.preset("exact")).rgb.numpy())
+        frames.append({"file_path": f"{k:02}.png", "transform_matrix": c2w_to_opengl(camera.c2w).tolist()})
+    noisy = means + 0.05 * torch.randn(count, 3, generator=generator)
+    head = [f"property float {k}" for k in "xyz"] + [f"property uchar {k}" for k in ("red", "green", "blue")]
+    points = [f"{x:.5f} {y:.5f} {z:.5f} 128 128 128" for x, y, z in noisy.tolist()]
+    ply = ["ply", "format ascii 1.0", f"element vertex {count}", *head, "end_header", *points]
+    (folder / "points.ply").write_text("\n".join(ply) + "\n")
+    lens = {"camera_model": "OPENCV_FISHEYE", "fl_x": focal, "fl_y": focal, "w": width, "h": height}
+    data = {**lens, "ply_file_path": "points.ply", "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(data))
+    return folder
 
 
 def cropped(camera: Camera) -> float:
@@ -180,7 +216,12 @@ def main() -> None:
     if args.times:
         TIMES.write_text(json.dumps(times(), indent=1) + "\n")
     done = {tuple(row[name] for name in KEY) for row in read_rows(ROWS)}
-    for scene in [] if args.page or args.times else args.scenes:
+    made = tempfile.TemporaryDirectory()
+    for name in [] if args.page or args.times else args.scenes:
+        scene = name
+        if name == MADE:
+            (folder := Path(made.name) / MADE).mkdir()
+            scene = str(made_fisheye(folder))
         for seed, offset in UNITS[: args.seeds]:
             for undistort in ("on", "off"):
                 if (Path(scene).name, undistort, seed, offset, *SIZE.values()) not in done:
@@ -189,6 +230,7 @@ def main() -> None:
                     print(
                         scene, undistort, seed, {use: statistics.mean(x) for use, x in row["psnr"].items()}, flush=True
                     )
+    made.cleanup()
     texts = {"lenses": table(read_rows(ROWS))}
     if TIMES.exists():
         texts["lens_times"] = times_table(json.loads(TIMES.read_text()))

@@ -217,7 +217,7 @@ def rasterization(
         for c, camera in enumerate(cameras_of(flat["viewmats"][b], flat["Ks"][b], width, height, lenses[b])):
             views.append(
                 _View(
-                    Splats(
+                    splats=Splats(
                         means=flat["means"][b],
                         quats=flat["quats"][b],
                         scales=flat["scales"][b],
@@ -226,22 +226,22 @@ def rasterization(
                         degree=sh_degree,
                         strains=None if strains is None else of(strains)[b],
                     ),
-                    camera,
-                    settings,
-                    mode,
-                    antialiased,
-                    with_ut and with_eval3d,
-                    with_eval3d and preset is None,
-                    near_plane if with_eval3d and preset is None else settings.near,
-                    far_plane,
-                    radius_clip,
-                    None if backgrounds is None else of(backgrounds)[b, c],
-                    None if extra is None else _of_view(of(extra), b, c, extra_signals_sh_degree),
-                    extra_signals_sh_degree,
-                    None if rays is None else of(rays)[b, c],
-                    None if leaf is None else leaf.reshape(batches, count, -1, 2)[b, c],
-                    None if absolute is None else absolute.reshape(batches, count, -1, 2)[b, c],
-                    return_normals,
+                    camera=camera,
+                    settings=settings,
+                    mode=mode,
+                    antialiased=antialiased,
+                    with_ut=with_ut and with_eval3d,
+                    gsplat_depth=with_eval3d and preset is None,
+                    near=near_plane if with_eval3d and preset is None else settings.near,
+                    far=far_plane,
+                    clip=radius_clip,
+                    background=None if backgrounds is None else of(backgrounds)[b, c],
+                    extra=None if extra is None else _of_view(of(extra), b, c, extra_signals_sh_degree),
+                    extra_degree=extra_signals_sh_degree,
+                    rays=None if rays is None else of(rays)[b, c],
+                    leaf=None if leaf is None else leaf.reshape(batches, count, -1, 2)[b, c],
+                    absolute=None if absolute is None else absolute.reshape(batches, count, -1, 2)[b, c],
+                    normals=return_normals,
                 )
             )
     made = [view.draw() for view in views]
