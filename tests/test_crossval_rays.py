@@ -221,9 +221,9 @@ def test_projected_instead_of_along_rays():
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_our_own_preset(lens):
-    """`drgs:3dgut` is held against the oracle through lenses, too."""
+    """`drgs:3dgut` is held against the oracle through lenses, too, boxes included."""
     g, camera = _made(2, lens)
-    result = crossval(load_rasterizer("drgs:3dgut"), g, [camera], "auto", FIELDS)
+    result = crossval(load_rasterizer("drgs:3dgut"), g, [camera], "auto", {"background": BACKGROUND})
     assert result.verdict == "agreement", "\n".join(result.lines())
     assert (result.report["preset"], result.report["reference"]) == ("3dgut", "float64 oracle")
 

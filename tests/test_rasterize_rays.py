@@ -408,3 +408,27 @@ def test_a_hit_counts_down_to_the_least_opacity():
         alpha = drgs.rasterization(**given, opacities=opacities, with_ut=True, with_eval3d=True)[1][0, 0, :, 0]
         assert float((alpha - expected).abs().max()) < 1e-5
         assert float(rho[alpha > 0].max()) == pytest.approx(3.2 if opacity == 1 else 3.0, abs=0.15)
+
+
+def test_what_boxes_leave_out_of_a_large_near_gaussian():
+    """Beside the image by more than a tenth of it: gsplat does not draw it, rays see it in every pixel."""
+    given = {
+        "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        "opacities": torch.tensor([0.9]),
+        "colors": torch.ones(1, 1),
+        "viewmats": torch.eye(4)[None],
+        "Ks": torch.tensor([[[40.0, 0.0, 24.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]]]),
+        "width": 48,
+        "height": 32,
+        "with_eval3d": True,
+    }
+    aside, ahead = torch.tensor([[0.6, 0.0, 0.6]]), torch.tensor([[0.0, 0.0, 0.6]])
+    whole, boxed = (
+        drgs.rasterization(aside, scales=torch.full((1, 3), 0.3), with_ut=ut, **given)[1] for ut in (False, True)
+    )
+    assert bool((whole > 1 / 255).all())
+    assert not boxed.any()
+    whole, boxed = (
+        drgs.rasterization(ahead, scales=torch.full((1, 3), 0.02), with_ut=ut, **given)[1] for ut in (False, True)
+    )
+    assert torch.equal(whole, boxed)
