@@ -23,7 +23,7 @@ def seen(rng, kind, size=(61, 45)):
     return camera(rng, size) if kind == "pinhole" else lens_camera(rng, kind, size)
 
 
-@pytest.mark.parametrize("kind", ["pinhole", "barrel", "fisheye", "rolling"])
+@pytest.mark.parametrize("kind", ["pinhole", "barrel", "fisheye", "f-theta", "panorama", "rolling"])
 def test_what_is_left_out(rng, kind):
     """Large Gaussians around the camera are cut off at the tiles of their boxes, where the oracle cuts them off."""
     settings = RenderSettings(**UT)

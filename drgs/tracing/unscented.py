@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from drgs.cameras import Camera
-from drgs.lenses import distorted, fisheye_polynomial
+from drgs.lenses import angle_polynomial, distorted, fisheye_polynomial
 from drgs.tracing.arrays import Float, Lib, Mask
 from drgs.tracing.primitives import Activated
 
@@ -147,7 +147,17 @@ def _fisheye(x: Float, y: Float, z: Float, distortion: tuple) -> tuple[Float, Fl
     return x * factor, y * factor, radius >= 0
 
 
-_PLANES = {"pinhole": _pinhole, "opencv": _opencv, "opencv_fisheye": _fisheye}
+def _ftheta(x: Float, y: Float, z: Float, distortion: tuple) -> tuple[Float, Float, Mask]:
+    """The same through an f-theta lens."""
+    radius = dr.sqrt(x * x + y * y)
+    seen, _ = angle_polynomial(dr.atan2(radius, z), distortion)
+    factor = dr.select(radius > 0, seen / dr.select(radius > 0, radius, 1), 0)
+    c, d, e = distortion[5:8]
+    u, v = x * factor, y * factor
+    return c * u + d * v, e * u + v, radius >= 0
+
+
+_PLANES = {"pinhole": _pinhole, "opencv": _opencv, "opencv_fisheye": _fisheye, "ftheta": _ftheta}
 
 
 def _around(center: list[Float], axes: list[list[Float]]) -> list[list[Float]]:
