@@ -38,6 +38,7 @@ from drgs.cameras import Camera, c2w_to_opengl, intrinsics, look_at  # noqa: E40
 from drgs.display.pictures import write_png  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.fitting.frames import load_frames  # noqa: E402
+from drgs.fitting.lenses import lost_share  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
 
@@ -92,15 +93,6 @@ def made_fisheye(folder: Path) -> Path:
     return folder
 
 
-def cropped(camera: Camera) -> float:
-    """Share of a photograph's pixels that its undistorted image does not show."""
-    there = camera.undistorted()
-    points = camera.center + camera.pixel_directions().reshape(-1, 3)
-    pixels, _ = there.project(points)
-    inside = ((pixels >= 0) & (pixels <= (there.width, there.height))).all(1)
-    return 1 - float(inside.mean())
-
-
 def measured(scene: str, undistort: str, seed: int, offset: int) -> dict:
     """One fit for `fast`, and its held-out photographs, undistorted (on) and as they were taken (off)."""
     fast = RenderSettings.preset("fast")
@@ -121,7 +113,7 @@ def measured(scene: str, undistort: str, seed: int, offset: int) -> dict:
     return {
         **dict(zip(KEY, (Path(scene).name, undistort, seed, offset, *SIZE.values()), strict=True)),
         "psnr": psnr,
-        "cropped": statistics.mean(cropped(view.camera) for view in done.test),
+        "cropped": statistics.mean(lost_share(view.camera) for view in done.test),
         "seconds": done.process_seconds,
         **ran(),
     }
