@@ -11,8 +11,9 @@ Conventions, stated once for the whole project:
 - Lens models are those of lenses.py. Distortion is OpenCV's: model `opencv` with (k1, k2, p1, p2[, k3[, k4, k5, k6[,
   s1, s2, s3, s4]]]), model `opencv_fisheye` with (k1, k2, k3, k4) on the angle; `pinhole` has none. `ftheta`, which is
   NVIDIA's, has (k1, ..., k5, c, d, e): r = k1 a + ... + k5 a^5 of the angle a to the axis, in the direction of (x, y),
-  times [[c, d], [e, 1]], then K. `equirectangular` has none: K takes (longitude, latitude), in radians, to pixels, so
-  that fx = width / (2 pi), fy = height / pi and a principal point in the middle make a panorama of 360 degrees.
+  times [[c, d], [e, 1]], then K; `ftheta_inverse` has the same with a = k1 r + ... + k5 r^5. `equirectangular` has
+  none: K takes (longitude, latitude), in radians, to pixels, so that fx = width / (2 pi), fy = height / pi and a
+  principal point in the middle make a panorama of 360 degrees.
 - Other frames are converted at the border by the functions here: OpenGL / Blender / Nerfstudio cameras (+x right, +y
   up, looking along -z), LLFF `poses_bounds` columns (down, right, backward) and Mitsuba cameras (+x left, +y up,
   looking along +z). World axes never change, only the camera's.
@@ -81,7 +82,7 @@ class Camera:
             rotation that rounding has left not quite orthonormal is read as the nearest one, and the camera stays
             where it is; see `rigid`.
         width, height: Image size in pixels.
-        model: `pinhole`, `opencv`, `opencv_fisheye`, `ftheta` or `equirectangular`.
+        model: `pinhole`, `opencv`, `opencv_fisheye`, `ftheta`, `ftheta_inverse` or `equirectangular`.
         distortion: Coefficients of the model, in the order above; empty for `pinhole` and `equirectangular`.
         name: Name in messages and of files.
         time: Time at which the view was taken, in the scene's unit of time (0 to 1 over a sequence in most data sets),

@@ -184,19 +184,25 @@ def lenses_of(
 
 
 def _ftheta(coefficients: Any, cx: float, cy: float) -> dict[str, Any]:
-    """Fields of `Camera` of gsplat's `FThetaCameraDistortionParameters`: its polynomial from angles to pixels, whose
-    principal point counts from the center of the first pixel. `max_angle` plays no role for rays.
+    """Fields of `Camera` of gsplat's `FThetaCameraDistortionParameters`: its reference polynomial, from angles to
+    pixels or back; the principal point counts from the center of the first pixel. `max_angle` plays no role for rays.
     """
     kind = str(getattr(coefficients.reference_poly, "name", coefficients.reference_poly))
-    polynomial = [float(x) for x in coefficients.angle_to_pixeldist_poly]
-    if not kind.endswith("ANGLE_TO_PIXELDIST") or polynomial[0] != 0:
+    forward = kind.endswith("ANGLE_TO_PIXELDIST")
+    polynomial = [
+        float(x) for x in (coefficients.angle_to_pixeldist_poly if forward else coefficients.pixeldist_to_angle_poly)
+    ]
+    if polynomial[0] != 0 or not polynomial[1] > 0:
         raise NotImplementedError(
-            "rasterization: ftheta_coeffs must have the reference polynomial ANGLE_TO_PIXELDIST without a constant "
-            f"term, got {kind} with {polynomial[0]:g}; {_RAYS}"
+            "rasterization: ftheta_coeffs must have a reference polynomial without a constant term that grows from 0 "
+            f"on, got {kind} with {polynomial[0]:g} and {polynomial[1]:g}; {_RAYS}"
         )
-    K = np.array([[1.0, 0.0, cx + 0.5], [0.0, 1.0, cy + 0.5], [0.0, 0.0, 1.0]])
+    # The focal length belongs into K: bounds of silhouettes are of an equidistant fisheye of that K.
+    focal = polynomial[1] if forward else 1 / polynomial[1]
+    scaled = [x / focal if forward else x * focal**i for i, x in enumerate(polynomial)][1:]
+    K = np.array([[focal, 0.0, cx + 0.5], [0.0, focal, cy + 0.5], [0.0, 0.0, 1.0]])
     linear = [float(x) for x in coefficients.linear_cde]
-    return {"K": K, "model": "ftheta", "distortion": (*polynomial[1:], *linear)}
+    return {"K": K, "model": "ftheta" if forward else "ftheta_inverse", "distortion": (*scaled, *linear)}
 
 
 def shutter_of(rolling_shutter: Any, viewmats_rs: torch.Tensor | None) -> str:

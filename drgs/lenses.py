@@ -2,7 +2,8 @@
 
 A model takes a direction in camera axes to a point of its plane, and K takes that to pixels. Its plane is the one at
 z = 1 (`opencv`), or, of models that may see behind the camera, one of angles: `opencv_fisheye` and `ftheta` put a
-direction at a distance that is a polynomial of its angle to the axis, `equirectangular` at its longitude and latitude.
+direction at a distance that is a polynomial of its angle to the axis, `ftheta_inverse` at one that the angle is a
+polynomial of, `equirectangular` at its longitude and latitude.
 `drgs.cameras.Camera` is the way in.
 """
 
@@ -19,6 +20,7 @@ __all__ = [
     "Guide",
     "LensModel",
     "angle_polynomial",
+    "angle_polynomial_inverse",
     "distort_opencv",
     "distorted",
     "equirectangular",
@@ -27,6 +29,8 @@ __all__ = [
     "undistort_opencv",
 ]
 
+_STEPS = 30  # of Newton's, at most
+_FLAT = 1e-6  # a slope below stands for this one: what it leads to is found to be no inverse
 _CONVERGED = 1e-14  # radians; the next step of Newton's is far below the rounding of float64
 Guide = Literal["plane", "fisheye", "panorama"]
 """Where the silhouette of an ellipsoid is bounded (drgs/tracing/silhouettes.py): on the plane z = 1, under the
@@ -106,9 +110,24 @@ def angle_polynomial(angle: Any, distortion: tuple) -> tuple[Any, Any]:
     return value, slope
 
 
+def angle_polynomial_inverse(angle: Any, distortion: tuple) -> tuple[Any, Any]:
+    """Distance r of `ftheta_inverse` with k1 r + ... + k5 r^5 = angle (radians), and its derivative, for an angle; of
+    arrays, or tensors, where the last of Newton's steps has the derivatives by angle and coefficients.
+    """
+    known = [x.detach() if hasattr(x, "detach") else x for x in (angle, *distortion[:5])]
+    r = known[0] / known[1]
+    for _ in range(_STEPS):
+        value, slope = angle_polynomial(r, tuple(known[1:]))
+        # Where the polynomial turns back the slope is 0.
+        r = r - (value - known[0]) / (slope + _FLAT * (abs(slope) < _FLAT))
+        r = r * (r > 0)
+    value, slope = angle_polynomial(r, distortion)
+    return r - (value - angle) / slope, 1 / slope
+
+
 def linear_part(model: str, distortion: tuple) -> tuple[Any, Any, Any]:
     """The matrix [[c, d], [e, 1]] that follows a radial model's polynomial, as (c, d, e); none is (1, 0, 0)."""
-    return tuple(distortion[5:8]) if model == "ftheta" else (1.0, 0.0, 0.0)
+    return tuple(distortion[5:8]) if model in ("ftheta", "ftheta_inverse") else (1.0, 0.0, 0.0)
 
 
 def equirectangular(x: Any, y: Any, module: Any) -> tuple[Any, Any, Any]:
@@ -156,7 +175,7 @@ def _radial_unproject(plane: np.ndarray, distortion: tuple[float, ...], polynomi
     radius = np.linalg.norm(plane, axis=1)
     steepest = polynomial(np.zeros(1), distortion)[1][0]
     angle = np.clip(radius / (steepest if abs(steepest) > 1e-6 else 1.0), 0.0, np.pi)
-    for _ in range(30):
+    for _ in range(_STEPS):
         value, slope = polynomial(angle, distortion)
         # Where the lens turns back the slope is 0: a step that the clip ends stands for an infinite one.
         moved = np.clip(angle - (value - radius) / np.where(np.abs(slope) > 1e-6, slope, 1e-6), 0.0, np.pi)
@@ -176,17 +195,35 @@ def _fisheye_unproject(plane: np.ndarray, distortion: tuple[float, ...]) -> np.n
     return _radial_unproject(plane, distortion, fisheye_polynomial)
 
 
-def _ftheta_project(local: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
+def _ftheta_project(
+    local: np.ndarray, distortion: tuple[float, ...], polynomial: Callable = angle_polynomial
+) -> np.ndarray:
     c, d, e = distortion[5:]
-    x, y = _radial_project(local, distortion, angle_polynomial).T
+    x, y = _radial_project(local, distortion, polynomial).T
     return np.stack([c * x + d * y, e * x + y], axis=-1)
 
 
-def _ftheta_unproject(plane: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
+def _round_plane(plane: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
+    """Points before the linear part."""
     c, d, e = distortion[5:]
     x, y = plane.T
-    round_plane = np.stack([x - d * y, c * y - e * x], axis=-1) / (c - d * e)
-    return _radial_unproject(round_plane, distortion, angle_polynomial)
+    return np.stack([x - d * y, c * y - e * x], axis=-1) / (c - d * e)
+
+
+def _ftheta_unproject(plane: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
+    return _radial_unproject(_round_plane(plane, distortion), distortion, angle_polynomial)
+
+
+def _ftheta_inverse_project(local: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
+    return _ftheta_project(local, distortion, angle_polynomial_inverse)
+
+
+def _ftheta_inverse_unproject(plane: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
+    plane = _round_plane(plane, distortion)
+    radius = np.linalg.norm(plane, axis=1)
+    angle = angle_polynomial(radius, distortion)[0]
+    factor = np.sin(angle) / np.where(radius > 0, radius, 1.0)
+    return np.concatenate([plane * factor[:, None], np.cos(angle)[:, None]], axis=1)
 
 
 def _equirectangular_project(local: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
@@ -203,6 +240,9 @@ LENS_MODELS: dict[str, LensModel] = {
     "opencv": LensModel((4, 5, 8, 12), "plane", _opencv_project, _opencv_unproject),
     "opencv_fisheye": LensModel((4,), "fisheye", _fisheye_project, _fisheye_unproject, fisheye_polynomial),
     "ftheta": LensModel((8,), "fisheye", _ftheta_project, _ftheta_unproject, angle_polynomial),
+    "ftheta_inverse": LensModel(
+        (8,), "fisheye", _ftheta_inverse_project, _ftheta_inverse_unproject, angle_polynomial_inverse
+    ),
     "equirectangular": LensModel((0,), "panorama", _equirectangular_project, _equirectangular_unproject),
 }
 """Name of a model -> what it is."""

@@ -35,6 +35,7 @@ LENSES = [
     ("opencv", PRISM),
     ("opencv_fisheye", FISHEYE),
     ("ftheta", FTHETA),
+    ("ftheta_inverse", FTHETA),
     ("equirectangular", ()),
 ]
 
@@ -293,7 +294,10 @@ FLIPPED = np.diag([1.0, 1.0, -1.0, 1.0])
         ({"width": 0}, "width must be a whole number of pixels >= 1, got 0"),
         ({"height": 2.5}, "height must be a whole number of pixels >= 1, got 2.5"),
         ({"width": float("nan")}, "width must be a whole number of pixels >= 1, got nan"),
-        ({"model": "fov"}, "model must be one of pinhole, opencv, opencv_fisheye, ftheta, equirectangular, got 'fov'"),
+        (
+            {"model": "fov"},
+            "model must be one of pinhole, opencv, opencv_fisheye, ftheta, ftheta_inverse, equirectangular, got 'fov'",
+        ),
         (
             {"model": "ftheta", "distortion": (1, 0, 0, 0, 0, 0.5, 1, 0.5)},
             r"must have an inverse, got \(0.5, 1.0, 0.5\)",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import numpy as np
@@ -80,6 +81,18 @@ def test_a_mean_a_little_beside_an_image_is_seen():
     beside = lambda share: [[(0.5 + share) * 64 * 4.0 / 50, 0, 0]]  # noqa: E731
     assert sampling_rates(np.array(beside(0.14)), [camera(4.0)])[0] > 0
     assert sampling_rates(np.array(beside(0.16)), [camera(4.0)])[0] == 0
+
+
+def test_what_lenses_see_beside_and_behind_is_sampled_by_its_distance():
+    """A fisheye and a panorama have pixels a radian, wherever they look."""
+    plain = camera(4.0, 20.0)
+    means = np.array([[0, 0, 0], [0.01, 0, -4.2], [3.0, 0, -4.0]])
+    fisheye = dataclasses.replace(plain, model="opencv_fisheye", distortion=(0.0,) * 4)
+    assert sampling_rates(means, [fisheye]) == pytest.approx([20 / 4, 0, 20 / 3])
+    K = intrinsics(64 / (2 * np.pi), 48 / np.pi, 32.0, 24.0)
+    around = dataclasses.replace(plain, K=K, model="equirectangular")
+    focal = 48 / np.pi
+    assert sampling_rates(means, [around]) == pytest.approx([focal / 4, focal / np.hypot(0.2, 0.01), focal / 3])
 
 
 def test_what_nobody_sees_has_the_widest_filter():

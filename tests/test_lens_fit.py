@@ -113,6 +113,9 @@ def test_wide_lenses_are_kept_where_renderers_can(wide, tmp_path):
         assert choice.undistort == "on"
         assert because in choice.words()
     assert lens_choice(config(), train).words().endswith("they are fitted through their lenses")
+    behind = any((view.camera.local_directions()[..., 2] < 0).any() for view in train)
+    choice = lens_choice(config(renderers=("fast", "3dgut")), train)
+    assert (choice.undistort == "on") == behind == ("behind the camera's plane" in choice.words())
 
 
 def test_ordinary_lenses_are_taken_out(tmp_path):

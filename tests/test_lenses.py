@@ -33,6 +33,7 @@ LENSES = {
     "thin prism": ("opencv", (0.2, -0.1, 0.01, -0.01, 0.05, 0.1, 0.1, 0.02, 0.06, -0.02, -0.05, 0.03), 0.8),
     "f-theta": ("ftheta", (1.0, 0.02, -0.06, 0.01, -0.002, 1.05, 0.03, -0.02), 0.3),
     "f-theta, narrow": ("ftheta", (0.9, 0.0, 0.05, 0.01, 0.0, 1.0, 0.0, 0.01), 1.0),
+    "f-theta, inverse": ("ftheta_inverse", (1.0, -0.02, 0.04, 0.003, 0.0, 1.05, 0.03, -0.02), 0.35),
     # K takes longitude and latitude to pixels: here the seam is within the image, and a part of a panorama is seen.
     "panorama": ("equirectangular", (), None),
     "part of a panorama": ("equirectangular", (), 0.4),
@@ -128,6 +129,7 @@ KINDS = [
     ("thin prism", {"order": "ray"}),
     ("f-theta", {"order": "ray", "sh_direction": "ray"}),
     ("f-theta, narrow", CUTS),
+    ("f-theta, inverse", {"order": "ray", "sh_direction": "ray"}),
     ("panorama", {"order": "ray", "sh_direction": "ray"}),
     ("panorama", CUTS),
     ("part of a panorama", {"response": "integral", "order": "ray"}),
@@ -200,6 +202,7 @@ MOVED = [
     ("f-theta", {"order": "ray"}),
     ("f-theta", {"order": "ray", "traversal": "bvh"}),
     ("f-theta, narrow", CUTS),
+    ("f-theta, inverse", {"order": "ray"}),
     ("panorama", {"order": "ray", "sh_direction": "ray"}),
     ("part of a panorama", {"response": "integral", "order": "ray"}),
 ]

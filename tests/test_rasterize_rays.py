@@ -15,6 +15,7 @@ import drgs
 from drgs import reference
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
+from drgs.gsplat_options import lenses_of
 from drgs.settings import RenderSettings
 
 
@@ -139,8 +140,20 @@ def test_ftheta():
     culled = reference.render(gaussians_of(given), camera, UT, tolerance=1e-5)
     seen = culled.rgb + (1 - culled.alpha[..., None]) * given["backgrounds"][0]
     assert float((found[0] - seen).abs()[~culled.ambiguous].max()) < 2e-5
+    # K has the focal length: with one of 1 all guides are in one cell, and each Gaussian is listed on all tiles.
+    fields = lenses_of("ftheta", (), 1, None, None, None, made, given["Ks"])[0][0]
+    assert fields["K"][0, 0] == fields["K"][1, 1] == polynomial[1]
+    assert fields["distortion"] == pytest.approx((*(k / polynomial[1] for k in polynomial[1:]), *made.linear_cde))
     made.reference_poly = "PIXELDIST_TO_ANGLE"
-    with pytest.raises(NotImplementedError, match="must have the reference polynomial ANGLE_TO_PIXELDIST.*rays="):
+    made.pixeldist_to_angle_poly = back = (0.0, 1 / 16, 2e-5, -1e-6, 0.0, 1e-9)
+    angle = sum(k * radius**i for i, k in enumerate(back))
+    scale = torch.where(radius > 0, angle.sin() / radius, 0.0)
+    d = torch.stack([p * scale, q * scale, angle.cos()], -1) @ w2c[:3, :3]
+    out, image = oracle(given, {}, RenderSettings.preset("3dgut", culling="extent"), rays=(rays[0], d))
+    whole = drgs.rasterization(**given, camera_model="ftheta", ftheta_coeffs=made, with_eval3d=True)[0]
+    assert float((whole[0] - image).abs()[~out.ambiguous].max()) < 2e-5
+    made.pixeldist_to_angle_poly = (0.1, *back[1:])
+    with pytest.raises(NotImplementedError, match="must have a reference polynomial without a constant term.*rays="):
         drgs.rasterization(**given, camera_model="ftheta", ftheta_coeffs=made, with_eval3d=True)
     with pytest.raises(ValueError, match="ftheta_coeffs must come with camera_model='ftheta'"):
         drgs.rasterization(**given, camera_model="ftheta", with_eval3d=True)

@@ -18,7 +18,7 @@ from test_data import write_transforms
 from test_dynamic_data import cameras, coded, write_poses, write_video
 
 from drgs import train
-from drgs.files import write_json
+from drgs.files import Run, write_json
 from drgs.fitting.config import FitConfig
 from drgs.guards.locks import InUse
 from drgs.studies import cells as engine
@@ -747,3 +747,13 @@ def test_the_kitchen_study_is_whole_units(monkeypatch, tmp_path):
         tables = [table.policies for table in EXPERIMENTS.values() if table.study == "dynamic"]
         assert {label for policies in tables for label in policies} == set(study.policies)
     assert not list(tmp_path.iterdir()), "nothing is made before it is needed"
+
+
+def test_auto_of_lenses_is_what_the_run_has_made_of_it(tmp_path):
+    """A cell that leaves it to the photographs goes on with its run, whose config.json says what that was."""
+    run = Run(tmp_path / "run")
+    done = FitConfig.of(renderers=("fast",), undistort="off")
+    run.start({"schema": 1, "command": "fit", "data": str(tmp_path), "train": ["a"], "test": [], "fit": done.to_json()})
+    engine._check_same(run, FitConfig.of(renderers=("fast",)))
+    with pytest.raises(ValueError, match="must be the run of this cell, undistort was 'off' and is 'on'"):
+        engine._check_same(run, FitConfig.of(renderers=("fast",), undistort="on"))

@@ -25,6 +25,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from drgs.lenses import LENS_MODELS
+
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
@@ -100,15 +102,19 @@ def filtered(gaussians: Gaussians, variances: torch.Tensor) -> Gaussians:
 def sampling_rates(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     """(N,) pixels per world unit, in the image plane of the camera that samples a mean most finely; 0 where none does.
 
+    Fisheyes and panoramas have no such plane: theirs are pixels a radian, at the distance of the mean.
+
     Args:
         means: (N, 3) world.
-        cameras: Pinhole cameras.
+        cameras: Cameras of any lens.
     Reference:
         [1], eq. 7.
     """
     rates = np.zeros(len(means))
     for camera in cameras:
         pixels, depth = camera.project(means)
+        if LENS_MODELS[camera.model].guide != "plane":
+            depth = np.linalg.norm(means - camera.center, axis=1)
         sides = np.array([camera.width, camera.height])
         inside = (depth > 0) & ((pixels >= -_MARGIN * sides) & (pixels <= (1 + _MARGIN) * sides)).all(1)
         focal = max(camera.K[0, 0], camera.K[1, 1])

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from drgs.cameras import Camera
-from drgs.fitting.renderers import planar_of
+from drgs.fitting.renderers import RendererSchedule, planar_of
 from drgs.sizes import at_most
 
 if TYPE_CHECKING:
@@ -77,7 +77,17 @@ def lens_choice(config: FitConfig, views: Sequence[View]) -> LensChoice:
         return LensChoice("on", lost, "use --poses fixed")
     if config.selection is not None:
         return LensChoice("on", lost, "use --views all")
+    drawn = RendererSchedule.of(config.renderers, config.settings, config.max_steps).all_settings
+    if any(settings.near > 0 for settings in drawn) and any(_looks_behind(camera) for camera in cameras.values()):
+        return LensChoice("on", lost, "use --for drgs: near planes leave out what lenses see behind the camera's plane")
     return LensChoice("off", lost)
+
+
+def _looks_behind(camera: Camera) -> bool:
+    """Whether any ray of a camera is at more than 90 degrees to its axis."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*cannot be inverted")
+        return bool((at_most(camera, _PIXELS).local_directions()[..., 2] < 0).any())
 
 
 def lost_share(camera: Camera) -> float:

@@ -197,10 +197,10 @@ def checked_distortion(where: str, model: str, distortion: Any) -> tuple[float, 
             f"coefficients, got {len(values)}; "
             "pad with zeros"
         )
-    if model == "ftheta":
+    if model in ("ftheta", "ftheta_inverse"):
         c, d, e = values[5:]
         if not abs(c - d * e) > _SINGULAR:
-            raise ValueError(f"{where}: [[c, d], [e, 1]] of ftheta must have an inverse, got {(c, d, e)}; correct it")
+            raise ValueError(f"{where}: [[c, d], [e, 1]] of {model} must have an inverse, got {(c, d, e)}; correct it")
     return values
 
 

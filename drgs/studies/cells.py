@@ -290,6 +290,8 @@ def _said(metric: Metric, value: float | None) -> str:
 def _check_same(run: Run, config: FitConfig) -> None:
     """Refuse a run folder that was begun by another fit: by a study that had other numbers under the same name."""
     was = fit_record(run).config
+    if config.data.undistort == "auto":  # the run has recorded what that was
+        was = was.replace(data=dataclasses.replace(was.data, undistort="auto"))
     found = config.difference(was)
     if found is None and config.selection is not None:
         mine, theirs = config.selection.flat(), (was.selection or SelectionConfig()).flat()
