@@ -32,12 +32,12 @@ from drgs.testing import random_scene
 from drgs.train import SelectionConfig, fit
 
 _SOMETIMES = {
-    "config.json": {"frames", "absent", "semantics", "times", "poses", "exposure", "estimated"},
+    "config.json": {"frames", "absent", "semantics", "times", "poses", "exposure", "estimated", "lenses"},
     "metrics.json": {"segmentation", "motion", "transients", "poses", "skybox", "scale"},
     "fisher.json": {"nuisances"},
 }
-"""Fields of data sets that the tests here do not make, videos, missing images, a teacher, several times; and of what is
-not asked for: exposure, poses, a skybox, transients, larger pictures, eliminated unknowns.
+"""Fields of data sets that the tests here do not make, videos, missing images, lenses, a teacher, several times; and of
+what is not asked for: exposure, poses, a skybox, transients, larger pictures, eliminated unknowns.
 """
 
 

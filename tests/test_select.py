@@ -385,6 +385,7 @@ def test_every_field_of_a_camera_is_in_the_key(field):
     w2c = np.eye(4)
     w2c[0, 3] = 1
     camera = Camera(intrinsics_from_fov(40.0, *SIZE), np.eye(4), *SIZE, "opencv", (0.1, 0.0, 0.0, 0.0), "one")
+    camera = dataclasses.replace(camera, shutter="rolling_top_to_bottom", w2c_end=np.eye(4))
     other = {
         "K": intrinsics_from_fov(41.0, *SIZE),
         "w2c": w2c,
@@ -394,6 +395,8 @@ def test_every_field_of_a_camera_is_in_the_key(field):
         "distortion": (0.1, 0.0, 0.0, 1e-12),
         "name": "two",
         "time": 0.25,
+        "shutter": "rolling_bottom_to_top",
+        "w2c_end": w2c,
     }
     assert camera_key(dataclasses.replace(camera)) == camera_key(camera)
     changed = dataclasses.replace(camera, **{field: other[field]})

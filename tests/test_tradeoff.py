@@ -96,7 +96,8 @@ def test_settings_of_the_design_are_all_there():
     assert values("dilation") == {0, 0.3}
     assert values("near") == {0, 0.01, 0.2}
     assert values("sh_direction") == {"gaussian", "ray"}
-    for name in ("stop", "fov_clamp", "culling"):
+    assert values("culling") == {"extent", "inria", "gsplat", "ut"}
+    for name in ("stop", "fov_clamp"):
         assert len(values(name)) == 3
     assert {v.share for v in TRADEOFF_VARIANTS} == {1, 0.5, 0.25}
 
