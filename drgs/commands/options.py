@@ -74,15 +74,21 @@ class Render(Settings, Around, Views, Moments, Lenses):
     output: OutputPath = Path("out/render")
     """Folder for the pictures."""
     width: int | None = None
-    """Image width in pixels; default the camera's, of an orbit 640."""
+    """Image width in pixels; default the camera's, of an orbit or a flight 640, of a panorama 2048."""
     height: int | None = None
     """Image height in pixels; default the camera's."""
-    frames: int = 60
-    """Views of an orbit, or of one camera over a range of --time."""
+    path: Path | None = None
+    """A flight through keyframes, as drgs view saves it, or a camera path of Nerfstudio's viewer (docs/view.md)."""
+    panorama: bool = False
+    """All-round pictures (360 by 180 degrees, upright) from where the cameras are; default the middle photograph's."""
+    frames: int | None = None
+    """Views of an orbit, a flight, or one camera over a range of --time; default 60, of a flight as it lasts."""
+    duration: float | None = None
+    """Seconds that the film of an orbit, a flight or a range of --time lasts, instead of --frames."""
     format: str = "png"
-    """Comma-separated list of png, exr, webm, and ply: all Gaussians as they are at each time."""
-    fps: float = 24.0
-    """Frames a second of the video."""
+    """Comma-separated list of png, jpg, exr, webm, mp4, and ply: all Gaussians as they are at each time."""
+    fps: float | None = None
+    """Frames a second of the video; default 24, of a flight what its file says."""
     depth: bool = False
     """Write color-mapped depth too; exr files hold it anyway."""
     features: bool = False

@@ -126,7 +126,9 @@ def _keyframe(where: str, row: dict) -> Keyframe:
         position, wxyz = np.array(row["position"], np.float64), np.array(row["wxyz"], np.float64)
         length = float(np.linalg.norm(wxyz))
         if not abs(length - 1) <= _UNIT:
-            raise ValueError(f"{where}: wxyz must be a quaternion of length 1, got length {length:g}; divide it by that")
+            raise ValueError(
+                f"{where}: wxyz must be a quaternion of length 1, got length {length:g}; divide it by that"
+            )
         wxyz /= length
         inverse_pose(where, np.column_stack([np.eye(3), position]))  # refuses what is beyond reason
     _number(where, row, "fov", *_FOV)
@@ -169,7 +171,7 @@ def _check_together(where: str, keys: tuple[Keyframe, ...]) -> None:
 
 
 def _of_nerfstudio(where: str, found: dict) -> Flight:
-    """A camera path of Nerfstudio's viewer: OpenGL axes, matrices in a row of 16, vertical fields of view in degrees."""
+    """A camera path of Nerfstudio's viewer: OpenGL axes, matrices of 16 numbers, vertical fields of view in degrees."""
     check_json(where, found, _THEIRS, "export the camera path again")
     kind = found.get("camera_type", "perspective")
     if kind not in ("perspective", "equirectangular"):
@@ -183,13 +185,17 @@ def _of_nerfstudio(where: str, found: dict) -> Flight:
         at = f"{where}: camera_path[{k}]"
         check_json(at, row, {"camera_to_world": [float], "fov": float}, "export the camera path again")
         if len(row["camera_to_world"]) != 16:
-            raise ValueError(f"{at}: camera_to_world must hold 16 numbers, got {len(row['camera_to_world'])}; export it again")
+            raise ValueError(
+                f"{at}: camera_to_world must hold 16 numbers, got {len(row['camera_to_world'])}; export it again"
+            )
         matrix = np.array(row["camera_to_world"], np.float64).reshape(4, 4)
         check_last_row(f"{at}: camera_to_world", matrix)
         matrix = c2w_from_opengl(matrix)
         length = np.cbrt(abs(np.linalg.det(matrix[:3, :3])))
         if not 1e-6 < length < 1e6:
-            raise ValueError(f"{at}: camera_to_world must hold a rotation, got a determinant of {length**3:g}; export it again")
+            raise ValueError(
+                f"{at}: camera_to_world must hold a rotation, got a determinant of {length**3:g}; export it again"
+            )
         matrix[:3, :3] /= length  # their poses may carry the scale of the scene
         position, wxyz = _pose(at, "camera_to_world", matrix.tolist())
         _number(at, row, "fov", *_FOV)

@@ -123,4 +123,6 @@ class Mp4:
     def _failure(self, problem: Exception) -> OSError:
         """The error of the path, in a line."""
         told = " ".join(str(problem).split()) or type(problem).__name__
-        return OSError(f"{self.path}: must be written, got: {told}; free some space, choose another folder, or use webm")
+        return OSError(
+            f"{self.path}: must be written, got: {told}; free some space, choose another folder, or use webm"
+        )
