@@ -170,11 +170,9 @@ def check_suffix(where: str, path: Path) -> str:
         return codec.suffix
     got = (codec.suffix if codec else path.suffix.lower()) or "no suffix"
     known = f"{where}: {path.name} must end with {', '.join(written)}, got {got}"
-    if name == "meta.json":
-        codec = CODECS["sog"]  # the index of the same, in a folder
     if codec is None or not codec.made_by:
         raise ValueError(f"{known}; choose one of these")
-    ply = path.with_name(("scene" if name == "meta.json" else path.name[: -len(codec.suffix)]) + ".ply")
+    ply = path.with_name(path.name[: -len(codec.suffix)] + ".ply")
     raise ValueError(
         f"{known}, a format that drgs reads and does not write; write {ply}, and make it of that: "
         f"{codec.made_by.format(ply=ply, path=path)}"

@@ -17,11 +17,10 @@ _CODEBOOK_STEPS = 40
 _PALETTE_STEPS = 6
 _BLOCK = 4096  # rows that are compared with all centers at a time
 _SEED = 0
+_MORTON_BITS = 20  # an axis: a few Gaussians far away shall not leave one cell for all others
 
 
-def codebook(
-    values: np.ndarray, weights: np.ndarray | None = None, size: int = 256
-) -> tuple[np.ndarray, np.ndarray]:
+def codebook(values: np.ndarray, weights: np.ndarray | None = None, size: int = 256) -> tuple[np.ndarray, np.ndarray]:
     """At most `size` numbers that stand for values, ascending, and which of them stands for each.
 
     Args:
@@ -142,11 +141,12 @@ def morton_order(means: np.ndarray) -> np.ndarray:
     Reference:
         Morton, "A computer oriented geodetic data base", 1966.
     """
-    low, high = means.min(0), means.max(0)
-    step = (high.astype(np.float64) - low) / 1023
+    means = means.astype(np.float64)
+    low = means.min(0)
+    step = (means.max(0) - low) / ((1 << _MORTON_BITS) - 1)
     cells = ((means - low) / np.where(step > 0, step, 1)).astype(np.uint64)
     code = np.zeros(len(means), np.uint64)
-    for bit in range(10):
+    for bit in range(_MORTON_BITS):
         for axis in range(3):
             code |= (cells[:, axis] >> np.uint64(bit) & np.uint64(1)) << np.uint64(3 * bit + axis)
     return np.argsort(code, kind="stable")

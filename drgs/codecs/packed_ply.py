@@ -194,7 +194,7 @@ def encode_packed_ply(g: Gaussians) -> bytes:
     ]
     if g.sh_degree:
         # Ours are coefficient by coefficient, stored channel by channel.
-        rest = sh[:, 1:].transpose(0, 2, 1).reshape(len(g), -1)
+        rest = sh[:, 1:].transpose(0, 2, 1).reshape(len(g), 3 * (sh.shape[1] - 1))
         lines += [f"element sh {len(g)}", *(f"property uchar f_rest_{i}" for i in range(rest.shape[1]))]
         body.append(np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8).tobytes())
     return "\n".join([*lines, "end_header", ""]).encode() + b"".join(body)

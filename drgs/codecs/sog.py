@@ -40,7 +40,8 @@ __all__ = ["SOG", "load_sog"]
 _log = logging.getLogger(__name__)
 _META = 4 << 20  # bytes
 _THIN = 8.0  # of log scales below the largest: fits make disks whose thickness is 1e-9, and 256 entries are few
-_EACH = 3  # Gaussians a row of the palette
+_EACH = 3  # Gaussians a row of the palette, which has as many as its indices reach at most
+_FEWEST_ROWS, _MOST_ROWS = 64, 1 << 16
 _PALETTE = 64  # rows of SH side by side
 _ADVICE = "export it again with splat-transform or SuperSplat"
 _FILES = {"files": [str]}
@@ -226,7 +227,7 @@ def encode_sog(g: Gaussians) -> bytes:
         ValueError: If there are more than 2^28 Gaussians, or none.
     """
     if not 0 < len(g) <= 1 << 28:
-        raise ValueError(f"save_gaussians: SOG holds 1 to 2^28 Gaussians, got {len(g)}; write a PLY")
+        raise ValueError(f"save_gaussians: .sog must hold 1 to 2^28 Gaussians, got {len(g)}; write a PLY")
     order = morton_order(g.means.numpy())
     width = 4 * -(-(math.isqrt(len(g) - 1) + 1) // 4)  # about square
 
@@ -270,7 +271,8 @@ def encode_sog(g: Gaussians) -> bytes:
         "sh0": {"codebook": color_book.tolist(), "files": ["sh0.webp"]},
     }
     if g.sh_degree:
-        rows, labels = palette(sh[:, 1:].reshape(len(g), -1), weights, palette_size(len(g)))
+        size = min(_MOST_ROWS, max(_FEWEST_ROWS, len(g) // _EACH))
+        rows, labels = palette(sh[:, 1:].reshape(len(g), -1), weights, size)
         book, entries = codebook(rows)
         each = sh.shape[1] - 1
         pixels = np.full((-(-len(rows) // _PALETTE) * _PALETTE, each, 4), 255, np.uint8)
@@ -296,14 +298,10 @@ def _weights(g: Gaussians) -> np.ndarray:
 
     Between the thousandth part and a thousand times the median, so that none is given up.
     """
-    largest = np.sort(g.log_scales.numpy().astype(np.float64), axis=1)[:, 1:].sum(1)
-    shown = g.logit_opacities.double().sigmoid().numpy() * np.exp(largest - np.median(largest))
-    return np.clip(shown / np.median(shown), 1e-3, 1e3) ** 0.5
-
-
-def palette_size(count: int) -> int:
-    """Rows of the palette of SH of so many Gaussians: one for three, up to 65,536."""
-    return min(1 << 16, max(64, count // _EACH))
+    area = np.sort(g.log_scales.numpy().astype(np.float64), axis=1)[:, 1:].sum(1)
+    opacities = g.logit_opacities.double().sigmoid().numpy()
+    shown = area + np.log(np.maximum(opacities, np.finfo(np.float64).tiny))
+    return np.exp(0.5 * np.clip(shown - np.median(shown), -np.log(1e3), np.log(1e3)))
 
 
 def _bytes_of_quats(quats: np.ndarray) -> np.ndarray:

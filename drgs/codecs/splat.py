@@ -57,7 +57,12 @@ def encode_splat(g: Gaussians) -> bytes:
 
     The Gaussians that show most come first, by volume times opacity, as viewers that draw while they load want it.
     Values round to the nearest byte (antimatter15's own writer cuts digits off).
+
+    Raises:
+        ValueError: If there are none, which no reader tells from a file that is cut, or a scale is no float32.
     """
+    if not len(g):
+        raise ValueError("save_gaussians: .splat must hold at least one Gaussian, got none; write a PLY")
     if g.sh_degree:
         _log.warning("SPLAT: left out SH above degree 0, there is no room")
     log_scales = g.log_scales.numpy().astype(np.float64)
@@ -67,7 +72,7 @@ def encode_splat(g: Gaussians) -> bytes:
     with np.errstate(over="ignore", under="ignore"):
         scales = np.exp(log_scales).astype(np.float32)
     if not np.isfinite(scales).all():
-        raise ValueError("save_gaussians: .splat holds scales up to 3.4e38, got larger ones; scale them or write a PLY")
+        raise ValueError("save_gaussians: .splat must have scales up to 3.4e38, got larger ones; write a PLY")
     colors = g.sh.numpy()[:, 0].astype(np.float64) * Y_00 + 0.5
     outside = int(((colors < -0.5 / 255) | (colors > 255.5 / 255)).sum())
     if outside:

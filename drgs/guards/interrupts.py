@@ -241,7 +241,7 @@ def _ignore_again(first: float) -> None:
     Python's own handlers are gone once it shuts down, where large libraries take long: there the signals are ignored.
 
     Args:
-        first: When the signal came, as `time.monotonic` counts.
+        first: Time at which the signal came, in seconds of `time.monotonic`.
     """
 
     def again(signum: int, _frame: object) -> None:
