@@ -66,6 +66,7 @@ smoke: setup
 	$(BIN)/drgs teach --help
 	$(BIN)/drgs convert out/smoke/semantic out/smoke/labelled.ply --labels
 	$(BIN)/drgs convert out/smoke/run out/smoke/run.spz
+	$(BIN)/drgs convert out/smoke/run out/smoke/run.sog
 	$(BIN)/drgs scene kitchen -o out/smoke/kitchen --size 64x48 --cameras 3 --times 3 --spp 2
 	rm -rf out/smoke/moving
 	$(BIN)/drgs fit out/smoke/kitchen -o out/smoke/moving --max-steps 40 --max-gaussians 2000 --feature-width 8

@@ -289,7 +289,7 @@ class Query(Settings, Around, Views, Lenses):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Convert(Common):
-    """Write Gaussians in another format: .ply of 3DGS, .spz, or .glb (KHR_gaussian_splatting)."""
+    """Write Gaussians in another format: .ply, .spz, .sog, .splat, .compressed.ply or .glb (KHR_gaussian_splatting)."""
 
     scene: SceneFile
     out: Positional[Path]
