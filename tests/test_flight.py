@@ -54,7 +54,7 @@ def test_passes_through_keyframes(rng, loop):
 @pytest.mark.parametrize("loop", [False, True])
 def test_rates_are_continuous(rng, loop):
     """Just before and just behind a keyframe the camera moves, turns and zooms at one rate; a loop's ends, too."""
-    step = 1e-6
+    step = 1e-8
     for _ in range(20):
         flight = some(rng, loop=loop)
         at = shares_of(flight)[0 if loop else 1 : None if loop else -1]
