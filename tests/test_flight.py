@@ -1,4 +1,4 @@
-"""Claims of flights: through their keyframes, smooth, the same backwards, within a bound; files of them, good and bad."""
+"""Claims of flights: through their keyframes, smooth, the same backwards, within a bound; files, good and bad."""
 
 from __future__ import annotations
 

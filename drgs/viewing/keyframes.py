@@ -60,7 +60,12 @@ class KeyframeFolder:
         with gui.add_folder("flight", expand_by_default=expanded):
             self._text = gui.add_html("")
             self._step = gui.add_number(
-                "seconds to the next", _STEP, _SHORTEST, _LONGEST, 0.1, hint="From the last keyframe to the one added."
+                "seconds to the next",
+                _STEP,
+                min=_SHORTEST,
+                max=_LONGEST,
+                step=0.1,
+                hint="From the last keyframe to the one that is added.",
             )
             self._loop = gui.add_checkbox("loop", False, hint="Whether the flight goes back to its first keyframe.")
             self._add = gui.add_button("add keyframe", hint="Where the camera is now, at the time that is shown.")
