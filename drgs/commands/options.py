@@ -72,7 +72,7 @@ class Render(Settings, Around, Views, Moments, Lenses):
     cameras: str | None = None
     """A data set, a run, a cameras.json or selection.json, or orbit; default orbit, or with --view the run."""
     output: OutputPath = Path("out/render")
-    """Folder for the pictures."""
+    """Folder for the pictures; or a file: NAME.mp4 or .webm for the film alone, NAME.png, .jpg or .exr for one view."""
     width: int | None = None
     """Image width in pixels; default the camera's, of an orbit or a flight 640, of a panorama 2048."""
     height: int | None = None
@@ -85,8 +85,9 @@ class Render(Settings, Around, Views, Moments, Lenses):
     """Views of an orbit, a flight, or one camera over a range of --time; default 60, of a flight as it lasts."""
     duration: float | None = None
     """Seconds that the film of an orbit, a flight or a range of --time lasts, instead of --frames."""
-    format: str = "png"
-    """Comma-separated list of png, jpg, exr, webm, mp4, and ply: all Gaussians as they are at each time."""
+    format: str | None = None
+    """Comma-separated list of png, jpg, exr, webm, mp4, and ply: all Gaussians as they are at each time; default png, or
+    what the file of -o ends with."""
     fps: float | None = None
     """Frames a second of the video; default 24, of a flight what its file says."""
     depth: bool = False

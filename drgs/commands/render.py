@@ -30,6 +30,7 @@ from drgs.commands.flown import (
     up_of,
 )
 from drgs.commands.forecast import forecast
+from drgs.commands.lone_file import lone_file
 from drgs.commands.moments import at_times, named_view, ply_names, write_plys
 from drgs.commands.orbits import Wish
 from drgs.commands.painters import PAINTINGS, painters
@@ -65,7 +66,10 @@ _FILMS: Mapping[str, Any] = {"webm": pictures.Video, "mp4": Mp4}
 def run(args: Render) -> None:
     """`drgs render SCENE`."""
     settings = args.settings()  # refuses what cannot be, before anything is read
-    formats = _formats(args.format)
+    alone = lone_file(args)
+    if alone is not None:
+        args = dataclasses.replace(args, output=alone.folder, format=alone.format)
+    formats = _formats("png" if args.format is None else args.format)
     _check_numbers(args)
     if args.moving and "ply" not in formats:
         raise ValueError("render: --moving must have ply among --format, which only it means; add it or drop --moving")
@@ -79,9 +83,11 @@ def run(args: Render) -> None:
     if is_alone and views == "orbit" and args.path is None:
         raise ValueError("render: --panorama must have a place, a file of Gaussians has none; add --path or --cameras")
     movie = "flight" if args.path is not None else "turntable" if views == "orbit" else "video"
+    if alone is not None:
+        movie = alone.stem
     kinds = [kind for kind in PAINTINGS if getattr(args, kind)]
     movies = [_movie_of(movie, kind, end) for end in _FILMS if end in formats for kind in ("", *kinds)]
-    fixed = ["render.json", "cameras.json", *movies]
+    fixed = ["render.json", "cameras.json", *movies] if alone is None else [alone.name]
     output = claim(args.output, "render", fixed, inputs=[args.scene, views, *([args.path] if args.path else [])])
     given = SceneInput.of(args)
     paint = painters(kinds, given, args.scene)
@@ -107,6 +113,8 @@ def run(args: Render) -> None:
         cameras = [camera.undistorted() for camera in cameras]
         _say(args, f"{bent} cameras have a lens: drawn without it; --undistort off draws through it")
     check_lenses("render", settings, cameras)
+    if alone is not None:
+        cameras = alone.named(cameras)
     _check_memory(cameras, settings, formats, 0 if gaussians.features is None else gaussians.features.shape[1])
     ends = [*(kind for kind in formats if kind not in (*_FILMS, "ply")), *(["depth.png"] * args.depth)]
     ends += [f"{kind}.png" for kind in kinds]
@@ -129,6 +137,9 @@ def run(args: Render) -> None:
             advance=bar.advance,
         )
     report = {"scene": str(args.scene), "cameras": source, "gaussians": len(gaussians)} | report
+    if alone is not None:
+        _say(args, _summary(report, alone.path))
+        return
     if film.flight is not None:
         report["flight"] = {
             "path": str(args.path),
