@@ -37,7 +37,7 @@ class Keyframe:
         position: (3,) center of the camera in the world.
         wxyz: (4,) quaternion of camera to world, OpenCV axes, of length 1.
         fov: Vertical field of view in degrees.
-        seconds: When the flight is there; only differences count.
+        seconds: Time at which the flight is there; only differences count.
         time: Time of the scene, of one that moves.
     """
 
@@ -53,7 +53,7 @@ class Flight:
     """A way through keyframes.
 
     Attributes:
-        keyframes: At least one, in the order of their seconds, no two at the same. All have a time, or none has.
+        keyframes: Keyframes in the order of their seconds, at least one, no two at the same; all have a time, or none.
         duration: Seconds of the whole flight, to which those of the keyframes are stretched; None leaves them.
         loop: Whether it ends where it began, after one more step as long as the others in the mean.
         fps: Frames a second; None where the file says nothing.
