@@ -177,3 +177,49 @@ def test_a_level_panorama_of_a_camera_that_looks_up():
         np.testing.assert_allclose(level.center, (1, 2, 3), atol=1e-12)
         np.testing.assert_allclose(level.c2w[:3, 1], -up, atol=1e-12)
         assert abs(np.linalg.det(level.c2w[:3, :3]) - 1) < 1e-12
+
+
+@pytest.mark.parametrize("end", [pytest.param("mp4", marks=needs_av), "webm"])
+def test_a_film_alone(scene, flight, tmp_path, end):
+    """-o with the name of a film: that file and no other, written anew as often as asked, never over another's."""
+    out = tmp_path / "out" / f"a flight.{end}"
+    for seconds, count in ((0.2, 5), (0.1, 3)):
+        assert rendered(scene, "--path", flight, "--duration", seconds, "--width", 16, "-o", out) == 0
+        assert [path.name for path in out.parent.iterdir() if not path.name.startswith(".")] == [out.name]
+        assert len(film(out)[0]) == count
+    foreign = tmp_path / f"foreign.{end}"
+    foreign.write_bytes(b"mine")
+    assert rendered(scene, "--path", flight, "--width", 16, "-o", foreign) == 2
+    assert foreign.read_bytes() == b"mine"
+
+
+def test_a_picture_alone(scene, flight, tmp_path):
+    """-o with the name of a picture: one view, in the format that the name says."""
+    out = tmp_path / "out" / "all-round.jpg"
+    assert rendered(scene, "--path", flight, "--limit", 1, "--panorama", "--width", 40, "-o", out) == 0
+    assert [path.name for path in out.parent.iterdir() if not path.name.startswith(".")] == [out.name]
+    assert cv2.imread(str(out)).shape == (20, 40, 3)
+    folder = tmp_path / "pictures.png"
+    folder.mkdir()
+    assert rendered(scene, "--path", flight, "--limit", 2, "--width", 8, "-o", folder) == 0
+    assert len(list(folder.glob("*.png"))) == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("-o {dir}/a.webm --format png", "--format must be left out with -o {dir}/a.webm, got 'png'"),
+        ("-o {dir}/a.webm --depth", "--depth must have a folder to write into, -o {dir}/a.webm is one file"),
+        ("-o {dir}/a.WEBM", "{dir}/a.WEBM: must end in .webm in small letters"),
+        ("-o {dir}/a.png", "{dir}/a.png: must be a folder for 11 views, a file holds one; name a folder"),
+        ("-o {dir}/a+b.png --limit 1", "{dir}/a+b.png: must have a name of letters, digits, - _ and . alone"),
+    ],
+)
+def test_a_lone_file_that_cannot_be(scene, flight, tmp_path, capsys, words, expected):
+    """One line, exit code 2, nothing written."""
+    before = sorted(tmp_path.iterdir())
+    assert rendered(scene, "--path", flight, "--width", 8, *words.format(dir=tmp_path).split()) == 2
+    error = capsys.readouterr().err
+    assert expected.format(dir=tmp_path) in error
+    assert error.count("\n") == 1
+    assert [path for path in sorted(tmp_path.iterdir()) if not path.name.startswith(".")] == before

@@ -85,9 +85,7 @@ def lone_file(args: Render) -> LoneFile | None:
         )
     for name in _MORE:
         if getattr(args, name):
-            raise ValueError(
-                f"render: --{name} must have a folder to write into, -o {path} is one file; name a folder"
-            )
+            raise ValueError(f"render: --{name} must have a folder to write into, -o {path} is one file; name a folder")
     if found.format in _PICTURES and file_names([found.stem]) != [found.stem]:
         raise ValueError(f"{path}: must have a name of letters, digits, - _ and . alone; rename it")
     return found

@@ -25,6 +25,7 @@ __all__ = ["KeyframeFolder"]
 
 _STEP = 2.0  # seconds from a keyframe to the next
 _SHORTEST, _LONGEST = 0.1, 600.0  # of such a step
+_MANY = 100  # keyframes; of the longest steps they are less long than a file may say
 _SEGMENTS = 24  # of the way's line, from a keyframe to the next
 _COLOR = (66, 135, 245)
 _FRAME = 1 / 20  # seconds, in a preview
@@ -36,7 +37,7 @@ class KeyframeFolder:
     Args:
         client: viser's handle of the browser.
         here: Function that returns where the browser's camera is, in the world, as a keyframe at 0 seconds.
-        go: Function that moves the browser's camera, and its time, to a keyframe.
+        go: Function that moves the browser's camera, and its time, to a keyframe; and whether it is the last one.
         origin: (3,) what the world is moved by in the browser.
         expanded: Whether the folder is open at first.
     """
@@ -45,7 +46,7 @@ class KeyframeFolder:
         self,
         client: viser.ClientHandle,
         here: Callable[[], Keyframe],
-        go: Callable[[Keyframe], None],
+        go: Callable[[Keyframe, bool], None],
         origin: np.ndarray,
         expanded: bool = False,
     ) -> None:
@@ -92,9 +93,11 @@ class KeyframeFolder:
     def close(self) -> None:
         """End a preview."""
         if self._preview is not None:
-            self._preview.cancel()
+            if self._preview is not asyncio.current_task():
+                self._preview.cancel()
             self._preview = None
             self._fly.label = "fly"
+            self._show_line(True)
 
     def forget(self, has_times: bool) -> None:
         """Another subject is looked at: keyframes stay, unless they have times and it has none, or the reverse."""
@@ -107,6 +110,8 @@ class KeyframeFolder:
 
     async def _added(self, _: Any) -> None:
         self.close()
+        if len(self.keyframes) >= _MANY:
+            return
         step = self._step.value
         step = float(step) if isinstance(step, int | float) and _SHORTEST <= step <= _LONGEST else _STEP
         seconds = self.keyframes[-1].seconds + step if self.keyframes else 0.0
@@ -123,30 +128,35 @@ class KeyframeFolder:
 
     async def _saved(self, _: Any) -> None:
         if self.keyframes:
-            self.client.send_file_download("flight.json", flight_json(self.flight))
+            self.client.send_file_download("flight.json", flight_json(self.flight), save_immediately=True)
 
     async def _flown(self, _: Any) -> None:
         if self._preview is not None:
             self.close()
         elif len(self.keyframes) > 1:
             self._fly.label = "stop"
+            self._show_line(False)  # it leads through the camera
             self._preview = asyncio.create_task(self._previewed(self.flight))
 
     async def _previewed(self, flight: Flight) -> None:
         """Fly once, at the pace of the flight."""
         began = time.monotonic()
         while (gone := (time.monotonic() - began) / flight.seconds) < 1:
-            self._go(flight.at(np.array([gone]))[0])
+            self._go(flight.at(np.array([gone]))[0], False)
             await asyncio.sleep(_FRAME)
-        self._preview = None
-        self._fly.label = "fly"
-        self._go(flight.at(np.array([1.0]))[0])
+        self._go(flight.at(np.array([1.0]))[0], True)
+        self.close()
+
+    def _show_line(self, is_shown: bool) -> None:
+        if self._line is not None:
+            self._line.visible = is_shown
 
     def _show(self) -> None:
         """Say what there is, and draw the way."""
         count = len(self.keyframes)
         long = f", {self.flight.seconds:.1f} s" if count > 1 else ""
         self._text.content = panel.status(f"{count} keyframe{'' if count == 1 else 's'}{long}")
+        self._add.disabled = count >= _MANY
         for button, least in ((self._drop, 1), (self._fly, 2), (self._save, 1)):
             button.disabled = count < least
         if self._line is not None:
@@ -160,3 +170,4 @@ class KeyframeFolder:
             self._line = self.client.scene.add_line_segments(
                 "/flight", np.stack([way[:-1], way[1:]], axis=1), _COLOR, thickness=2.0, thickness_units="screen"
             )
+            self._show_line(not self.is_flying)

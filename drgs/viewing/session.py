@@ -47,6 +47,7 @@ _FRUSTUM = 0.05  # size of a camera's frustum, of its distance to what is looked
 _COVERS = 0.5  # share of half a view's narrower side: a frustum that reaches farther is hidden
 _NARROW = 576  # pixels of a window that viser lays its panel over, as over a phone's
 _MOMENTS = 48  # times in a round of playing, at most
+_FOVS = 1.0, 150.0  # degrees of a keyframe: such as files have, and no wider than our pictures
 _UNKNOWN = 640, 480  # pixels of a window that has not said how large it is
 _PAUSE = 0.08  # seconds between two of them, at least
 
@@ -353,10 +354,11 @@ class Session:
         """Where the camera is, as a keyframe of a flight."""
         pose = self.pose
         wxyz = pose.wxyz / np.linalg.norm(pose.wxyz)
-        return Keyframe(pose.position + self.subject.origin, wxyz, math.degrees(pose.fov), 0.0, self.time)
+        fov = float(np.clip(math.degrees(pose.fov), *_FOVS))
+        return Keyframe(pose.position + self.subject.origin, wxyz, fov, 0.0, self.time)
 
-    def _fly_to(self, key: Keyframe) -> None:
-        """Move the camera to a moment of a flight."""
+    def _fly_to(self, key: Keyframe, is_last: bool) -> None:
+        """Move the camera to a moment of a flight; what moves goes along as fast as it can be sent."""
         camera = self.client.camera
         with self.client.atomic():
             camera.position = key.position - self.subject.origin
@@ -364,8 +366,10 @@ class Session:
             camera.fov = math.radians(key.fov)
         self.pose, self.size = self._seen_pose() or (self.pose, self.size)
         self._hide()
-        if self._slider is not None and key.time is not None and self._playing is None:
-            self._slider.value = self.subject.moment(key.time)
+        if self._slider is not None and key.time is not None:
+            self._stop_playing()
+            if is_last or not self._worker.has((self, "gaussians")):
+                self._slider.value = self.subject.moment(key.time)
         self._ask_later()
 
     def _read_photograph(self, read: Callable[[int], np.ndarray]) -> Iterator[None]:
