@@ -149,8 +149,9 @@ def make_folder(folder: Path) -> Path:
     """Fill a folder with what pages speak of.
 
     `scene`, nine posed pictures of a few Gaussians; `data/room`, the same with a teacher's maps; `point_cloud.ply`
-    and `scene.ply`, the Gaussians; `cameras.json`, poses alone; `flight.json`, three of them; `phone.mp4`, seconds of
-    video, and `photos`, an empty folder; `my_package/rasterizer.py`, a rasterizer in plain torch.
+    and `scene.ply`, the Gaussians; `cameras.json`, poses alone; `flight.json`, a flight through three of them;
+    `phone.mp4`, seconds of video, and `photos`, an empty folder; `my_package/rasterizer.py`, a rasterizer in plain
+    torch.
     """
     import cv2
     import numpy as np
