@@ -166,6 +166,7 @@ _WRITERS = {
 """Module that writes JSON for users -> the sections of the page that tell its fields."""
 _OTHERS = {
     "codecs/gltf.py",  # the header of a .glb
+    "codecs/sog.py",  # the index in a .sog
     "commands/info.py",  # stdout
     "commands/repeat.py",  # options on a line of a report
     "data/reader_process.py",  # between processes
