@@ -52,8 +52,8 @@ smoke: setup
 	$(BIN)/drgs cite out/smoke/run
 	$(BIN)/drgs render out/smoke/run --frames 3 --width 64 --format png,exr,webm --depth -o out/smoke/render
 	echo '{"keyframes": [{"position": [0, 0, -3], "wxyz": [1, 0, 0, 0], "fov": 50, "seconds": 0}, {"position": [1, 0, -3], "wxyz": [1, 0, 0, 0], "fov": 40, "seconds": 0.2}]}' > out/smoke/flight.json
-	$(BIN)/drgs render out/smoke/run --path out/smoke/flight.json --width 64 --format mp4,webm -o out/smoke/flight
-	$(BIN)/drgs render out/smoke/run --panorama --width 64 --format jpg -o out/smoke/panorama
+	$(BIN)/drgs render out/smoke/run --path out/smoke/flight.json --width 64 -o out/smoke/flight.mp4
+	$(BIN)/drgs render out/smoke/run --panorama --width 64 -o out/smoke/panorama.jpg
 	rm -rf out/smoke/active
 	$(BIN)/drgs fit out/smoke/still_life -o out/smoke/active --views active --add 2 --every 10 --max-steps 40
 	$(BIN)/drgs select out/smoke/run --candidates dome --count 6 -k 2 -o out/smoke/selection.json
