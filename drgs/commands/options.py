@@ -86,8 +86,7 @@ class Render(Settings, Around, Views, Moments, Lenses):
     duration: float | None = None
     """Seconds that the film of an orbit, a flight or a range of --time lasts, instead of --frames."""
     format: str | None = None
-    """Comma-separated list of png, jpg, exr, webm, mp4, and ply: all Gaussians as they are at each time; default what a
-    file of -o ends with, else png."""
+    """List of png, jpg, exr, webm, mp4 and ply (all Gaussians at each time), by commas; default png, or as -o ends."""
     fps: float | None = None
     """Frames a second of the video; default 24, of a flight what its file says."""
     depth: bool = False
