@@ -103,6 +103,8 @@ def test_how_many_frames(scene, flight, tmp_path, capsys):
         ("--panorama", "--panorama must have a place, a file of Gaussians has none; add --path or --cameras"),
         ("--panorama --path {flight} --width 30 --height 30", "--panorama must be twice as wide as high, got 30x30"),
         ("--panorama --path {flight} --preset gsplat", "--panorama must have settings that follow rays"),
+        ("--panorama --path {flight} --preset 3dgut", "--panorama must have near 0, got 0.01, which leaves out all"),
+        ("--panorama --path {flight} --preset 3dgut --set near=0", "--panorama must have culling by extent"),
     ],
 )
 def test_bad_input(scene, flight, tmp_path, capsys, words, expected):
@@ -140,24 +142,26 @@ def test_half_an_mp4_is_none(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_panorama_shows_what_is_all_round(scene, tmp_path):
-    """Up is up, ahead is in the middle, right is right: the balls lie where their directions say."""
-    camera = Camera(
-        K=intrinsics_from_fov(60, 24, 16),
-        w2c=look_at((0, 0, 0), (0, 0.3, 1), (0, -1, 0)),
-        width=24,
-        height=16,
-        name="a",
-    )
-    save_cameras_json(tmp_path / "cameras.json", [camera])
-    words = ("--cameras", tmp_path / "cameras.json", "--panorama", "--width", 80, "--format", "png,jpg")
-    assert rendered(scene, *words, "-o", tmp_path / "out") == 0
+@pytest.mark.parametrize("settings", ["--preset exact", "--preset fast"])
+def test_a_panorama_shows_what_is_all_round(scene, tmp_path, settings):
+    """Up is what it is to all cameras together, ahead is in the middle, right is right: the balls lie where their
+    directions say."""
+    looks = [(0, 0.3, 1), (1, 0.3, 0), (0, 0.3, -1), (-1, 0.3, 0)]  # all of them down
+    cameras = [
+        Camera(K=intrinsics_from_fov(60, 24, 16), w2c=look_at((0, 0, 0), x, (0, -1, 0)), width=24, height=16, name=name)
+        for name, x in zip("abcd", looks, strict=True)
+    ]
+    save_cameras_json(tmp_path / "cameras.json", cameras)
+    words = f"{scene} --cameras {tmp_path / 'cameras.json'} --limit 1 --panorama --width 80 --format png,jpg"
+    assert cli.main(["render", *words.split(), *settings.split(), "-o", str(tmp_path / "out"), "--quiet"]) == 0
     image = cv2.imread(str(tmp_path / "out" / "a.png"))[..., ::-1].astype(int)
     assert image.shape == (40, 80, 3)
     assert image[20, 40].argmax() == 2  # blue, +z, ahead: leveled, though the camera looks down
+    assert image[20, [40, 60]].max(1).min() > 200
     assert image[20, 60].argmax() == 0  # red, +x, a quarter to the right
     assert (image[39].argmax(1) == 1).all()  # green, +y, below
-    assert image[20, 20].max() < 100
+    assert 20 < image[20, 20].max() < 100  # dark, -x, a quarter to the left
+    assert 20 < image[20, 0].max() < 100  # dark, -z, behind
     data = (tmp_path / "out" / "a.jpg").read_bytes()
     assert b'GPano:ProjectionType="equirectangular"' in data[:1000]
     assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).shape == (40, 80, 3)

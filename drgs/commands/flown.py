@@ -133,11 +133,21 @@ def flight_cameras(args: Render, film: Film, given: SceneInput, shape: float) ->
 
 
 def check_panorama(settings: RenderSettings) -> None:
-    """Raise ValueError for settings that draw pinholes alone."""
+    """Raise ValueError for settings that draw pinholes alone, or leave out what is behind the camera."""
     if settings.planar:
         raise ValueError(
             f"render: --panorama must have settings that follow rays, response {settings.response!r} is a model of a "
-            "pinhole's image plane; use --preset exact, fast or 3dgut"
+            "pinhole's image plane; use --preset exact or fast"
+        )
+    if settings.near > 0:
+        raise ValueError(
+            f"render: --panorama must have near 0, got {settings.near:g}, which leaves out all behind the camera; use "
+            "--preset exact or fast"
+        )
+    if settings.culling == "ut":
+        raise ValueError(
+            "render: --panorama must have culling by extent, the points of 'ut' do not reach around the poles; use "
+            "--preset exact or fast"
         )
 
 

@@ -101,9 +101,10 @@ def run(args: Render) -> None:
     else:
         cameras, source = drawn_views(args, views, given, film.frames, size, returns=True)
         cameras = [middle_camera(cameras)] if is_alone else named_view(cameras, args.view, source)
+    placed = photographs or cameras
     cameras = at_times(cameras[: args.limit], args.time, film.frames, given, is_film=film.flight is not None)
     if args.panorama:
-        up, across = up_of(photographs or cameras, Wish.of(args).up), panorama_size(args)
+        up, across = up_of(placed, Wish.of(args).up), panorama_size(args)
         cameras = [level_panorama(camera, up, *across) for camera in cameras]
     else:
         cameras = [_resized(camera, args.width, args.height) for camera in cameras]
