@@ -42,11 +42,11 @@ _LINE = re.compile(rb"^[IWEF]\d{8} \S+ +\d+ [^\]]+\] (.*)$")
 class _Told:
     """What `map_photos` tells of: poses found in the model that is being made, and what is being done."""
 
-    def __init__(self, total: int, progress: Progress, doing: Callable[[str], None]) -> None:
+    def __init__(self, total: int, progress: Progress, doing: Callable[[str], None], registered: int = 0) -> None:
         self.total = total
         self._progress = progress
         self._doing = doing
-        self.registered = 0
+        self.registered = registered
         self._model = 0
         self._what = "reading the matches"
         self._since = time.monotonic()
@@ -97,6 +97,8 @@ def map_photos(
     total: int,
     progress: Progress,
     doing: Callable[[str], None],
+    base: Path | None = None,
+    posed: int = 0,
 ) -> dict[int, Any]:
     """COLMAP's incremental mapping.
 
@@ -108,12 +110,14 @@ def map_photos(
         total: photographs.
         progress: Called with ("mapping", poses found in the current model, total), also from another thread.
         doing: Called with what is being done, in words, also from another thread.
+        base: Folder of a model to go on with; default none.
+        posed: Number of photographs in it.
     Returns:
         pycolmap's models by number; empty if no two photographs could be connected.
     """
     from drgs.data.colmap_bindings import pycolmap
 
-    told = _Told(total, progress, doing)
+    told = _Told(total, progress, doing, posed)
     told.still()
     with _followed(folder, told):
         return pycolmap.incremental_mapping(
@@ -121,6 +125,7 @@ def map_photos(
             image_dir,
             folder,
             options=options,
+            input_path=base or "",
             initial_image_pair_callback=told.begun,
             next_image_callback=told.one_more,
         )

@@ -47,6 +47,7 @@ def extract(
     max_image_size: int = 0,
     wide_baseline: bool = False,
     masks: Path | None = None,
+    camera: int | None = None,
     progress: Progress | None = None,
 ) -> None:
     """SIFT features of images into a COLMAP database.
@@ -60,6 +61,7 @@ def extract(
         wide_baseline: Affine shapes and pooled scales: connects views further apart, at 2.5 times
             the cost.
         masks: Folder with `NAME.EXT.png` of every image, of its size: no features where it is 0.
+        camera: Number of a camera in the database that the images share; default a new one.
         progress: Called with ("features", done, total).
     """
     from drgs.data.colmap_bindings import pycolmap
@@ -75,14 +77,17 @@ def extract(
     if masks is not None:
         reader.mask_path = masks
         options.sift.peak_threshold = _MASKED_CONTRAST
+    shared_camera = shared_camera or camera is not None
     mode = pycolmap.CameraMode.SINGLE if shared_camera else pycolmap.CameraMode.PER_IMAGE
+    if camera is not None:
+        reader.existing_camera_id = camera
     for start in range(0, len(names), _IMAGES_A_STEP):
         if progress:
             progress("features", start, len(names))
-        if shared_camera and start:
-            # Every call would otherwise open a camera of its own.
+        if shared_camera and start and camera is None:
+            # Every call would otherwise open a camera of its own; the first of these is the newest.
             with pycolmap.Database.open(database) as handle:
-                reader.existing_camera_id = handle.read_all_cameras()[0].camera_id
+                reader.existing_camera_id = max(found.camera_id for found in handle.read_all_cameras())
         pycolmap.extract_features(
             database,
             folder,

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import itertools
-import logging
 import os
-import re
 import shutil
 import time
-import unicodedata
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,10 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.data.checks import IMAGE_SUFFIXES, image_size, list_images, read_image
-from drgs.data.heif import heif_as_jpeg, is_heif
+from drgs.data.checks import image_size, list_images
 from drgs.data.mapping import PhotoGroups, map_photos
 from drgs.data.masks import ALPHA_MASKS, feature_mask, masked_photo, masks_of
+from drgs.data.photo_files import check_names, readable_photos
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.outputs import claim
 from drgs.guards.unfinished import temporary_folder
@@ -46,11 +43,6 @@ _WINDOW = 10
 # Matches that a pose needs where an object alone is looked at, which has few: half of COLMAP's own numbers.
 _MASKED_INLIERS_FIRST = 50
 _MASKED_INLIERS = 15
-_QUALITY = 98  # of JPEG, for what has been compressed before
-_LONGEST = 251  # bytes of a name, where file systems allow 255 and COLMAP wants .png behind it
-_SHOWN = 5  # names that a message repeats
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -120,7 +112,7 @@ def run_sfm(
     if not image_dir.is_dir():
         raise FileNotFoundError(f"{image_dir}: must be a folder of photos, found none; check the path")
     names = [path.name for path in list_images(image_dir)]
-    _check_names(image_dir, names, masked=masks is not None)
+    check_names(image_dir, names, masked=masks is not None)
     if len(names) < 2:
         raise ValueError(f"{image_dir}: must hold at least 2 photos, got {len(names)}; add overlapping photos")
     if camera_model not in CAMERA_MODELS:
@@ -208,7 +200,7 @@ def _reconstruct(
     shared = len({image_size(image_dir / name) for name in names}) == 1
     marks = [time.perf_counter()]
     with quiet():
-        readable = _readable_photos(image_dir, names, partial / "readable", report)
+        readable = readable_photos(image_dir, names, partial / "readable", report)
         extract(
             database,
             partial / "photos" if is_masked else readable,
@@ -291,71 +283,3 @@ def _install(partial: Path, output: Claim, linked: dict[str, Path], makes_masks:
     for file in partial.glob("database.db*"):
         output.put(file, file.name)
     output.put(partial / "sparse", "sparse")
-
-
-def _check_names(folder: Path, names: list[str], masked: bool = False) -> None:
-    """Refuse names that a COLMAP model cannot hold: with line breaks or other control characters, or bytes that are not
-    UTF-8; with masks, whose names are those and `.png`, also too long ones. Say which photographs are hidden, and left
-    out.
-
-    Raises:
-        ValueError: There is one.
-    """
-    for name in names:
-        if any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") for c in name):
-            raise ValueError(
-                f"{folder}: the name of a photo must be one line of UTF-8 without control characters, got "
-                f"{name[:80]!r}; rename this photo"
-            )
-        if masked and len(name.encode()) > _LONGEST:
-            raise ValueError(
-                f"{folder}: with masks, the name of a photo must have at most {_LONGEST} bytes, got "
-                f"{len(name.encode())}: {name[:40]}...; rename this photo and its mask"
-            )
-    # Those of ._ are no photographs, but what macOS notes about them on other systems.
-    hidden = [p.name for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and re.match(r"\.(?!_)", p.name)]
-    if hidden:
-        shown = ", ".join(sorted(hidden)[:_SHOWN]) + (", ..." if len(hidden) > _SHOWN else "")
-        _log.warning("%s: %d hidden photos are left out (%s); rename them to use them", folder, len(hidden), shown)
-
-
-def _readable_photos(folder: Path, names: list[str], target: Path, progress: Callable[[str, int, int], None]) -> Path:
-    """A folder where COLMAP can read all photographs under their names.
-
-    Args:
-        folder, names: The photographs.
-        target: Folder that is made if some of them are HEIC, AVIF or WebP: these become JPEG there, whatever their
-            names say, with their EXIF (which of WebP is lost), and the others links.
-        progress: Called with ("decoding", done, total) where there are such.
-    Returns:
-        `target`, or `folder` if COLMAP reads all of it.
-    Raises:
-        ValueError: One cannot be decoded, or pillow-heif is missing.
-    """
-    import cv2
-
-    foreign = [name for name in names if is_heif(folder / name) or _is_webp(folder / name)]
-    if not foreign:
-        return folder
-    target.mkdir()
-    for name in set(names) - set(foreign):
-        try:
-            (target / name).symlink_to((folder / name).resolve())
-        except OSError:
-            shutil.copyfile(folder / name, target / name)
-    for done, name in enumerate(foreign):
-        progress("decoding", done, len(foreign))
-        if is_heif(folder / name):
-            (target / name).write_bytes(heif_as_jpeg(folder / name, _QUALITY))
-        else:
-            pixels = np.ascontiguousarray(read_image(folder / name)[..., 2::-1])  # without alpha, in OpenCV's order
-            _, encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-            (target / name).write_bytes(encoded.tobytes())
-    progress("decoding", len(foreign), len(foreign))
-    return target
-
-
-def _is_webp(path: Path) -> bool:
-    with path.open("rb") as file:
-        head = file.read(12)
-    return head[:4] == b"RIFF" and head[8:] == b"WEBP"
