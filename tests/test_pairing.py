@@ -17,7 +17,9 @@ def write_features(path, features) -> list[str]:
     """A database of COLMAP's with descriptors (N, 128) uint8 of each photograph, and their names."""
     names = [f"{index:03d}.jpg" for index in range(len(features))]
     with pycolmap.Database.open(path) as handle:
-        camera = handle.write_camera(pycolmap.Camera.create(0, pycolmap.CameraModelId.SIMPLE_RADIAL, 500.0, 640, 480))
+        camera = handle.write_camera(
+            pycolmap.Camera.create_from_model_id(0, pycolmap.CameraModelId.SIMPLE_RADIAL, 500.0, 640, 480)
+        )
         for name, found in zip(names, features, strict=True):
             number = handle.write_image(pycolmap.Image(name=name, camera_id=camera))
             handle.write_descriptors(number, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, found))

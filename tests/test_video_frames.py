@@ -91,12 +91,12 @@ def test_long_blur_is_told(walk, tmp_path):
 @pytest.mark.parametrize("focal", [0.75, 1.2])
 def test_a_turn_on_the_spot(tmp_path, focal):
     """Few frames and a finding, whatever the lens."""
-    cameras = turn_cameras(walk_cameras(1, focal=focal)[0], 2 * RATE, step=0.05)
+    cameras = turn_cameras(walk_cameras(1, focal=focal)[0], 2 * RATE, step=0.06)
     looked = look_at(film(tmp_path / "turn.mp4", pictures(cameras)))
     picked = looked.pick(150)
     assert kinds(picked) == ["turn"]
     assert "only turns, which shows no depth; step sideways" in picked.findings[0].line()
-    bridged = 0.05 * 20 * focal / 0.25
+    bridged = 0.06 * 20 * focal / 0.25
     assert 2 <= len(picked.frames) <= 1.5 * bridged + 1
     # Two frames of it would share little: more would do.
     found = [finding.line() for finding in looked.pick(2).findings if finding.kind == "overlap"]

@@ -37,6 +37,7 @@ _PARALLAX = 0.01  # of the longer side, between two frames that are taken
 _MOTION = 0.12  # the same of all motion, where there is little parallax: such frames connect
 _TURN_STEP = 0.25  # the same within a turn, which is only to be bridged: three quarters are in both
 _FEWEST_TRACKS = 20
+_BLANK = 0.05  # frames a look where there is nothing to be tracked
 _BLURRED = 0.45  # of the sharpness that is usual near by
 _NEAR = 1.5  # seconds that are near by
 _INSTEAD = 0.35  # seconds that a sharp frame may be away from a blurred one whose place it takes
@@ -307,12 +308,9 @@ def _novelty(looks: Sequence[_Look], turns: Sequence[tuple[int, int]]) -> tuple[
 
     Turns at either end, after or before which nothing comes, are left out, unless there is little else.
     """
-    steps = np.array(
-        [1.0 if math.isnan(look.motion) else max(look.parallax / _PARALLAX, look.motion / _MOTION) for look in looks]
-    )
+    steps = np.array([_step(look, is_turn=False) for look in looks])
     for start, end in turns:
-        bridging = [1.0 if math.isnan(look.motion) else look.motion / _TURN_STEP for look in looks[start : end + 1]]
-        steps[start : end + 1] = bridging
+        steps[start : end + 1] = [_step(look, is_turn=True) for look in looks[start : end + 1]]
     steps[0] = 1.0  # the first frame
     steps = np.minimum(steps, 2.0)
     is_open = np.ones(len(looks), bool)
@@ -324,8 +322,15 @@ def _novelty(looks: Sequence[_Look], turns: Sequence[tuple[int, int]]) -> tuple[
     return np.cumsum(np.where(is_open, steps, 0.0)), is_open
 
 
+def _step(look: _Look, is_turn: bool) -> float:
+    """How many frames should be taken on the way to a look from the one before."""
+    if math.isnan(look.motion):  # nothing was found again: all is new, or there was nothing
+        return 1.0 if look.corners >= 2 * _FEWEST_TRACKS else _BLANK
+    return look.motion / _TURN_STEP if is_turn else max(look.parallax / _PARALLAX, look.motion / _MOTION)
+
+
 def _spread(wanted: np.ndarray, sharpness: np.ndarray, is_open: np.ndarray, count: int) -> list[int]:
-    """Numbers of looks: a sharp one, rather in the middle, of each of `count` stretches in which equally much is new."""
+    """Numbers of looks: a sharp one, rather in the middle, of each of `count` stretches with equally much in each."""
     first = float(wanted[is_open][0])
     span = max(float(wanted[-1]) - first, 1e-12)
     place = np.clip((wanted - first) / span * count, 0, count - 1e-9)
