@@ -74,6 +74,7 @@ FACADE = {"cli": "the program", "runtime": "`__version__`, which the package sta
 
 # Names that more than one module defines: what they share is what the name says.
 SHARED = {
+    "Finding": "what is wrong, with a way to name it: of a shoot, or of a rasterizer",
     "run": "what the program calls of each command",
     "Scene": "the options of the command of that name, beside what is rendered",
     "View": "the options of the command of that name, beside what a data set holds",

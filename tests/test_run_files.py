@@ -158,6 +158,7 @@ _WRITERS = {
     "commands/teach.py": {"teach.json", "classes.json"},
     "commands/tradeoff.py": {"tradeoff.json"},
     "data/camera_lists.py": {"cameras.json"},
+    "data/gathering.py": {"frames.json"},
     "files.py": {"config.json", "env.json", "log.jsonl"},
     "fitting/active.py": {"selection.json"},
     "metrics.py": {"metrics.json"},
