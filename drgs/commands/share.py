@@ -182,7 +182,7 @@ def _what_does_not_carry_over(given: SceneInput) -> str | None:
 
 
 def _uncertainty(given: SceneInput, fitted: list[Camera]) -> np.ndarray | None:
-    """(N,) what the photographs leave uncertain of each Gaussian's color."""
+    """(N,) what the photographs leave uncertain of where each Gaussian is."""
     assert given.record is not None
     if given.moving is not None:
         fitted = [camera for camera in fitted if camera.time is not None]

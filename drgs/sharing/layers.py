@@ -27,7 +27,6 @@ __all__ = ["classes_layer", "moments_of", "uncertainty_layer", "uncertainty_of"]
 
 _LEVELS = 256
 _DECADES = 3.0  # of the scale of uncertainty at most, as in the report's maps
-_SH0_SQUARED = 1 / (4 * np.pi)  # square of the first spherical harmonic
 _STILL = 1e-3  # what moves less, as a part of the scene's extent (or of a turn, or of a log scale), stands still
 
 
@@ -50,12 +49,10 @@ def classes_layer(features: torch.Tensor, classes: Classes, decoder: Decoder | N
 def uncertainty_of(
     scene: Scene, cameras: Sequence[Camera], settings: RenderSettings, nuisances: Nuisances
 ) -> np.ndarray:
-    """(N,) how uncertain the color of a pixel is that shows a Gaussian: as the report's maps, but for each Gaussian.
+    """(N,) what the photographs leave uncertain of where each Gaussian is.
 
-    A pixel's predictive variance is the sum over parameters k of J_pk^2 / (H_k + lambda). Summed over the pixels of
-    the photographs, the parameters of one Gaussian give sum_k H_k / (H_k + lambda); its weights in these pixels,
-    squared, give its pixels. Their ratio is the mean variance of a pixel that it fills, as a multiple of the
-    photographs' noise, by its own parameters. Where no photograph shows it, it is infinite.
+    The standard deviation of its center for unit noise of the photographs' colors, in scene units: the square root of
+    the sum over its three coordinates of 1 / (H + lambda), as `drgs convert --uncertainty` writes it.
 
     Args:
         scene: What was fitted.
@@ -63,17 +60,14 @@ def uncertainty_of(
         settings: How it is drawn.
         nuisances: Unknowns of the photographs, eliminated from what they say.
     """
-    blocks = SceneBlocks.of(scene, Scoring(settings=settings, blocks=("geometry",), nuisances=nuisances), cameras, "share")
+    scoring = Scoring(settings=settings, blocks=("geometry",), nuisances=nuisances)
+    blocks = SceneBlocks.of(scene, scoring, cameras, "share")
     total: dict[str, torch.Tensor] = {}
     with Bar("uncertainty", len(cameras)) as bar:
         for camera in cameras:
             add(total, together(blocks.information(camera)))
             bar.advance()
-    count = len(total["means"])
-    left = variances(total, MAP_PRIOR)
-    known = sum((total[name].double() * left[name]).reshape(count, -1).sum(1) for name in left if len(left[name]) == count)
-    pixels = total["sh"].double().reshape(count, -1, 3)[:, 0].mean(1) / _SH0_SQUARED
-    return torch.where(pixels > 0, known / pixels, torch.inf).cpu().numpy()
+    return variances(total, MAP_PRIOR)["means"].sum(1).sqrt().cpu().numpy()
 
 
 def uncertainty_layer(values: np.ndarray) -> tuple[dict[str, Any], bytes]:
@@ -83,17 +77,17 @@ def uncertainty_layer(values: np.ndarray) -> tuple[dict[str, Any], bytes]:
     color of its end.
 
     Args:
-        values: (N,) > 0, infinite where nothing is known.
+        values: (N,) > 0.
     """
-    finite = values[np.isfinite(values) & (values > 0)]
-    logs = np.log10(np.percentile(finite, [1, 99])) if len(finite) else np.array([0.0, 1.0])
-    low, high = max(logs[0], logs[1] - _DECADES), max(logs[1], logs[0] + 1e-3)
-    with np.errstate(divide="ignore"):
-        shares = (np.clip(np.log10(values), low, high) - low) / (high - low)
+    values = np.log10(values)
+    least, high = np.percentile(values, [1, 99])
+    low = max(least, high - _DECADES)
+    high = max(high, low + 1e-3)  # of one value, too, the scale has a length to divide by
+    shares = (np.clip(values, low, high) - low) / (high - low)
     known = {
         "low": float(10.0**low),
         "high": float(10.0**high),
-        "text": "variance of the color, as a multiple of the photographs' noise",
+        "text": "standard deviation of a center for noise of 1, in scene units",
         "colors": inferno(np.linspace(0, 1, _LEVELS)[None])[0].tolist(),
     }
     return known, np.rint((_LEVELS - 1) * shares).astype(np.uint8).tobytes()

@@ -41,7 +41,7 @@ class Shared:
         target: (3,) point of the world that is looked at.
         up: (3,) direction of the world that is up, of length 1.
         background: RGB in [0, 1].
-        uncertainty: (N,) variance of each Gaussian's color; None: no such layer.
+        uncertainty: (N,) standard deviation of each Gaussian's center; None: no such layer.
         classes: Names and colors of classes, and the class of each Gaussian (`layers.classes_layer`); None: none.
         moving: The Gaussians and what moves them; None where nothing does.
         times: Times at which it is written, ascending.
