@@ -32,13 +32,17 @@ from drgs.sharing.layers import uncertainty_layer
 from drgs.sharing.placing import upright_matrix
 
 def blobs(count: int = 300, degree: int = 3, seed: int = 0) -> drgs.Gaussians:
-    """Gaussians of all sizes and colors, in a box of about two units."""
+    """Gaussians of all sizes, colors and a few kinds of shine, in a box of about two units."""
     rng = np.random.default_rng(seed)
+    each = (degree + 1) ** 2
+    kinds = 0.2 * rng.normal(size=(20, each, 3))
+    sh = kinds[rng.integers(20, size=count)] + 0.01 * rng.normal(size=(count, each, 3))
+    sh[:, 0] = rng.normal(size=(count, 3))
     arrays = {
         "quats": rng.normal(size=(count, 4)),
         "scales": np.exp(rng.uniform(-4.5, -1.5, (count, 3))),
         "opacities": rng.uniform(0.1, 0.99, count),
-        "sh": rng.normal(size=(count, (degree + 1) ** 2, 3)) * np.r_[1.0, [0.2] * ((degree + 1) ** 2 - 1)][:, None],
+        "sh": sh,
     }
     tensors = {name: torch.as_tensor(x, dtype=torch.float32) for name, x in arrays.items()}
     return drgs.Gaussians.from_arrays(torch.as_tensor(rng.normal(0, 0.5, (count, 3)), dtype=torch.float32), **tensors)

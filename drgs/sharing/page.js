@@ -63,6 +63,7 @@ export async function show(scene, bytesOfPart) {
   let due = true; // whether the picture is to be drawn again
   const changed = () => {
     due = true;
+    document.body.dataset.state = "drawing";
     gaussians.touch();
   };
   spark.onDirty = () => {
