@@ -24,7 +24,7 @@ def shared_of_run(run):  # noqa: F811
     with torch.no_grad():
         for weights in shared.moving.field.parameters():
             weights += 0.2 * torch.randn_like(weights)
-        shared.moving.gaussians.logit_opacities += 4.0
+        shared.moving.gaussians.logit_opacities.add_(4.0)
     return dataclasses.replace(shared, gaussians=shared.moving.at(shared.times[0]).detach())
 
 
