@@ -23,7 +23,7 @@ def shared_of_run(run):  # noqa: F811
     torch.manual_seed(0)
     with torch.no_grad():
         for name, weights in shared.moving.field.named_parameters():
-            weights += (1.0 if name == "mlp.means.3.weight" else 0.2) * torch.randn_like(weights)
+            weights += (3.0 if name == "mlp.means.3.weight" else 0.2) * torch.randn_like(weights)
         shared.moving.gaussians.logit_opacities.add_(4.0)
     return dataclasses.replace(shared, gaussians=shared.moving.at(shared.times[0]).detach())
 
@@ -59,5 +59,5 @@ def test_a_moment_in_a_browser(shown, run, tmp_path):  # noqa: F811
         pictures.append(picture(page))
         with torch.no_grad():
             truth = ours(looked.moving.at(time), CAMERAS[0])
-        assert decibels(pictures[-1], truth) > 45
-    assert decibels(pictures[0], truth) < 40  # so much has moved
+        assert decibels(pictures[-1], truth) > 40
+    assert decibels(pictures[0], truth) < decibels(pictures[-1], truth) - 6  # it has moved meanwhile
