@@ -31,6 +31,7 @@ from drgs.sharing.gaussians import archive_of
 from drgs.sharing.layers import uncertainty_layer
 from drgs.sharing.placing import upright_matrix
 
+
 def blobs(count: int = 300, degree: int = 3, seed: int = 0) -> drgs.Gaussians:
     """Gaussians of all sizes, colors and a few kinds of shine, in a box of about two units."""
     rng = np.random.default_rng(seed)

@@ -108,7 +108,9 @@ def shared_of(args: Share) -> Shared:
         focus = Focus.of(fitted, None, seen_distance(gaussians))
     else:
         up, focus = np.array(UP["minus-y"], np.float64), None
-        cameras = [("other", dataclasses.replace(scene_orbit(gaussians, 1, width=_VIEW[0], height=_VIEW[1])[0], name="all"))]
+        cameras = [
+            ("other", dataclasses.replace(scene_orbit(gaussians, 1, width=_VIEW[0], height=_VIEW[1])[0], name="all"))
+        ]
     return Shared(
         title=args.scene.resolve().stem if given.run is None else args.scene.resolve().name,
         lines=lines,

@@ -30,7 +30,9 @@ _DECADES = 3.0  # of the scale of uncertainty at most, as in the report's maps
 _STILL = 1e-3  # what moves less, as a part of the scene's extent (or of a turn, or of a log scale), stands still
 
 
-def classes_layer(features: torch.Tensor, classes: Classes, decoder: Decoder | None) -> tuple[dict[str, Any], np.ndarray]:
+def classes_layer(
+    features: torch.Tensor, classes: Classes, decoder: Decoder | None
+) -> tuple[dict[str, Any], np.ndarray]:
     """Names and colors of classes, and the class of each Gaussian: (N,) from 1 on.
 
     Args:
