@@ -1,4 +1,4 @@
-"""The page of `drgs share`: what it holds, that it is whole by itself, its file, and where the viewer's code comes from."""
+"""The page of `drgs share`: what it holds, its file, and where the viewer's code comes from."""
 
 from __future__ import annotations
 

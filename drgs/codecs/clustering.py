@@ -19,9 +19,7 @@ _BLOCK = 4096  # rows that are compared with all centers at a time
 _SEED = 0
 
 
-def codebook(
-    values: np.ndarray, weights: np.ndarray | None = None, size: int = 256
-) -> tuple[np.ndarray, np.ndarray]:
+def codebook(values: np.ndarray, weights: np.ndarray | None = None, size: int = 256) -> tuple[np.ndarray, np.ndarray]:
     """At most `size` numbers that stand for values, ascending, and which of them stands for each.
 
     Args:

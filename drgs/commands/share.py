@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -92,38 +92,51 @@ def shared_of(args: Share) -> Shared:
     gaussians = gaussians.replace(features=None).detach()
     cameras = _cameras(args, given)
     fitted = [camera for kind, camera in cameras if kind == "fitted"]
-    lines = [f"{len(gaussians):,} Gaussians" + (f", fitted to {len(fitted)} photographs" if fitted else "") + "."]
-    if (warning := _what_does_not_carry_over(given)) is not None:
-        _log.warning("%s: %s; fit with --for any or --for viewers", args.scene, warning)
-        lines.append(warning[0].upper() + warning[1:] + ".")
-    uncertainty = None
-    if args.uncertainty and fitted and given.record is not None:
-        uncertainty = _uncertainty(given, fitted)
-    classes = None
-    if given.gaussians.features is not None and given.decoder is not None and given.classes is not None:
-        if given.classes.embeddings is not None:
-            classes = classes_layer(given.gaussians.features, given.classes, given.decoder)
+    target = None
+    up = np.array(UP["minus-y"], np.float64)
     if fitted:
         up = upright(fitted)
         focus = Focus.of(fitted, None, seen_distance(gaussians))
-    else:
-        up, focus = np.array(UP["minus-y"], np.float64), None
-        cameras = [
-            ("other", dataclasses.replace(scene_orbit(gaussians, 1, width=_VIEW[0], height=_VIEW[1])[0], name="all"))
-        ]
+        target = None if focus is None else focus.center
+    if not cameras:
+        (around,) = scene_orbit(gaussians, 1, width=_VIEW[0], height=_VIEW[1])
+        cameras = [("other", dataclasses.replace(around, name="all of it"))]
     return Shared(
-        title=args.scene.resolve().stem if given.run is None else args.scene.resolve().name,
-        lines=lines,
+        title=args.scene.stem if given.run is None else args.scene.resolve().name,
+        lines=_lines(args, given, len(fitted)),
         gaussians=gaussians,
         cameras=cameras,
-        target=_middle(gaussians, [camera for _, camera in cameras]) if focus is None else focus.center,
+        target=_middle(gaussians, cameras[0][1]) if target is None else target,
         up=up,
         background=given.background if given.record is None else given.record.config.settings.background,
-        uncertainty=uncertainty,
-        classes=classes,
+        uncertainty=_uncertainty(given, fitted) if args.uncertainty else None,
+        classes=_classes(given),
         moving=given.moving,
         times=times,
     )
+
+
+def _lines(args: Share, given: SceneInput, photographs: int) -> list[str]:
+    """What a page says of its scene; what does not carry over is said in the log, too."""
+    lines = [
+        f"{len(given.gaussians):,} Gaussians" + (f", fitted to {photographs} photographs." if photographs else ".")
+    ]
+    if given.record is None:
+        return lines
+    config = given.record.config
+    if not planar_of(config.renderers, config.settings):
+        found = f"fitted for {', '.join(config.renderers)} alone; pages draw as {VIEWERS} does, where it may look worse"
+        _log.warning("%s: %s: fit with --for any or --for viewers (docs/one-model.md)", args.scene, found)
+        lines.append(found[0].upper() + found[1:] + ".")
+    return lines
+
+
+def _classes(given: SceneInput) -> tuple[dict[str, Any], np.ndarray] | None:
+    """Names, colors and each Gaussian's class; None where they have none."""
+    features, classes, decoder = given.gaussians.features, given.classes, given.decoder
+    if features is None or decoder is None or classes is None or classes.embeddings is None:
+        return None
+    return classes_layer(features, classes, decoder)
 
 
 def _cameras(args: Share, given: SceneInput) -> list[tuple[Kind, Camera]]:
@@ -170,22 +183,10 @@ def _times(given: SceneInput, count: int) -> tuple[float, ...]:
     return tuple(float(x) for x in np.linspace(low, high, count))
 
 
-def _what_does_not_carry_over(given: SceneInput) -> str | None:
-    """Why a page may look otherwise than the run does; None where it was fitted to look right in viewers."""
-    if given.record is None:
-        return None
-    config = given.record.config
-    if planar_of(config.renderers, config.settings):
-        return None
-    return (
-        f"fitted for {', '.join(config.renderers)} alone, pages draw as {VIEWERS} does, in which it may look worse "
-        "(docs/one-model.md)"
-    )
-
-
 def _uncertainty(given: SceneInput, fitted: list[Camera]) -> np.ndarray | None:
     """(N,) what the photographs leave uncertain of where each Gaussian is."""
-    assert given.record is not None
+    if given.record is None:
+        return None
     if given.moving is not None:
         fitted = [camera for camera in fitted if camera.time is not None]
     if not fitted:
@@ -196,9 +197,8 @@ def _uncertainty(given: SceneInput, fitted: list[Camera]) -> np.ndarray | None:
     return uncertainty_of(scene, spread(cameras, _COUNTED), settings, Nuisances(eliminate=given.record.estimated))
 
 
-def _middle(gaussians: Gaussians, cameras: list[Camera]) -> np.ndarray:
-    """(3,) the point of the first camera's axis that is as far away as what is before it."""
-    camera = cameras[0]
+def _middle(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """(3,) the point of a camera's axis that is as far away as what is before it."""
     axis = camera.c2w[:3, 2]
     means = gaussians.means.double().numpy() + np.array(gaussians.origin, np.float64)
     ahead = (means - camera.center) @ axis

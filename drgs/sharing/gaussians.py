@@ -7,9 +7,9 @@ import json
 import zipfile
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 
+from drgs.codecs.bounded import pixels_of_webp
 from drgs.codecs.sog import encode_sog
 
 if TYPE_CHECKING:
@@ -44,8 +44,6 @@ def archive_of(g: Gaussians) -> tuple[bytes, dict[str, Any] | None]:
 
 def _sum(webp: bytes) -> int:
     """What a page compares with its own: whether its browser tells the bytes of pictures as they are."""
-    pixels = cv2.imdecode(np.frombuffer(webp, np.uint8), cv2.IMREAD_UNCHANGED)
-    order = cv2.COLOR_BGRA2RGBA if pixels.shape[2] == 4 else cv2.COLOR_BGR2RGBA
-    values = cv2.cvtColor(pixels, order).reshape(-1).astype(np.uint64)
+    values = pixels_of_webp("share", webp, 1, 1 << 28).reshape(-1).astype(np.uint64)
     weights = (np.arange(len(values), dtype=np.uint64) & 255) + 1
     return int((values * weights).sum() % (1 << 32))

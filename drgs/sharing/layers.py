@@ -1,4 +1,4 @@
-"""What a page knows of each Gaussian beside its looks: its class, how uncertain it is, and where it is at other times."""
+"""What a page knows of each Gaussian beside its looks: its class, how uncertain it is, where it is at other times."""
 
 from __future__ import annotations
 
