@@ -49,6 +49,7 @@ smoke: setup
 	$(BIN)/drgs demo --quick -o out/smoke
 	$(BIN)/drgs eval out/smoke/run
 	$(BIN)/drgs report out/smoke/run -o out/smoke/report.html
+	$(BIN)/drgs share out/smoke/run -o out/smoke/scene.html
 	$(BIN)/drgs cite out/smoke/run
 	$(BIN)/drgs render out/smoke/run --frames 3 --width 64 --format png,exr,webm --depth -o out/smoke/render
 	rm -rf out/smoke/active

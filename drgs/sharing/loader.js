@@ -9,7 +9,9 @@ const unpacked = (text) =>
 
 async function bytesOfPart(name) {
   const script = document.querySelector(`script.part[data-name="${name}"]`);
-  return new Uint8Array(await unpacked(script.textContent).arrayBuffer());
+  const response = unpacked(script.textContent);
+  script.remove(); // it is as large as what it holds, and read once
+  return new Uint8Array(await response.arrayBuffer());
 }
 
 function complain(error) {

@@ -37,7 +37,10 @@ export async function buildPanel({
       time.set(photo.time);
     }
   };
-  choice.addEventListener("change", () => choose(scene.photos[choice.value]));
+  choice.addEventListener("change", () => {
+    choose(scene.photos[choice.value]);
+    document.getElementById("canvas").focus(); // arrow keys are for the camera again
+  });
   controls.append(element("div", { className: "row" }, choice));
 
   const flying = element("button", { textContent: "fly", title: "drag turns the camera; W A S D E Q move it" });
