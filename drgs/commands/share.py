@@ -103,7 +103,7 @@ def shared_of(args: Share) -> Shared:
         cameras = [("other", dataclasses.replace(around, name="all of it"))]
     return Shared(
         title=args.scene.stem if given.run is None else args.scene.resolve().name,
-        lines=_lines(args, given, len(fitted)),
+        lines=_lines(args, given),
         gaussians=gaussians,
         cameras=cameras,
         target=_middle(gaussians, cameras[0][1]) if target is None else target,
@@ -116,13 +116,12 @@ def shared_of(args: Share) -> Shared:
     )
 
 
-def _lines(args: Share, given: SceneInput, photographs: int) -> list[str]:
+def _lines(args: Share, given: SceneInput) -> list[str]:
     """What a page says of its scene; what does not carry over is said in the log, too."""
-    lines = [
-        f"{len(given.gaussians):,} Gaussians" + (f", fitted to {photographs} photographs." if photographs else ".")
-    ]
-    if given.record is None:
-        return lines
+    count = f"{len(given.gaussians):,} Gaussians"
+    if given.record is None or given.run is None:
+        return [f"{count}."]
+    lines = [f"{count}, fitted to {len(fitted_views(given.run, given.record)):,} photographs."]
     config = given.record.config
     if not planar_of(config.renderers, config.settings):
         found = f"fitted for {', '.join(config.renderers)} alone; pages draw as {VIEWERS} does, where it may look worse"
