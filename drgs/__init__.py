@@ -86,6 +86,7 @@ _MODULES = frozenset(
         "runtime",
         "select",
         "settings",
+        "sharing",
         "shutters",
         "splats",
         "studies",
@@ -158,6 +159,7 @@ if TYPE_CHECKING:
     from drgs import rasterize as rasterize
     from drgs import report as report
     from drgs import settings as settings
+    from drgs import sharing as sharing
     from drgs import shutters as shutters
     from drgs import splats as splats
     from drgs import studies as studies

@@ -23,7 +23,7 @@ from drgs.guards.outputs import check_file
 from drgs.information.nuisances import Nuisances
 from drgs.report.pictures import spread
 from drgs.sharing.layers import classes_layer, uncertainty_of
-from drgs.sharing.page import GENERATOR
+from drgs.sharing.page import SHARED_BY
 from drgs.sharing.write import Shared, write_page
 from drgs.sizes import at_most
 from drgs.viewing.placed_views import Ranking, placed_views_of, read_ranking
@@ -32,11 +32,11 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.commands.options import Share
     from drgs.ellipsoids import Gaussians
-    from drgs.sharing.placing import Kind
+    from drgs.sharing.placing import PhotoKind
 
-__all__ = ["FILE", "is_page", "run", "shared_of"]
+__all__ = ["is_page", "run", "shared_of"]
 
-FILE = "scene.html"
+_FILE = "scene.html"
 _COUNTED = 24  # photographs whose information is added up; of more, these stand for all, as in the report
 _INFO_PIXELS = 30_000  # of each of them
 _VIEW = 960, 640  # pixels of a view of what has no photographs
@@ -61,8 +61,8 @@ def _output(args: Share) -> Path:
     """The file to write, which is free or a page that this command wrote."""
     path = args.output
     if path is None and is_run(args.scene):
-        path = args.scene / FILE
-        claim_run(Run(args.scene), "share").check([FILE])
+        path = args.scene / _FILE
+        claim_run(Run(args.scene), "share").check([_FILE])
         return path
     path = path or args.scene.with_suffix(".html")
     if path.suffix.lower() not in (".html", ".htm"):
@@ -75,7 +75,7 @@ def _output(args: Share) -> Path:
 def is_page(path: Path) -> bool:
     """Whether a file says that `drgs share` wrote it."""
     with path.open("rb") as file:
-        return f'<meta name="generator" content="{GENERATOR}">'.encode() in file.read(1000)
+        return f'<meta name="generator" content="{SHARED_BY}">'.encode() in file.read(1000)
 
 
 def shared_of(args: Share) -> Shared:
@@ -138,7 +138,7 @@ def _classes(given: SceneInput) -> tuple[dict[str, Any], np.ndarray] | None:
     return classes_layer(features, classes, decoder)
 
 
-def _cameras(args: Share, given: SceneInput) -> list[tuple[Kind, Camera]]:
+def _cameras(args: Share, given: SceneInput) -> list[tuple[PhotoKind, Camera]]:
     """Cameras of the photographs that a run was fitted to, and of those to take next; none where nobody knows."""
     ranking = _ranking(args, given)
     views, names = [], []
@@ -154,7 +154,7 @@ def _cameras(args: Share, given: SceneInput) -> list[tuple[Kind, Camera]]:
     fitted = [place.camera for place in placed if place.kind == "training"]
     picks = {place.best.pick: place.best.camera for place in placed if place.kind != "training" and place.best.pick}
     following = [dataclasses.replace(picks[k], name=f"{k}. {picks[k].name}") for k in sorted(picks)]
-    ordered: list[tuple[Kind, Camera]] = [("fitted", camera) for camera in sorted(fitted, key=lambda x: x.name)]
+    ordered: list[tuple[PhotoKind, Camera]] = [("fitted", camera) for camera in sorted(fitted, key=lambda x: x.name)]
     return ordered + [("next", camera) for camera in following]
 
 

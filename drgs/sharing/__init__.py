@@ -1,1 +1,14 @@
-"""A scene as one HTML file that opens from disk: what it holds, and the viewer from npm that draws it."""
+"""A scene as one HTML file that opens from disk, drawn by a viewer from npm.
+
+write       the page of a scene, gathered and written
+gaussians   its Gaussians, as an archive of SOG
+layers      what is known of each of them: class, uncertainty, where it is at other times
+placing     where the page's camera stands
+page        the template, filled: page.html with loader.js, page.js, gaussians.js, cameras.js and panel.js
+npm         the viewer's code, fetched by version and hash
+wheel       the step that puts it into a wheel
+"""
+
+from drgs.guards.imports import modules_of
+
+__getattr__ = modules_of(__name__)

@@ -33,7 +33,7 @@ class Package:
     Attributes:
         name: Name at npm.
         version: The only one that is taken.
-        sha512: Of its archive, in base64, as npm states it.
+        sha512: Hash of its archive, in base64, as npm states it.
         modules: What a page imports -> file in the package.
         license: File in the package with the text of its license.
     """

@@ -11,9 +11,9 @@ from typing import Any
 
 from drgs.sharing.npm import PACKAGES
 
-__all__ = ["GENERATOR", "page_html"]
+__all__ = ["SHARED_BY", "scene_html"]
 
-GENERATOR = "drgs share"
+SHARED_BY = "drgs share"
 """What the page says of itself: a file that does is one that may be replaced."""
 
 _HERE = Path(__file__).parent
@@ -25,7 +25,7 @@ _OURS = {
 }
 
 
-def page_html(
+def scene_html(
     title: str, lines: Sequence[str], scene: Mapping[str, Any], parts: Mapping[str, bytes], viewer: Path
 ) -> tuple[str, dict[str, int]]:
     """The page, and bytes of its parts: those of `parts` by their names, and `viewer`.
@@ -44,7 +44,7 @@ def page_html(
     packed = {name: _packed(data) for name, data in parts.items()}
     modules = _modules(viewer)
     context = {
-        "generator": GENERATOR,
+        "generator": SHARED_BY,
         "title": title,
         "lines": lines,
         "background": f"rgb({red}, {green}, {blue})",

@@ -10,15 +10,15 @@ import numpy as np
 if TYPE_CHECKING:
     from drgs.cameras import Camera
 
-__all__ = ["Kind", "columns", "median_camera", "photo", "upright_matrix"]
+__all__ = ["PhotoKind", "columns", "median_camera", "photo", "upright_matrix"]
 
-Kind = Literal["fitted", "next", "other"]
+PhotoKind = Literal["fitted", "next", "other"]
 """A photograph, one to be taken next, or a view of what has no photographs."""
 
 _AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # of OpenGL's cameras, which look along -z with y up, in ours
 
 
-def photo(camera: Camera, kind: Kind, origin: np.ndarray) -> dict[str, Any]:
+def photo(camera: Camera, kind: PhotoKind, origin: np.ndarray) -> dict[str, Any]:
     """What a page is told of a camera.
 
     Args:

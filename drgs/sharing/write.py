@@ -15,8 +15,8 @@ from drgs.files import atomic_write
 from drgs.sharing.gaussians import archive_of
 from drgs.sharing.layers import moments_of, uncertainty_layer
 from drgs.sharing.npm import viewer_files
-from drgs.sharing.page import page_html
-from drgs.sharing.placing import Kind, columns, median_camera, photo, upright_matrix
+from drgs.sharing.page import scene_html
+from drgs.sharing.placing import PhotoKind, columns, median_camera, photo, upright_matrix
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -50,7 +50,7 @@ class Shared:
     title: str
     lines: Sequence[str]
     gaussians: Gaussians
-    cameras: Sequence[tuple[Kind, Camera]]
+    cameras: Sequence[tuple[PhotoKind, Camera]]
     target: np.ndarray
     up: np.ndarray
     background: tuple[float, float, float]
@@ -104,7 +104,7 @@ def write_page(shared: Shared, path: str | os.PathLike) -> dict[str, int]:
         scene["moments"], parts["moving"], parts["moments"] = moments_of(
             shared.moving, shared.times, shared.gaussians, order
         )
-    page, sizes = page_html(shared.title, shared.lines, scene, parts, viewer)
+    page, sizes = scene_html(shared.title, shared.lines, scene, parts, viewer)
     with atomic_write(path) as file:
         file.write(page.encode())
     return sizes
