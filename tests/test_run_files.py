@@ -177,6 +177,7 @@ _OTHERS = {
     "guards/outputs.py",  # .drgs.jsonl
     "guards/writing.py",  # for log.jsonl
     "report/page.py",  # a cell of the report
+    "sharing/page.py",  # what a page is told
 }
 """Modules that make JSON which is no file of the page."""
 
