@@ -2,13 +2,13 @@
 
     python benchmarks/sfm.py [--scenes banana bonsai] [--seeds 1] [--page]
 
-Appends one row a scene, method and seed to benchmarks/sfm.jsonl as it ends, leaves out what is there, then writes the table
-of docs/datasets.md. `drgs` finds features as `drgs sfm` does (affine shapes, pooled scales), once, and matches all
-pairs, the next ones by name, or the nearest by appearance; `COLMAP` is pycolmap's extract_features, match_exhaustive
-and incremental_mapping with its own options, but for one thread and the same size of photographs: with the cameras that
-it makes by default, and with one that all photographs share, as drgs does. Camera centers are compared with those of
-the model that lies beside the photographs. Seconds are those that the process computed, with one thread.
-The seed is that of pairs, verification and mapping; COLMAP runs with the first one alone, which is its own.
+Appends one row a scene, method and seed to benchmarks/sfm.jsonl as it ends, leaves out what is there, then writes the
+table of docs/datasets.md. `drgs` finds features as `drgs sfm` does (affine shapes, pooled scales), once, and matches
+all pairs, the next ones by name, or the nearest by appearance; `COLMAP` is pycolmap's extract_features,
+match_exhaustive and incremental_mapping with its own options, but for one thread and the same size of photographs: with
+the cameras that it makes by default, and with one that all photographs share, as drgs does. Camera centers are compared
+with those of the model beside the photographs. Seconds are those that the process computed, with one thread. The seed
+is that of pairs, verification and mapping; COLMAP runs once, with its own.
 """
 
 from __future__ import annotations
