@@ -222,10 +222,10 @@ def table(found: list[dict]) -> str:
             method if method in OWN else f"drgs, {method}",
             f"{statistics.mean(one['pairs'] for one in mine):,.0f}",
             stages,
-            ", ".join(f"{one['registered']}" for one in mine),
-            ", ".join(f"{one['points']:,}".replace(",", " ") for one in mine),
-            ", ".join(f"{one['reprojection_error']:.2f}" for one in mine),
-            ", ".join(f"{one['off']:.2%}" for one in mine),
+            " / ".join(f"{one['registered']}" for one in mine),
+            " / ".join(f"{one['points']:,}" for one in mine),
+            " / ".join(f"{one['reprojection_error']:.2f}" for one in mine),
+            " / ".join(f"{one['off']:.2%}" for one in mine),
         ]
         lines.append(f"| {' | '.join(columns)} |")
     return "\n".join(lines)
