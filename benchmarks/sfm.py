@@ -1,13 +1,14 @@
 """Structure from motion: which pairs of photographs are matched, and COLMAP's own pipeline on the same photographs.
 
-    python benchmarks/sfm.py [--scenes banana bonsai] [--page]
+    python benchmarks/sfm.py [--scenes banana bonsai] [--seeds 1] [--page]
 
-Appends one row a scene and method to benchmarks/sfm.jsonl as it ends, leaves out what is there, then writes the table
-of docs/datasets.md. `drgs` finds features as `drgs sfm` does (affine shapes, pooled scales), once, and matches all
-pairs, the next ones by name, or the nearest by appearance; `COLMAP` is pycolmap's extract_features, match_exhaustive
-and incremental_mapping with its own options, but for one thread and the same size of photographs: with the cameras that
-it makes by default, and with one that all photographs share, as drgs does. Camera centers are compared with those of
-the model that lies beside the photographs. Seconds are those that the process computed, with one thread.
+Appends one row a scene, method and seed to benchmarks/sfm.jsonl as it ends, leaves out what is there, then writes the
+table of docs/datasets.md. `drgs` finds features as `drgs sfm` does (affine shapes, pooled scales), once, and matches
+all pairs, the next ones by name, or the nearest by appearance; `COLMAP` is pycolmap's extract_features,
+match_exhaustive and incremental_mapping with its own options, but for one thread and the same size of photographs: with
+the cameras that it makes by default, and with one that all photographs share, as drgs does. Camera centers are compared
+with those of the model beside the photographs. Seconds are those that the process computed, with one thread. The seed
+is that of pairs, verification and mapping; COLMAP runs once, with its own.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from __future__ import annotations
 import argparse
 import os
 import shutil
+import statistics
 import sys
 import tempfile
 import time
@@ -45,7 +47,6 @@ SCENES = {"banana": (16, 752), "bonsai": (110, 320)}
 MATCHED = ("exhaustive", "retrieval", "sequential")
 OWN = {"COLMAP": pycolmap.CameraMode.AUTO, "COLMAP, one camera": pycolmap.CameraMode.SINGLE}
 FEW = 30
-SEED = 0
 
 
 class Seconds(dict):
@@ -83,15 +84,15 @@ def own_features(scene: str, names: list[str], database: Path) -> Seconds:
     return seconds
 
 
-def by_drgs(scene: str, names: list[str], database: Path, matching: str) -> tuple[Seconds, int, object]:
+def by_drgs(scene: str, names: list[str], database: Path, matching: str, seed: int) -> tuple[Seconds, int, object]:
     """Matching and mapping as `drgs sfm` does: seconds, pairs and the model."""
     seconds = Seconds()
     with seconds.of("matching"):
-        pairs = choose_pairs(database, names, matching, False, SEED).pairs
-        match(database, pairs, seed=SEED, progress=said(scene))
+        pairs = choose_pairs(database, names, matching, False, seed).pairs
+        match(database, pairs, seed=seed, progress=said(scene))
     with seconds.of("mapping"):
         options = pycolmap.IncrementalPipelineOptions()
-        options.random_seed = SEED
+        options.random_seed = seed
         folder = database.parent / "models"
         folder.mkdir()
         models = map_photos(
@@ -155,11 +156,12 @@ def off(model: pycolmap.Reconstruction, scene: str) -> float:
     return float(np.median(errors) / np.sqrt((b**2).sum(axis=1).mean()))
 
 
-def row(scene: str, names: list[str], method: str, seconds: Seconds, pairs: int, model: object) -> dict:
+def row(scene: str, names: list[str], method: str, seed: int, seconds: Seconds, pairs: int, model: object) -> dict:
     """What a method found."""
     return {
         "scene": scene,
         "method": method,
+        "seed": seed,
         "photographs": len(names),
         "longer_side": SCENES[scene][1],
         "seconds": {stage: round(value, 1) for stage, value in seconds.items()},
@@ -172,18 +174,19 @@ def row(scene: str, names: list[str], method: str, seconds: Seconds, pairs: int,
     }
 
 
-def measure(scene: str) -> None:
-    """All methods of a scene that have no row yet."""
+def measure(scene: str, seeds: int) -> None:
+    """All methods and seeds of a scene that have no row yet."""
     names = photographs(scene)
-    done = {found["method"] for found in read_rows(ROWS) if found["scene"] == scene}
+    done = {(found["method"], found["seed"]) for found in read_rows(ROWS) if found["scene"] == scene}
     with tempfile.TemporaryDirectory() as temporary, quiet():
         features = Path(temporary) / "features.db"
         seconds = Seconds()
-        for method in (*MATCHED, *OWN):
+        cells = [(method, seed) for seed in range(seeds) for method in MATCHED] + [(method, 0) for method in OWN]
+        for method, seed in cells:
             # Of few photographs all are among the nearest.
-            if method in done or (method == "retrieval" and len(names) < FEW):
+            if (method, seed) in done or (method == "retrieval" and len(names) < FEW):
                 continue
-            folder = Path(temporary) / method
+            folder = Path(temporary) / f"{method}_{seed}"
             folder.mkdir()
             if method in OWN:
                 found = by_colmap(scene, names, folder / "database.db", OWN[method])
@@ -191,27 +194,40 @@ def measure(scene: str) -> None:
                 if not features.exists():
                     seconds = own_features(scene, names, features)
                 shutil.copyfile(features, folder / "database.db")
-                found = by_drgs(scene, names, folder / "database.db", method)
+                found = by_drgs(scene, names, folder / "database.db", method, seed)
                 found[0].update(seconds)
-            add_row(ROWS, row(scene, names, method, *found))
+            add_row(ROWS, row(scene, names, method, seed, *found))
             print(f"\r{scene}: {read_rows(ROWS)[-1]}", flush=True)
 
 
 def table(found: list[dict]) -> str:
-    """A row a scene and method."""
+    """A row a scene and method: means of seconds and pairs over the seeds, and the rest of each."""
     lines = [
         "| photographs | method | pairs | features, matching, mapping (s) | with a pose | points | reprojection (px) "
         "| centers off |",
         "|---" * 8 + "|",
     ]
-    for one in sorted(found, key=lambda one: list(SCENES).index(one["scene"])):
-        stages = ", ".join(f"{one['seconds'][stage]:.0f}" for stage in ("features", "matching", "mapping"))
-        what = f"`{one['scene']}`, {one['photographs']} at {one['longer_side']}"
-        method = one["method"] if one["method"] in OWN else f"drgs, {one['method']}"
-        lines.append(
-            f"| {what} | {method} | {one['pairs']:,} | {stages} | {one['registered']} | {one['points']:,} "
-            f"| {one['reprojection_error']:.2f} | {one['off']:.2%} |"
+    for scene, method in [(scene, method) for scene in SCENES for method in (*MATCHED, *OWN)]:
+        mine = sorted(
+            (one for one in found if (one["scene"], one["method"]) == (scene, method)), key=lambda one: one["seed"]
         )
+        if not mine:
+            continue
+        stages = ", ".join(
+            f"{statistics.mean(one['seconds'][stage] for one in mine):.0f}"
+            for stage in ("features", "matching", "mapping")
+        )
+        columns = [
+            f"`{scene}`, {mine[0]['photographs']} at {mine[0]['longer_side']}",
+            method if method in OWN else f"drgs, {method}",
+            f"{statistics.mean(one['pairs'] for one in mine):,.0f}",
+            stages,
+            " / ".join(f"{one['registered']}" for one in mine),
+            " / ".join(f"{one['points']:,}" for one in mine),
+            " / ".join(f"{one['reprojection_error']:.2f}" for one in mine),
+            " / ".join(f"{one['off']:.2%}" for one in mine),
+        ]
+        lines.append(f"| {' | '.join(columns)} |")
     return "\n".join(lines)
 
 
@@ -219,10 +235,11 @@ def main() -> None:
     """The program."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES), help="names of captures")
+    parser.add_argument("--seeds", type=int, default=1, help="seeds of what drgs does")
     parser.add_argument("--page", action="store_true", help="run nothing, write the table of the rows that there are")
     args = parser.parse_args()
     for scene in [] if args.page else args.scenes:
-        measure(scene)
+        measure(scene, args.seeds)
     text = table(read_rows(ROWS))
     print(text)
     fill_between(PAGE, "sfm", text)
