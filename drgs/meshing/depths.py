@@ -32,6 +32,7 @@ class DepthView:
         camera: The camera.
         depth: (H, W) float32 distance along each ray in scene units; infinite where nothing solid is hit.
         weight: (H, W) float32 in [0, 1], the cosine of the angle between the ray and the surface's normal.
+        alpha: (H, W) float32 opacity.
         rgb: (H, W, 3) float32 colors.
         spread: (H, W) float32 standard deviation of the position of what is seen in scene units, for unit noise of
             colors; None if nobody asked.
@@ -40,6 +41,7 @@ class DepthView:
     camera: Camera
     depth: np.ndarray
     weight: np.ndarray
+    alpha: np.ndarray
     rgb: np.ndarray
     spread: np.ndarray | None = None
 
@@ -77,7 +79,7 @@ def depth_views(
         if features is not None:
             # The mean of the logarithm, over the weights of what is seen.
             spread = np.exp(out.features[..., 0].cpu().numpy() / np.maximum(alpha, _SOLID)).astype(np.float32)
-        views.append(DepthView(camera, depth, _cosines(camera, depth), out.rgb.cpu().numpy(), spread))
+        views.append(DepthView(camera, depth, _cosines(camera, depth), alpha, out.rgb.cpu().numpy(), spread))
         if advance:
             advance()
     return views

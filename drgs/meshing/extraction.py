@@ -25,11 +25,13 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["Mesh", "deviations_of", "mesh_of", "mesh_of_depths"]
+__all__ = ["FINENESS", "Mesh", "deviations_of", "mesh_of", "mesh_of_depths"]
 
 _VIEW_BYTES = 40  # of a pixel of a view: depth, weight, colors, spread, and what sampling them takes
 _COLOR = 0.05  # standard deviation of a color's noise, of what is between black and white
 _FINER = 1.26  # the cube root of 2: by which a voxel grows until there are few enough
+FINENESS = 1.0
+"""The default voxel, in widths of a pixel on the surface."""
 _GRAY = 0.5  # of a vertex that no view shows
 
 
@@ -125,7 +127,10 @@ def mesh_of(
 
 
 def mesh_of_depths(
-    views: Sequence[DepthView], options: MeshOptions, advance: Callable[[str, int, int], None] | None = None
+    views: Sequence[DepthView],
+    options: MeshOptions,
+    advance: Callable[[str, int, int], None] | None = None,
+    empty: float = 1.0,
 ) -> Mesh:
     """The surface of depth images: fusion, colors, and what is cut away.
 
@@ -133,13 +138,14 @@ def mesh_of_depths(
         views: Depth images; with `spread` where `options.crop` is above 0.
         options: How it is made.
         advance: Called with a label, the steps done and their number.
+        empty: Weight of a pixel that hits nothing solid, as free space along its whole ray.
     Raises:
         ValueError: If no view sees a surface, the lattice would have more than `max_voxels` points, or nothing is left.
     """
     voxel, bricks = _lattice(views, options)
     trunc = options.trunc * voxel
     told = (lambda done: advance("fusion", done, len(bricks))) if advance else None
-    vertices, faces = surface(views, voxel, trunc, bricks=bricks, advance=told)
+    vertices, faces = surface(views, voxel, trunc, bricks=bricks, empty=empty, advance=told)
     colors, seen, spread = _attributes(views, vertices, trunc)
     mesh = Mesh(vertices, faces, colors, seen, spread, voxel, trunc)
     is_kept = seen >= options.min_views
@@ -189,7 +195,7 @@ def _lattice(views: Sequence[DepthView], options: MeshOptions) -> tuple[float, n
     width = footprint(views)
     if width is None:
         raise ValueError("mesh: a view must see something solid, none does; do the cameras belong to the scene?")
-    voxel = width if options.voxel is None else options.voxel
+    voxel = FINENESS * width if options.voxel is None else options.voxel
     while True:
         bricks = bricks_of(views, voxel, options.trunc * voxel)
         points = len(bricks) * POINTS

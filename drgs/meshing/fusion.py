@@ -199,7 +199,7 @@ def _triangles(values: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.nd
                 cells &= known[x : x + BRICK, y : y + BRICK, z : z + BRICK]
     if not cells.any():
         return None
-    vertices, triangles, _, _ = marching_cubes(values.reshape(side), 0.0, gradient_direction="ascent")
+    vertices, triangles, _, _ = marching_cubes(values.reshape(side), 0.0, gradient_direction="descent")
     vertices = vertices.astype(np.float64)
     cell = np.clip(np.floor(vertices[triangles].mean(axis=1)).astype(np.int64), 0, BRICK - 1)
     triangles = triangles[cells[cell[:, 0], cell[:, 1], cell[:, 2]]].astype(np.int64)
