@@ -76,7 +76,8 @@ def sampled(view: DepthView, points: np.ndarray, trunc: float) -> tuple[np.ndarr
     """What a view says about points.
 
     Depth is interpolated between the four pixels around where their values agree within `trunc`, else it is the nearest
-    pixel's: across the edge of an object there is no surface.
+    pixel's: across the edge of an object there is no surface. Within a pixel of an edge a view does not say that a point
+    is free, since the pixel beside it says otherwise; else every silhouette would take half a pixel off the surface.
 
     Args:
         view: Its depth image.
@@ -84,7 +85,7 @@ def sampled(view: DepthView, points: np.ndarray, trunc: float) -> tuple[np.ndarr
         trunc: Truncation in scene units.
     Returns:
         Distance in front of the surface along the ray (P,), infinite where the ray hits nothing solid and NaN outside
-        of the image; weight (P,); and pixels (P, 2).
+        of the image and beside edges; weight (P,); and pixels (P, 2).
     """
     height, width = view.depth.shape
     pixels, distance = _projected(view.camera, points)
@@ -107,7 +108,10 @@ def sampled(view: DepthView, points: np.ndarray, trunc: float) -> tuple[np.ndarr
     with np.errstate(invalid="ignore"):
         agree = corners.max(0) - corners.min(0) < trunc
         smooth = (parts * corners).sum(0)
-    signed[is_inside] = np.where(agree, smooth, nearest) - distance[is_inside]
+    found = np.where(agree, smooth, nearest) - distance[is_inside]
+    with np.errstate(invalid="ignore"):
+        is_at_edge = (found >= trunc) & (corners.min(0) - distance[is_inside] < trunc)
+    signed[is_inside] = np.where(is_at_edge, np.nan, found)
     weight[is_inside] = view.weight[row, column]
     return signed, weight, pixels
 
