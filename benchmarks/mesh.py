@@ -251,7 +251,10 @@ def measure(scene: str, count: int, steps: int, ways: list[str], folder: Path) -
         found = truth.compare(mesh)
         row = {**key, "way": way, "voxel_mm": 1e3 * mesh.voxel, "triangles": len(mesh.faces), "seconds": seconds}
         add_row(ROWS, {**row, **found, "fit_seconds": fit.seconds, **ran()})
-        print(json.dumps({name: round(x, 4) if isinstance(x, float) else x for name, x in (row | found).items()}), flush=True)
+        print(
+            json.dumps({name: round(x, 4) if isinstance(x, float) else x for name, x in (row | found).items()}),
+            flush=True,
+        )
 
 
 # ------------------------------------------------------------------------------------------- page

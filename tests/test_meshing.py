@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from drgs import cli
 from drgs.cameras import Camera, intrinsics_from_fov, orbit
+from drgs.data.camera_lists import save_cameras_json
 from drgs.ellipsoids import Gaussians
+from drgs.files import save_ply
 from drgs.meshing.depths import DepthView, depth_views, footprint
 from drgs.meshing.extraction import Mesh, deviations_of, mesh_of, mesh_of_depths
 from drgs.meshing.fusion import bricks_of, distances, sampled, surface
@@ -149,7 +152,8 @@ def test_small_pieces_and_what_one_view_sees_are_left_out():
 def test_crop_cuts_what_is_uncertain():
     views = [ball_view(camera) for camera in around()]
     views = [
-        dataclasses.replace(view, spread=np.where(np.arange(64) < 32, 0.5, 0.001)[:, None].repeat(64, 1)) for view in views
+        dataclasses.replace(view, spread=np.where(np.arange(64) < 32, 0.5, 0.001)[:, None].repeat(64, 1))
+        for view in views
     ]
     whole = mesh_of_depths(views[8:16], MeshOptions(voxel=0.03, crop=0.0))
     lower = mesh_of_depths(views[8:16], MeshOptions(voxel=0.03, crop=1.0))
@@ -161,10 +165,10 @@ def test_crop_cuts_what_is_uncertain():
 def test_too_many_voxels_are_refused_or_made_fewer():
     views = [ball_view(camera) for camera in around(4, 32)]
     with pytest.raises(ValueError, match="raise --max-voxels, or --voxel to about"):
-        mesh_of_depths(views, MeshOptions(voxel=0.001, max_voxels=100_000))
-    mesh = mesh_of_depths(views, MeshOptions(max_voxels=100_000, crop=0.0))
-    assert mesh.voxel > footprint(views)
-    assert len(bricks_of(views, mesh.voxel, 4 * mesh.voxel)) * 17**3 <= 100_000
+        mesh_of_depths(views, MeshOptions(voxel=0.01, max_voxels=100_000))
+    mesh = mesh_of_depths(views, MeshOptions(max_voxels=60_000, crop=0.0))
+    assert mesh.voxel > 2 * footprint(views)
+    assert len(bricks_of(views, mesh.voxel, 4 * mesh.voxel)) * 17**3 <= 60_000
 
 
 def test_options_are_refused_in_one_line():
@@ -218,6 +222,32 @@ def test_gaussians_over_a_sphere(kind):
     assert np.abs(mesh.colors - (mesh.vertices / RADIUS / 2 + 0.5)).mean() < 0.05
 
 
+def test_all_of_a_sphere_is_there():
+    """Completeness: how far points of the true surface are from the mesh, at most."""
+    from scipy.spatial import cKDTree
+
+    mesh = mesh_of(shell(), around(6), RenderSettings.preset("fast"))
+    truth = shell(5000).means.numpy()
+    distances_to = cKDTree(mesh.vertices).query(truth)[0]
+    assert 0.02 < mesh.voxel < 0.1  # two pixels of 0.023 where they meet the ball
+    assert np.quantile(distances_to, 0.99) < mesh.voxel
+    assert distances_to.max() < 2 * mesh.voxel
+
+
+def test_what_only_views_elsewhere_know_is_cut():
+    """Views from below are the known ones: what those from above show of the ball is cut away, the rest stays."""
+    below = orbit((0, 0, 0), 2.0, 6, -50, width=48, height=48, fov=40)
+    cameras, settings, options = around(6, 48), RenderSettings.preset("fast"), MeshOptions(voxel=0.04, crop=0.5)
+    whole = mesh_of(shell(1000), cameras, settings, options.replace(crop=0.0), known=below)
+    known = mesh_of(shell(1000), cameras, settings, options, known=below)
+    assert whole.spread is None
+    assert whole.vertices[:, 2].max() > 0.45
+    assert known.vertices[:, 2].max() < 0.45
+    assert known.vertices[:, 2].min() < -0.45
+    assert 0.3 < known.areas().sum() / whole.areas().sum() < 0.95
+    assert known.spread.max() <= 0.5 * known.voxel
+
+
 def test_deviations_fall_with_views_and_are_at_most_the_scale():
     g = shell(200)
     cameras = around(3, 32)
@@ -260,3 +290,75 @@ def test_files_are_read_by_another_program(suffix, tmp_path):
     with pytest.raises(ValueError, match="rename it"):
         save_mesh(mesh, tmp_path / "ball.stl")
     assert [x.name for x in tmp_path.iterdir()] == [f"ball{suffix}"]
+
+
+@pytest.fixture
+def made(tmp_path):
+    """Files of Gaussians over a ball and of cameras around it."""
+    save_ply(shell(1000), tmp_path / "ball.ply")
+    save_cameras_json(tmp_path / "cameras.json", around(4, 32))
+    return tmp_path
+
+
+def command(folder, *arguments: str) -> list[str]:
+    """`drgs mesh` on the files of `made`."""
+    return ["mesh", str(folder / "ball.ply"), "--cameras", str(folder / "cameras.json"), *arguments]
+
+
+def test_the_command(made, capsys):
+    import plyfile
+
+    line = command(made, "-o", str(made / "out/mesh.ply"), "--preset", "fast", "--crop", "3")
+    assert cli.main(line) == 0
+    assert "of 12 views" in capsys.readouterr().out
+    ply = plyfile.PlyData.read(made / "out/mesh.ply")
+    vertices = np.stack([ply["vertex"][axis] for axis in "xyz"], 1)
+    faces = np.stack(ply["face"]["vertex_indices"])
+    assert np.abs(np.linalg.norm(vertices, axis=1) - RADIUS).mean() < 0.02
+    assert ply["vertex"]["views"].min() >= 2
+    assert (ply["vertex"]["spread"] > 0).all()
+    assert faces.max() == len(vertices) - 1
+    # Once more over its own file, but not over another's.
+    assert cli.main([*line, "--quiet"]) == 0
+    (made / "mine.ply").write_bytes(b"mine")
+    assert cli.main(command(made, "-o", str(made / "mine.ply"), "--preset", "fast")) == 2
+    assert (made / "mine.ply").read_bytes() == b"mine"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (("-o", "mesh.stl"), "must be a .ply, .glb, .obj, got .stl"),
+        (("-o", "mesh.ply", "--voxel", "1e-9"), "--voxel must be at least 0.125 of a pixel"),
+        (("-o", "mesh.ply", "--voxel", "0.01", "--max-voxels", "20000"), "mesh: the lattice must have at most"),
+        (("-o", "mesh.ply", "--min-views", "13"), "lower --min-views"),
+        (("-o", "mesh.ply", "--crop", "1e-9"), "set --crop 0"),
+        (("-o", "mesh.ply", "--limit", "0"), "--limit must be at least 1"),
+        (("-o", "mesh.ply", "--trunc", "-1"), "trunc"),
+    ],
+)
+def test_what_cannot_be_is_one_line(made, arguments, word, capsys, monkeypatch):
+    """Nothing is left behind, either: no file, and no lattice that was promised to be small."""
+    monkeypatch.chdir(made)
+    assert cli.main(command(made, *arguments, "--preset", "fast", "--quiet")) == 2
+    told = capsys.readouterr().err
+    assert word in told
+    assert told.count("\n") == 1
+    assert not list(made.glob("mesh.*"))
+
+
+def test_too_fine_a_lattice_takes_no_memory():
+    """Bricks are counted before any is made, and counting stops where there are too many."""
+    import tracemalloc
+
+    views = [ball_view(camera) for camera in around(4, 128)]
+    tracemalloc.start()
+    with pytest.raises(ValueError, match="the lattice must have at most"):
+        mesh_of_depths(views, MeshOptions(voxel=0.002, max_voxels=10_000_000))  # 39 MB of its distances alone
+    assert tracemalloc.get_traced_memory()[1] < 20e6
+    tracemalloc.stop()
+
+
+def test_a_file_of_gaussians_needs_cameras(made, capsys):
+    assert cli.main(["mesh", str(made / "ball.ply"), "-o", str(made / "mesh.obj"), "--quiet"]) == 2
+    assert "--cameras must name" in capsys.readouterr().err

@@ -7,7 +7,6 @@ more uncertain than `max_spread`; and loose pieces that are small beside the lar
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
@@ -30,8 +29,9 @@ __all__ = ["FINENESS", "Mesh", "deviations_of", "mesh_of", "mesh_of_depths"]
 _VIEW_BYTES = 40  # of a pixel of a view: depth, weight, colors, spread, and what sampling them takes
 _COLOR = 0.05  # standard deviation of a color's noise, of what is between black and white
 _FINER = 1.26  # the cube root of 2: by which a voxel grows until there are few enough
-FINENESS = 1.0
+FINENESS = 2.0
 """The default voxel, in widths of a pixel on the surface."""
+_FINEST = 0.125  # the smallest voxel, in widths of a pixel: neighboring rays must not pass a brick on both sides
 _GRAY = 0.5  # of a vertex that no view shows
 
 
@@ -196,17 +196,22 @@ def _lattice(views: Sequence[DepthView], options: MeshOptions) -> tuple[float, n
     if width is None:
         raise ValueError("mesh: a view must see something solid, none does; do the cameras belong to the scene?")
     voxel = FINENESS * width if options.voxel is None else options.voxel
-    while True:
-        bricks = bricks_of(views, voxel, options.trunc * voxel)
-        points = len(bricks) * POINTS
-        if points <= options.max_voxels:
-            return voxel, bricks
-        if options.voxel is not None:
-            raise ValueError(
-                f"mesh: the lattice must have at most {options.max_voxels} points, voxels of {voxel:g} take {points}; "
-                f"raise --max-voxels, or --voxel to about {voxel * math.sqrt(points / options.max_voxels):.3g}"
-            )
-        voxel *= _FINER
+    if voxel < _FINEST * width:
+        raise ValueError(
+            f"mesh: --voxel must be at least {_FINEST:g} of a pixel on the surface, {_FINEST * width:.3g}, got {voxel:g}; "
+            "raise it, or --info-pixels"
+        )
+    most = options.max_voxels // POINTS
+    fits, bricks = voxel, bricks_of(views, voxel, options.trunc * voxel, most)
+    while len(bricks) > most:
+        fits *= _FINER
+        bricks = bricks_of(views, fits, options.trunc * fits, most)
+    if options.voxel is not None and fits > voxel:
+        raise ValueError(
+            f"mesh: the lattice must have at most {options.max_voxels} points, voxels of {voxel:g} take more; "
+            f"raise --max-voxels, or --voxel to about {fits:.3g}"
+        )
+    return fits, bricks
 
 
 def _attributes(

@@ -32,16 +32,22 @@ _STEPS = 9  # samples of each ray, from `trunc` in front of its surface to `trun
 _MOST = 1 << 20  # bricks along an axis to either side, so that three numbers fit into 64 bits
 
 
-def bricks_of(views: Sequence[DepthView], voxel: float, trunc: float) -> np.ndarray:
+def bricks_of(views: Sequence[DepthView], voxel: float, trunc: float, most: int | None = None) -> np.ndarray:
     """(B, 3) int64 indices of the bricks that a surface may pass through, sorted.
+
+    Bricks smaller than the distance of neighboring rays may be missed; `mesh_of_depths` has none that small.
 
     Args:
         views: Depth images.
         voxel: Distance of neighboring points of the lattice in scene units.
         trunc: Truncation in scene units.
+        most: Looking stops once there are more than this many, and gives what it has found.
     """
-    found = [np.zeros(0, np.int64)]
+    keys = np.zeros(0, np.int64)
     for view in views:
+        if most is not None and len(keys) > most:
+            break
+        found = []
         is_solid = np.isfinite(view.depth)
         directions, origins = view.camera.pixel_directions()[is_solid], view.camera.pixel_origins()[is_solid]
         depth = view.depth[is_solid].astype(np.float64)
@@ -50,7 +56,7 @@ def bricks_of(views: Sequence[DepthView], voxel: float, trunc: float) -> np.ndar
             index = np.floor(at / (voxel * BRICK))
             index = index[(np.abs(index) < _MOST).all(axis=1)].astype(np.int64) + _MOST
             found.append(np.unique((index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]))
-    keys = np.unique(np.concatenate(found))
+        keys = np.unique(np.concatenate([keys, *found]))
     mask = (1 << 21) - 1
     return np.stack([keys >> 42, (keys >> 21) & mask, keys & mask], axis=1) - _MOST
 
@@ -62,7 +68,9 @@ def _projected(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarr
         return pixels, np.linalg.norm(points - camera.center, axis=1)
     rotation, translation = rigid(np.asarray(camera.w2c, np.float64))
     # One axis at a time: a product of matrices would round a point differently in another brick.
-    local = [sum(points[:, k] * row[k] for k in range(3)) + move for row, move in zip(rotation, translation, strict=True)]
+    local = [
+        sum(points[:, k] * row[k] for k in range(3)) + move for row, move in zip(rotation, translation, strict=True)
+    ]
     x, y, z = local
     with np.errstate(divide="ignore", invalid="ignore"):
         u = np.where(z > 0, x / z, np.nan)

@@ -23,7 +23,7 @@ class MeshOptions(Record):
 
     Attributes:
         depth: Where a ray meets the surface: where its transmittance falls to one half (median), or the mean (expected).
-        voxel: Distance of neighboring points of the lattice in scene units; default the width of a pixel on the surface.
+        voxel: Distance of neighboring points of the lattice in scene units; default two pixels wide on the surface.
         trunc: How far from the surface a view still says something about it, in voxels.
         max_voxels: Points of the lattice that are computed at most; the default voxel grows until they suffice.
         min_views: Cut away what fewer views than this see.
