@@ -44,7 +44,7 @@ from drgs.studies.tables import fill_between  # noqa: E402
 ROWS = ROOT / "benchmarks" / "mesh.jsonl"
 PAGE = ROOT / "docs" / "mesh.md"
 SIZE = {"max_pixels": 20_000, "max_gaussians": 10_000, "test_every": 0}
-# (scene, photographs, steps)
+# What is fitted: a scene by its name, how many photographs of it, and for how many steps.
 FITS = (
     ("still_life", 28, 800),
     ("still_life", 14, 800),

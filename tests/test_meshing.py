@@ -166,9 +166,9 @@ def test_too_many_voxels_are_refused_or_made_fewer():
     views = [ball_view(camera) for camera in around(4, 32)]
     with pytest.raises(ValueError, match="raise --max-voxels, or --voxel to about"):
         mesh_of_depths(views, MeshOptions(voxel=0.01, max_voxels=100_000))
-    mesh = mesh_of_depths(views, MeshOptions(max_voxels=60_000, crop=0.0))
+    mesh = mesh_of_depths(views, MeshOptions(max_voxels=20_000, crop=0.0))
     assert mesh.voxel > 2 * footprint(views)
-    assert len(bricks_of(views, mesh.voxel, 4 * mesh.voxel)) * 17**3 <= 60_000
+    assert len(bricks_of(views, mesh.voxel, 4 * mesh.voxel)) * 17**3 <= 20_000
 
 
 def test_options_are_refused_in_one_line():

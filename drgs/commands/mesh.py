@@ -44,7 +44,7 @@ def run(args: Mesh) -> None:
             gaussians = _without_skybox(still(args, given), given)
         if args.cameras is None and given.run is None:
             raise ValueError(
-                "a file of Gaussians has no record of its views: --cameras must name a data set, a run or a cameras.json"
+                "a file of Gaussians does not say its views: --cameras must name a data set, a run or a cameras.json"
             )
         lenses = given.keeps_lenses(args.undistort)
         known = known_views(args.cameras if given.run is None else None, args, given, lenses)

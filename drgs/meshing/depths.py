@@ -1,4 +1,4 @@
-"""Depth images of the cameras of a scene, as fusion wants them: where a ray ends, how firmly, and what is seen there."""
+"""Depth images of cameras, as fusion wants them: where a ray ends, how firmly, and what is seen there."""
 
 from __future__ import annotations
 

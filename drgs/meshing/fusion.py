@@ -84,8 +84,8 @@ def sampled(view: DepthView, points: np.ndarray, trunc: float) -> tuple[np.ndarr
     """What a view says about points.
 
     Depth is interpolated between the four pixels around where their values agree within `trunc`, else it is the nearest
-    pixel's: across the edge of an object there is no surface. Within a pixel of an edge a view does not say that a point
-    is free, since the pixel beside it says otherwise; else every silhouette would take half a pixel off the surface.
+    pixel's: across the edge of an object there is no surface. Within a pixel of an edge a view does not say that a
+    point is free, since the pixel beside it says otherwise: every silhouette would take half a pixel off the surface.
 
     Args:
         view: Its depth image.
@@ -225,8 +225,8 @@ def _triangles(values: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _edges(brick: np.ndarray, local: np.ndarray) -> np.ndarray:
-    """(V, 4) int64 by which vertices of bricks are the same: the point of the lattice below, and which way they lie from
-    it, bits of the axes.
+    """(V, 4) int64 by which vertices of bricks are the same: the point of the lattice below, and which way they lie
+    from it, bits of the axes.
     """
     below = np.floor(local)
     way = ((local > below) * np.array([1, 2, 4])).sum(axis=1)
