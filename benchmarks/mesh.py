@@ -217,7 +217,7 @@ class Views:
 
 
 def mesh_in(way: dict, views: Views) -> tuple[Mesh, float]:
-    """The mesh that is made in a way, and the seconds that fusion took."""
+    """The mesh that is made in a way, and the processor seconds that fusion took."""
     from drgs.meshing import extraction
     from drgs.meshing.depths import footprint
 
@@ -231,9 +231,9 @@ def mesh_in(way: dict, views: Views) -> tuple[Mesh, float]:
         shown = [dataclasses.replace(view, weight=view.weight * view.alpha) for view in shown]
     if voxels != 1.0:
         options = options.replace(voxel=voxels * footprint(shown) * extraction.FINENESS)
-    began = time.perf_counter()
+    began = time.process_time()
     mesh = mesh_of_depths(shown, options, empty=1.0 if empty is None else empty)
-    return mesh, time.perf_counter() - began
+    return mesh, time.process_time() - began
 
 
 def measure(scene: str, count: int, steps: int, ways: list[str], folder: Path) -> None:

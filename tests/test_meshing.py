@@ -16,7 +16,7 @@ from drgs.files import save_ply
 from drgs.meshing.depths import DepthView, depth_views, footprint
 from drgs.meshing.extraction import Mesh, deviations_of, mesh_of, mesh_of_depths
 from drgs.meshing.fusion import bricks_of, distances, sampled, surface
-from drgs.meshing.options import MeshOptions
+from drgs.meshing.options import POINTS, MeshOptions
 from drgs.meshing.writing import save_mesh
 from drgs.settings import RenderSettings
 
@@ -163,12 +163,15 @@ def test_crop_cuts_what_is_uncertain():
 
 
 def test_too_many_voxels_are_refused_or_made_fewer():
-    views = [ball_view(camera) for camera in around(4, 32)]
-    with pytest.raises(ValueError, match="raise --max-voxels, or --voxel to about"):
-        mesh_of_depths(views, MeshOptions(voxel=0.01, max_voxels=100_000))
-    mesh = mesh_of_depths(views, MeshOptions(max_voxels=20_000, crop=0.0))
+    views = [ball_view(camera) for camera in around(4, 160)]
+    most = 64 * POINTS
+    with pytest.raises(ValueError, match="raise --max-voxels, or --voxel to about") as told:
+        mesh_of_depths(views, MeshOptions(voxel=0.01, max_voxels=most))
+    advised = float(str(told.value).split()[-1])
+    mesh = mesh_of_depths(views, MeshOptions(max_voxels=most, crop=0.0))
+    assert 0.9 * mesh.voxel < advised < 1.4 * mesh.voxel
     assert mesh.voxel > 2 * footprint(views)
-    assert len(bricks_of(views, mesh.voxel, 4 * mesh.voxel)) * 17**3 <= 20_000
+    assert len(bricks_of(views, mesh.voxel, 4 * mesh.voxel)) * POINTS <= most
 
 
 def test_options_are_refused_in_one_line():
@@ -177,7 +180,7 @@ def test_options_are_refused_in_one_line():
         ({"depth": "first"}, "depth"),
         ({"trunc": 0.1}, "trunc"),
         ({"min_piece": 2.0}, "min_piece"),
-        ({"max_voxels": 3}, "max_voxels"),
+        ({"max_voxels": 8 * POINTS}, "max_voxels"),
     ):
         with pytest.raises(ValueError, match=word) as told:
             MeshOptions(**fields)
@@ -330,7 +333,7 @@ def test_the_command(made, capsys):
     [
         (("-o", "mesh.stl"), "must be a .ply, .glb, .obj, got .stl"),
         (("-o", "mesh.ply", "--voxel", "1e-9"), "--voxel must be at least 0.125 of a pixel"),
-        (("-o", "mesh.ply", "--voxel", "0.01", "--max-voxels", "20000"), "mesh: the lattice must have at most"),
+        (("-o", "mesh.ply", "--voxel", "0.008", "--max-voxels", "320000"), "mesh: the lattice must have at most"),
         (("-o", "mesh.ply", "--min-views", "13"), "lower --min-views"),
         (("-o", "mesh.ply", "--crop", "1e-9"), "set --crop 0"),
         (("-o", "mesh.ply", "--limit", "0"), "--limit must be at least 1"),

@@ -198,7 +198,7 @@ def _lattice(views: Sequence[DepthView], options: MeshOptions) -> tuple[float, n
     voxel = FINENESS * width if options.voxel is None else options.voxel
     if voxel < _FINEST * width:
         raise ValueError(
-            f"mesh: --voxel must be at least {_FINEST:g} of a pixel on the surface, {_FINEST * width:.3g}, got {voxel:g}"
+            f"mesh: --voxel must be at least {_FINEST:g} of a pixel, {_FINEST * width:.3g}, got {voxel:g}"
             "; raise it, or --info-pixels"
         )
     most = options.max_voxels // POINTS

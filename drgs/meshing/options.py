@@ -42,6 +42,6 @@ class MeshOptions(Record):
     min_piece: float = 0.01
 
     def __post_init__(self) -> None:
-        ranges = {"voxel": (1e-30, 1e30), "trunc": (1.0, 64.0), "max_voxels": (POINTS, 1 << 40)}
+        ranges = {"voxel": (1e-30, 1e30), "trunc": (1.0, 64.0), "max_voxels": (64 * POINTS, 1 << 40)}
         ranges |= {"min_views": (1, 1 << 20), "crop": (0.0, 1e9), "min_piece": (0.0, 1.0)}
         check_fields(self.where, self, ranges)
