@@ -35,7 +35,7 @@ from where import add_row, ran, read_rows  # noqa: E402
 
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.meshing.depths import depth_views  # noqa: E402
-from drgs.meshing.extraction import Mesh, deviations_of, mesh_of_depths  # noqa: E402
+from drgs.meshing.extraction import TriangleMesh, deviations_of, mesh_of_depths  # noqa: E402
 from drgs.meshing.options import MeshOptions  # noqa: E402
 from drgs.scenes import room, still_life  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
@@ -155,7 +155,7 @@ class Truth:
         from drgs import runtime
 
         mi = runtime.mitsuba()
-        mesh = mi.Mesh("truth", 3 * len(corners), len(corners))
+        mesh = mi.TriangleMesh("truth", 3 * len(corners), len(corners))
         params = mi.traverse(mesh)
         params["vertex_positions"] = mi.Float(corners.astype(np.float32).ravel())
         params["faces"] = mi.UInt32(np.arange(3 * len(corners), dtype=np.uint32))
@@ -175,7 +175,7 @@ class Truth:
             count += inside & (t > 1 - 2e-3)
         return count
 
-    def compare(self, mesh: Mesh) -> dict[str, float]:
+    def compare(self, mesh: TriangleMesh) -> dict[str, float]:
         """Accuracy and completeness in millimeters, and shares of what is near enough."""
         from scipy.spatial import cKDTree
 
@@ -216,7 +216,7 @@ class Views:
         return self.known[depth, preset]
 
 
-def mesh_in(way: dict, views: Views) -> tuple[Mesh, float]:
+def mesh_in(way: dict, views: Views) -> tuple[TriangleMesh, float]:
     """The mesh that is made in a way, and the processor seconds that fusion took."""
     from drgs.meshing import extraction
     from drgs.meshing.depths import footprint

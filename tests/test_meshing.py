@@ -14,7 +14,7 @@ from drgs.data.camera_lists import save_cameras_json
 from drgs.ellipsoids import Gaussians
 from drgs.files import save_ply
 from drgs.meshing.depths import DepthView, depth_views, footprint
-from drgs.meshing.extraction import Mesh, deviations_of, mesh_of, mesh_of_depths
+from drgs.meshing.extraction import TriangleMesh, deviations_of, mesh_of, mesh_of_depths
 from drgs.meshing.fusion import bricks_of, distances, sampled, surface
 from drgs.meshing.options import POINTS, MeshOptions
 from drgs.meshing.writing import save_mesh
@@ -44,7 +44,7 @@ def ball_view(camera: Camera, radius: float = RADIUS) -> DepthView:
     return DepthView(camera, depth.astype(np.float32), cosine.astype(np.float32), solid, rgb)
 
 
-def is_closed(mesh: Mesh) -> bool:
+def is_closed(mesh: TriangleMesh) -> bool:
     """Whether every edge is of two triangles that run along it in opposite directions."""
     edges = np.concatenate([mesh.faces[:, [a, b]] for a, b in ((0, 1), (1, 2), (2, 0))])
     there, counts = np.unique(edges, axis=0, return_counts=True)
@@ -52,7 +52,7 @@ def is_closed(mesh: Mesh) -> bool:
     return bool((counts == 1).all()) and back == {tuple(edge) for edge in there}
 
 
-def volume(mesh: Mesh) -> float:
+def volume(mesh: TriangleMesh) -> float:
     """Signed volume; positive where triangles are counter-clockwise from outside."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     return float(np.einsum("fk,fk->f", a, np.cross(b, c)).sum() / 6)

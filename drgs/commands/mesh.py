@@ -16,7 +16,7 @@ from drgs.files import state_header
 from drgs.guards.outputs import claim
 from drgs.meshing.extraction import mesh_of
 from drgs.meshing.options import MeshOptions
-from drgs.meshing.writing import SUFFIXES, save_mesh
+from drgs.meshing.writing import MESH_SUFFIXES, save_mesh
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -31,8 +31,10 @@ def run(args: Mesh) -> None:
     settings = args.settings()  # refuses what cannot be, before anything is read
     options = MeshOptions(**{field.name: getattr(args, field.name) for field in dataclasses.fields(MeshOptions)})
     suffix = args.output.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise ValueError(f"{args.output}: -o must be a {', '.join(SUFFIXES)}, got {suffix or 'no suffix'}; rename it")
+    if suffix not in MESH_SUFFIXES:
+        raise ValueError(
+            f"{args.output}: -o must be a {', '.join(MESH_SUFFIXES)}, got {suffix or 'no suffix'}; rename it"
+        )
     for option, value in (("--limit", args.limit), ("--info-pixels", args.info_pixels)):
         if value is not None and value < 1:
             raise ValueError(f"{option} must be at least 1, got {value}; correct it")

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["FINENESS", "Mesh", "deviations_of", "mesh_of", "mesh_of_depths"]
+__all__ = ["FINENESS", "TriangleMesh", "deviations_of", "mesh_of", "mesh_of_depths"]
 
 _VIEW_BYTES = 40  # of a pixel of a view: depth, weight, colors, spread, and what sampling them takes
 _COLOR = 0.05  # standard deviation of a color's noise, of what is between black and white
@@ -36,7 +36,7 @@ _GRAY = 0.5  # of a vertex that no view shows
 
 
 @dataclasses.dataclass(frozen=True)
-class Mesh:
+class TriangleMesh:
     """Triangles with colors.
 
     Attributes:
@@ -46,7 +46,8 @@ class Mesh:
         views: (V,) int32 number of views that see each vertex.
         spread: (V,) float32 standard deviation of the position of what is there, in scene units, as the information of
             the known views has it; None if nobody asked.
-        voxel, trunc: Of the fusion, in scene units.
+        voxel: Distance of neighboring points of the lattice in scene units.
+        trunc: Truncation of the fused distance in scene units.
     """
 
     vertices: np.ndarray
@@ -57,7 +58,7 @@ class Mesh:
     voxel: float
     trunc: float
 
-    def only(self, faces: np.ndarray) -> Mesh:
+    def only(self, faces: np.ndarray) -> TriangleMesh:
         """The mesh of some of its triangles: (F,) bool; vertices that none has are left out."""
         kept = self.faces[faces]
         used = np.unique(kept)
@@ -91,7 +92,7 @@ def mesh_of(
     *,
     known: Sequence[Camera] | None = None,
     advance: Callable[[str, int, int], None] | None = None,
-) -> Mesh:
+) -> TriangleMesh:
     """A surface of triangles from the depth of Gaussians in some views.
 
         mesh = drgs.meshing.extraction.mesh_of(g, cameras)
@@ -131,7 +132,7 @@ def mesh_of_depths(
     options: MeshOptions,
     advance: Callable[[str, int, int], None] | None = None,
     empty: float = 1.0,
-) -> Mesh:
+) -> TriangleMesh:
     """The surface of depth images: fusion, colors, and what is cut away.
 
     Args:
@@ -147,7 +148,7 @@ def mesh_of_depths(
     told = (lambda done: advance("fusion", done, len(bricks))) if advance else None
     vertices, faces = surface(views, voxel, trunc, bricks=bricks, empty=empty, advance=told)
     colors, seen, spread = _attributes(views, vertices, trunc)
-    mesh = Mesh(vertices, faces, colors, seen, spread, voxel, trunc)
+    mesh = TriangleMesh(vertices, faces, colors, seen, spread, voxel, trunc)
     is_kept = seen >= options.min_views
     if options.crop > 0 and spread is not None:
         is_kept &= spread <= options.crop * voxel

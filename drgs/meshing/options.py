@@ -22,7 +22,7 @@ class MeshOptions(Record):
     """How a surface is made of depth images.
 
     Attributes:
-        depth: Where a ray meets the surface: where transmittance falls to one half (median), or the mean (expected).
+        depth: A ray meets the surface where transmittance falls to one half (median), or at the mean (expected).
         voxel: Distance of neighboring points of the lattice in scene units; default two pixels wide on the surface.
         trunc: How far from the surface a view still says something about it, in voxels.
         max_voxels: Points of the lattice that are computed at most; the default voxel grows until they suffice.

@@ -16,29 +16,31 @@ import numpy as np
 from drgs.guards.outputs import replacing
 
 if TYPE_CHECKING:
-    from drgs.meshing.extraction import Mesh
+    from drgs.meshing.extraction import TriangleMesh
 
-__all__ = ["SUFFIXES", "save_mesh"]
+__all__ = ["MESH_SUFFIXES", "save_mesh"]
 
-SUFFIXES = (".ply", ".glb", ".obj")
+MESH_SUFFIXES = (".ply", ".glb", ".obj")
 """Of the formats that are written."""
 _TURN = np.array([-1.0, -1.0, 1.0])  # half a turn about z: no mirror, so that triangles keep their order
 
 
-def save_mesh(mesh: Mesh, path: Path) -> None:
+def save_mesh(mesh: TriangleMesh, path: Path) -> None:
     """Write a mesh; the file appears once it is complete.
 
     Args:
         mesh: The mesh. A PLY also has the number of views of each vertex and, where it is known, its spread.
-        path: File, whose suffix (`SUFFIXES`) says the format.
+        path: File, whose suffix (`MESH_SUFFIXES`) says the format.
     Raises:
         ValueError: If the suffix is another one.
         OSError: If it cannot be written.
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise ValueError(f"{path}: a mesh must be a {', '.join(SUFFIXES)}, got {suffix or 'no suffix'!r}; rename it")
+    if suffix not in MESH_SUFFIXES:
+        raise ValueError(
+            f"{path}: a mesh must be a {', '.join(MESH_SUFFIXES)}, got {suffix or 'no suffix'!r}; rename it"
+        )
     with replacing(path, suffix) as name:
         if suffix == ".ply":
             _write_ply(mesh, name)
@@ -48,7 +50,8 @@ def save_mesh(mesh: Mesh, path: Path) -> None:
             _write_obj(mesh, name)
 
 
-def _write_ply(mesh: Mesh, name: str) -> None:
+def _write_ply(mesh: TriangleMesh, name: str) -> None:
+    """Elements `vertex` and `face`, binary little-endian, as MeshLab and Blender read them."""
     import plyfile
 
     columns = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("views", "u2")]
@@ -66,14 +69,14 @@ def _write_ply(mesh: Mesh, name: str) -> None:
     plyfile.PlyData(elements, byte_order="<").write(name)
 
 
-def _write_obj(mesh: Mesh, name: str) -> None:
+def _write_obj(mesh: TriangleMesh, name: str) -> None:
     with open(name, "w", encoding="ascii") as file:
         file.write("# vertices: x y z r g b, colors in [0, 1]\n")
         np.savetxt(file, np.column_stack([mesh.vertices, mesh.colors]), "v %.7g %.7g %.7g %.4f %.4f %.4f")
         np.savetxt(file, mesh.faces + 1, "f %d %d %d")
 
 
-def _glb(mesh: Mesh) -> bytes:
+def _glb(mesh: TriangleMesh) -> bytes:
     """A GLB of one primitive of triangles: POSITION, COLOR_0 and indices, as glTF 2.0 has them."""
     positions = np.ascontiguousarray(mesh.vertices * _TURN, "<f4")
     colors = mesh.colors.astype(np.float64)
