@@ -72,11 +72,11 @@ def depth_views(
         with torch.no_grad():
             out = render(plain, camera, settings, (asked,))
         alpha = out.alpha.cpu().numpy()
-        found = (out.median_depth if kind == "median" else out.depth).cpu().numpy()
+        found = getattr(out, asked).cpu().numpy()
         is_solid = (alpha > _SOLID) & (found > 0)
         depth = np.where(is_solid, found, np.inf).astype(np.float32)
         spread = None
-        if features is not None:
+        if out.features is not None:
             # The mean of the logarithm, over the weights of what is seen.
             spread = np.exp(out.features[..., 0].cpu().numpy() / np.maximum(alpha, _SOLID)).astype(np.float32)
         views.append(DepthView(camera, depth, _cosines(camera, depth), alpha, out.rgb.cpu().numpy(), spread))
