@@ -38,7 +38,7 @@ class MeshOptions(Record):
     trunc: float = 4.0
     max_voxels: int = 100_000_000
     min_views: int = 2
-    crop: float = 0.0
+    crop: float = 1.0
     min_piece: float = 0.01
 
     def __post_init__(self) -> None:
