@@ -120,7 +120,7 @@ def mesh_of(
     memory.require("mesh", pixels * _VIEW_BYTES, f"the depth of {len(cameras)} views", "use fewer or smaller views")
     deviations = None
     if options.crop > 0:
-        # What is cut at a voxel needs no exact order, which takes eight times as long and moves a deviation by 3 percent.
+        # What is cut at a voxel needs no exact order, which takes eight times as long and moves deviations by 3 %.
         rough = RenderSettings.preset("fast")
         deviations = deviations_of(gaussians, known, rough, _counter("information", len(known), advance))
     views = depth_views(
