@@ -76,6 +76,7 @@ _MODULES = frozenset(
         "integrator",
         "lab",
         "ladder",
+        "meshing",
         "metrics",
         "oracle",
         "plugin",

@@ -52,6 +52,7 @@ FLOORS: list[tuple[set[str], str]] = [
         {f"information.{x}" for x in ("blocks", "cache", "pool", "greedy", "combine")},
         "choosing views by it",
     ),
+    ({"meshing"}, "a surface from depth, cut to what information determines"),
     ({"policies"}, "what chooses, by information or by poses"),
     ({"select"}, "policies, for users"),
     ({"data"}, "photographs and their cameras, from disk"),

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from drgs.commands.option_groups import Clustered, Common, OutputPath, Timed
+from drgs.commands.option_groups import Clustered, Common, Lenses, OutputPath, SceneFile, Settings, Timed, Views
+from drgs.commands.record_options import options_of
+from drgs.meshing.options import MeshOptions
 from drgs.studies.choices import ExperimentName, ProtocolName, StudyScale
 
-__all__ = ["Demo", "Reproduce", "Scene", "Sfm", "Teach"]
+__all__ = ["Demo", "Mesh", "Reproduce", "Scene", "Sfm", "Teach"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -128,3 +130,23 @@ class Reproduce(Common, Clustered):
     """A TOML or JSON file of the configuration, or a run, over the fits of the scale (docs/configuration.md)."""
     figures: bool = True
     """Draw the comparison sheet and the maps at the end, unless --no-figures is given, which saves their seconds."""
+
+
+_Meshing: Any = options_of(MeshOptions)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Mesh(_Meshing, Settings, Views, Lenses):
+    """Make a surface of triangles with colors, from the depth of a finished run in the views it was fitted to."""
+
+    scene: SceneFile
+    output: OutputPath
+    """The file, a .ply, .glb or .obj; its suffix says the format."""
+    cameras: str | None = None
+    """Views whose depth is taken: a data set, a run or a cameras.json; default those that the run was fitted to."""
+    info_pixels: int | None = None
+    """Views are reduced to at most this many pixels; default as in the fit, or 130000."""
+    limit: int | None = None
+    """At most this many views, evenly spaced."""
+    time: float | None = None
+    """Of a run that moves: the surface as it is then."""

@@ -1,0 +1,304 @@
+"""Surfaces of made scenes against the true ones: how far off, and how much of them is there.
+
+    python benchmarks/mesh.py [--scenes still_life room] [--page]
+
+Fits Gaussians to photographs of a made scene, from points that are matched between photographs (what the scene's files
+know of depth is kept from the fit), makes meshes of them in several ways, and compares each with the triangles that the
+photographs were traced from. Appends a row a mesh to benchmarks/mesh.jsonl as it ends, leaves out what is there, then
+writes the table of docs/mesh.md. One thread, one seed.
+
+Accuracy is the distance of points on the mesh, evenly over its area, to the nearest point of the true surface;
+completeness that of points of the true surface, which at least two of the photographs show, to the mesh. Both surfaces
+are sampled densely and compared by nearest points, whose spacing is what a distance cannot fall below. Distances above
+`FAR` count as that. Of the still life, the table top and what stands on it count; `anywhere` is the accuracy of the
+whole mesh, with the room around it, whose walls are in the background of photographs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import sys
+import time
+from pathlib import Path
+
+os.environ.setdefault("DRGS_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
+
+import numpy as np  # noqa: E402
+from fits import Fit, fitted  # noqa: E402
+from where import add_row, ran, read_rows  # noqa: E402
+
+from drgs.fitting.config import FitConfig  # noqa: E402
+from drgs.meshing.depths import depth_views  # noqa: E402
+from drgs.meshing.extraction import TriangleMesh, deviations_of, mesh_of_depths  # noqa: E402
+from drgs.meshing.options import MeshOptions  # noqa: E402
+from drgs.scenes import room, still_life  # noqa: E402
+from drgs.settings import RenderSettings  # noqa: E402
+from drgs.studies.tables import fill_between  # noqa: E402
+
+ROWS = ROOT / "benchmarks" / "mesh.jsonl"
+PAGE = ROOT / "docs" / "mesh.md"
+SIZE = {"max_pixels": 20_000, "max_gaussians": 10_000, "test_every": 0}
+# What is fitted: a scene by its name, how many photographs of it, and for how many steps.
+FITS = (
+    ("still_life", 28, 800),
+    ("still_life", 14, 800),
+    ("still_life", 7, 800),
+    ("still_life", 28, 300),
+    ("room", 75, 800),
+)
+FAR = {"still_life": 0.05, "room": 0.25}  # meters
+NEAR = {"still_life": 0.005, "room": 0.03}
+SPACING = {"still_life": 0.0012, "room": 0.008}
+WAYS: dict[str, dict] = {
+    "default": {"crop": MeshOptions.crop},
+    "no crop": {},
+    "expected depth": {"depth": "expected"},
+    "preset fast": {"preset": "fast"},
+    "same weight at every angle": {"weight": "same"},
+    "weight: cosine x alpha": {"weight": "alpha"},
+    "what is not solid is not free": {"empty": 0.0},
+    "trunc 2": {"trunc": 2.0},
+    "trunc 8": {"trunc": 8.0},
+    "voxel / 2": {"voxels": 0.5},
+    "voxel x 2": {"voxels": 2.0},
+    "min-views 1": {"min_views": 1},
+    "min-views 3": {"min_views": 3},
+    "crop 0.5": {"crop": 0.5},
+    "crop 2": {"crop": 2.0},
+    "pieces kept": {"min_piece": 0.0},
+}
+"""Name -> what is done in another way than by default; but for the first, nothing is cut that is uncertain."""
+
+
+# ------------------------------------------------------------------------------------------ scenes
+
+
+def data_of(scene: str, views: int, folder: Path) -> Path:
+    """A data set of some of the photographs of a made scene, without its depth; it is made where it is not there."""
+    made = folder / scene
+    if scene == "still_life":
+        still_life.generate(made, views=28, width=240, height=180)
+    elif not (made / "test_views.txt").exists():
+        room.generate(made)
+    out = folder / f"{scene}-{views}"
+    out.mkdir(exist_ok=True)
+    if scene == "still_life":
+        cameras = json.loads((made / "transforms.json").read_text())
+        frames = cameras["frames"]
+        chosen = [frames[k * len(frames) // views] for k in range(views)]
+        plain = [{key: x for key, x in frame.items() if key != "depth_file_path"} for frame in chosen]
+        (out / "transforms.json").write_text(json.dumps({**cameras, "frames": plain}))
+        names = ("images",)
+    else:
+        names = ("images", "sparse")  # points of a COLMAP model, of which each view sees some, with errors
+    for name in names:
+        if not (out / name).exists():
+            (out / name).symlink_to(made / name)
+    return out
+
+
+def triangles_of(scene: str) -> np.ndarray:
+    """(F, 3, 3) corners of the true surface, in meters."""
+    rng = np.random.default_rng(0)
+    # In the order in which the scene draws its numbers.
+    parts = [*still_life._room(rng), *still_life.objects(rng)] if scene == "still_life" else [*room.parts(0)]
+    return np.concatenate([np.asarray(mesh[0])[np.asarray(mesh[1])] for _, mesh, *_ in parts]).astype(np.float64)
+
+
+def in_region(scene: str, points: np.ndarray) -> np.ndarray:
+    """Which points are of what is looked at: table top and what stands on it; of a room everything."""
+    if scene == "room":
+        return np.ones(len(points), bool)
+    return (np.hypot(points[:, 0], points[:, 1]) < 0.6) & (points[:, 2] > -0.02) & (points[:, 2] < 0.7)
+
+
+def sampled(corners: np.ndarray, spacing: float, seed: int = 0) -> np.ndarray:
+    """(P, 3) points on triangles, evenly over their area, about `spacing` apart."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    rng = np.random.default_rng(seed)
+    count = int(min(area.sum() / spacing**2, 6e6))
+    which = rng.choice(len(area), count, p=area / area.sum())
+    u, v = rng.random((2, count, 1))
+    flip = u + v > 1
+    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
+    return a[which] + u * (b - a)[which] + v * (c - a)[which]
+
+
+class Truth:
+    """The true surface of a scene, as the cameras of a fit see it."""
+
+    def __init__(self, scene: str, fit: Fit):
+        from scipy.spatial import cKDTree
+
+        self.scene = scene
+        corners = triangles_of(scene)
+        self.all = cKDTree(sampled(corners, SPACING[scene]))
+        keep = in_region(scene, corners.mean(1))
+        if scene == "still_life":  # the table's large triangles reach out of the region
+            keep |= (np.abs(corners[..., 2]) < 0.02).all(1)
+        points = sampled(corners[keep], SPACING[scene])
+        points = points[in_region(scene, points)]
+        self.tree = cKDTree(points)
+        few = points[np.random.default_rng(1).permutation(len(points))[:60_000]]
+        self.visible = few[self._seen(corners, few, fit) >= 2]
+
+    @staticmethod
+    def _seen(corners: np.ndarray, points: np.ndarray, fit: Fit) -> np.ndarray:
+        """How many photographs show each point: it is in the image and nothing is in front of it."""
+        from drgs import runtime
+
+        mi = runtime.mitsuba()
+        mesh = mi.Mesh("truth", 3 * len(corners), len(corners))
+        params = mi.traverse(mesh)
+        params["vertex_positions"] = mi.Float(corners.astype(np.float32).ravel())
+        params["faces"] = mi.UInt32(np.arange(3 * len(corners), dtype=np.uint32))
+        params.update()
+        built = mi.load_dict({"type": "scene", "truth": mesh})
+        count = np.zeros(len(points), int)
+        for frame in fit.frames:
+            camera = frame.camera
+            pixels, z = camera.project(points)
+            inside = (z > 0) & (pixels >= 0).all(1) & (pixels < [camera.width, camera.height]).all(1)
+            way = points - camera.center
+            ray = mi.Ray3f(
+                mi.Point3f(*[float(x) for x in camera.center]),
+                mi.Vector3f(*[mi.Float(np.ascontiguousarray(way[:, k], np.float32)) for k in range(3)]),
+            )
+            t = built.ray_intersect_preliminary(ray, coherent=False).t.numpy()  # 1 at the point itself
+            count += inside & (t > 1 - 2e-3)
+        return count
+
+    def compare(self, mesh: TriangleMesh) -> dict[str, float]:
+        """Accuracy and completeness in millimeters, and shares of what is near enough."""
+        from scipy.spatial import cKDTree
+
+        far, near = FAR[self.scene], NEAR[self.scene]
+        points = sampled(mesh.vertices[mesh.faces], SPACING[self.scene], 2)
+        own = cKDTree(points)
+        anywhere = points[np.random.default_rng(4).permutation(len(points))[:60_000]]
+        inside = points[in_region(self.scene, points)]
+        inside = inside[np.random.default_rng(3).permutation(len(inside))[:60_000]]
+        off = np.minimum(self.tree.query(inside)[0], far)
+        missing = np.minimum(own.query(self.visible)[0], far)
+        precision, recall = float((off < near).mean()), float((missing < near).mean())
+        return {
+            "accuracy_mm": 1e3 * float(off.mean()),
+            "completeness_mm": 1e3 * float(missing.mean()),
+            "anywhere_mm": 1e3 * float(np.minimum(self.all.query(anywhere)[0], far).mean()),
+            "precision": precision,
+            "recall": recall,
+            "f": 2 * precision * recall / max(precision + recall, 1e-9),
+        }
+
+
+# ----------------------------------------------------------------------------------------- meshes
+
+
+class Views:
+    """Depth images of a fit, each kind rendered once."""
+
+    def __init__(self, fit: Fit):
+        self.fit = fit
+        self.cameras = [frame.camera for frame in fit.frames]
+        self.known: dict = {}
+        self.deviations = deviations_of(fit.gaussians, self.cameras, RenderSettings.preset("fast"))
+
+    def of(self, depth: str, preset: str) -> list:
+        """The depth images of a kind."""
+        if (depth, preset) not in self.known:
+            settings = RenderSettings.preset(preset)
+            self.known[depth, preset] = depth_views(self.fit.gaussians, self.cameras, settings, depth, self.deviations)
+        return self.known[depth, preset]
+
+
+def mesh_in(way: dict, views: Views) -> tuple[TriangleMesh, float]:
+    """The mesh that is made in a way, and the processor seconds that fusion took."""
+    from drgs.meshing import extraction
+    from drgs.meshing.depths import footprint
+
+    way = dict(way)
+    weight, empty, voxels = way.pop("weight", "cosine"), way.pop("empty", None), way.pop("voxels", 1.0)
+    shown = views.of(way.get("depth", MeshOptions.depth), way.pop("preset", "exact"))
+    options = MeshOptions(**{"crop": 0.0, **way})
+    if weight == "same":
+        shown = [dataclasses.replace(view, weight=np.ones_like(view.weight)) for view in shown]
+    if weight == "alpha":
+        shown = [dataclasses.replace(view, weight=view.weight * view.alpha) for view in shown]
+    if voxels != 1.0:
+        options = options.replace(voxel=voxels * footprint(shown) * extraction.FINENESS)
+    began = time.process_time()
+    mesh = mesh_of_depths(shown, options, empty=1.0 if empty is None else empty)
+    return mesh, time.process_time() - began
+
+
+def measure(scene: str, count: int, steps: int, ways: list[str], folder: Path) -> None:
+    """Rows of one fit."""
+    key = {"scene": scene, "photographs": count, "steps": steps}
+    there = {row["way"] for row in read_rows(ROWS) if all(row[name] == x for name, x in key.items())}
+    ways = [way for way in ways if way not in there]
+    if not ways:
+        return
+    fit = fitted(str(data_of(scene, count, folder)), FitConfig.of(max_steps=steps, **SIZE))
+    truth = Truth(scene, fit)
+    views = Views(fit)
+    for way in ways:
+        mesh, seconds = mesh_in(WAYS[way], views)
+        found = truth.compare(mesh)
+        row = {**key, "way": way, "voxel_mm": 1e3 * mesh.voxel, "triangles": len(mesh.faces), "seconds": seconds}
+        add_row(ROWS, {**row, **found, "fit_seconds": fit.seconds, **ran()})
+        print(
+            json.dumps({name: round(x, 4) if isinstance(x, float) else x for name, x in (row | found).items()}),
+            flush=True,
+        )
+
+
+# ------------------------------------------------------------------------------------------- page
+
+
+def table(rows: list[dict]) -> str:
+    """The rows as Markdown."""
+    lines = [
+        "| scene, photographs, steps | way | voxel mm | triangles | accuracy mm | anywhere mm | completeness mm | "
+        "near, of the mesh | near, of the truth | F | s |",
+        "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
+    ]
+    order = {fit: k for k, fit in enumerate(FITS)}
+    ranks = {way: k for k, way in enumerate(WAYS)}
+    key = lambda row: (order[row["scene"], row["photographs"], row["steps"]], ranks[row["way"]])  # noqa: E731
+    for row in sorted(rows, key=key):
+        cells = [f"{row['scene'].replace('_', ' ')}, {row['photographs']}, {row['steps']}", row["way"]]
+        cells += [f"{row['voxel_mm']:.1f}", f"{row['triangles']:,}"]
+        names = ("accuracy_mm", "anywhere_mm", "completeness_mm")
+        cells += [f"{row[name]:.1f}" if name in row else "" for name in names]
+        cells += [f"{100 * row[name]:.0f} %" for name in ("precision", "recall")]
+        cells += [f"{row['f']:.3f}", f"{row['seconds']:.0f}"]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scenes", nargs="*", default=["still_life", "room"])
+    parser.add_argument("--photographs", nargs="*", type=int, help="only fits of so many")
+    parser.add_argument("--ways", nargs="*", default=list(WAYS))
+    parser.add_argument("--folder", type=Path, default=Path("out/mesh"), help="where made scenes are put")
+    parser.add_argument("--page", action="store_true", help="only write the table")
+    args = parser.parse_args()
+    if not args.page:
+        args.folder.mkdir(parents=True, exist_ok=True)
+        for scene, count, steps in FITS:
+            if scene in args.scenes and (not args.photographs or count in args.photographs):
+                measure(scene, count, steps, args.ways, args.folder.resolve())
+    fill_between(PAGE, "rows", table(read_rows(ROWS)))
+
+
+if __name__ == "__main__":
+    main()

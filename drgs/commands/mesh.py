@@ -1,0 +1,87 @@
+"""`drgs mesh`: a surface of triangles from a finished run or a file of Gaussians."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drgs.commands.convert import still
+from drgs.commands.scene_input import SceneInput
+from drgs.commands.viewpoints import check_lenses, evenly, known_views
+from drgs.display.progress import Bar
+from drgs.files import state_header
+from drgs.guards.outputs import claim
+from drgs.meshing.extraction import mesh_of
+from drgs.meshing.options import MeshOptions
+from drgs.meshing.writing import MESH_SUFFIXES, save_mesh
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.commands.making_options import Mesh
+    from drgs.ellipsoids import Gaussians
+
+__all__ = ["run"]
+
+
+def run(args: Mesh) -> None:
+    """`drgs mesh SCENE -o FILE`."""
+    settings = args.settings()  # refuses what cannot be, before anything is read
+    options = MeshOptions(**{field.name: getattr(args, field.name) for field in dataclasses.fields(MeshOptions)})
+    suffix = args.output.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        raise ValueError(
+            f"{args.output}: -o must be a {', '.join(MESH_SUFFIXES)}, got {suffix or 'no suffix'}; rename it"
+        )
+    for option, value in (("--limit", args.limit), ("--info-pixels", args.info_pixels)):
+        if value is not None and value < 1:
+            raise ValueError(f"{option} must be at least 1, got {value}; correct it")
+    if importlib.util.find_spec("skimage") is None:
+        raise ValueError("marching cubes need the package scikit-image, which is missing; pip install 'drgs[mesh]'")
+    with claim(args.output.parent, "mesh", [args.output.name], [args.scene, args.cameras or ""]):
+        with Bar("reading", show=not args.quiet):
+            given = SceneInput.of(args)
+            gaussians = _without_skybox(still(args, given), given)
+        if args.cameras is None and given.run is None:
+            raise ValueError(
+                "a file of Gaussians does not say its views: --cameras must name a data set, a run or a cameras.json"
+            )
+        lenses = given.keeps_lenses(args.undistort)
+        known = known_views(args.cameras if given.run is None else None, args, given, lenses)
+        seen = known if args.cameras is None else known_views(args.cameras, args, given, lenses)
+        cameras = evenly(_places(seen.cameras), args.limit or len(seen.cameras))
+        check_lenses("mesh", settings, cameras)
+        with Bar("information" if options.crop else "depth", show=not args.quiet) as bar:
+            mesh = mesh_of(
+                gaussians,
+                cameras,
+                given.over_background(settings),
+                options,
+                known=_places(known.cameras),
+                advance=lambda label, done, total: bar.update(done, total, label),
+            )
+        with Bar("writing", show=not args.quiet):
+            save_mesh(mesh, args.output)
+    if not args.quiet:
+        low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+        size = " x ".join(f"{x:.3g}" for x in np.asarray(high - low))
+        print(
+            f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, {size}, of {len(cameras)} views "
+            f"({seen.source}), {options.depth} depth, voxels of {mesh.voxel:.3g}: {args.output}"
+        )
+
+
+def _without_skybox(gaussians: Gaussians, given: SceneInput) -> Gaussians:
+    """The Gaussians but those of a skybox, which a run has first."""
+    if given.run is None or given.step is None:
+        return gaussians
+    count = state_header(given.run.state).get("skybox", 0)
+    return gaussians.take(slice(count, None)) if count else gaussians
+
+
+def _places(cameras: list[Camera]) -> list[Camera]:
+    """Cameras without the times of their photographs, each place once: frames of a video have one."""
+    found = {(camera.w2c.tobytes(), camera.K.tobytes()): camera for camera in reversed(cameras)}
+    return [dataclasses.replace(camera, time=None) for camera in reversed(found.values())]
