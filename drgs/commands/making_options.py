@@ -11,7 +11,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 from drgs.commands.option_groups import Clustered, Common, OutputPath, Timed
 from drgs.studies.choices import ExperimentName, ProtocolName, StudyScale
 
-__all__ = ["Demo", "Reproduce", "Scene", "Sfm", "Teach"]
+__all__ = ["Capture", "Demo", "Reproduce", "Scene", "Sfm", "Teach"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -32,6 +32,28 @@ class Sfm(Common):
     """Masks of an object that was turned or moved: a folder (NAME.png, white is kept), or alpha, the photos' own."""
     seed: int = 0
     """Seed of all random sampling."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Capture(Common):
+    """Make a run of photographs or videos in one go: frames, poses, fit, report; each step can be resumed."""
+
+    paths: Annotated[Positional[tuple[Path, ...]], arg(metavar="PATH")]
+    """Photographs, videos, folders of both, or one data set that has poses."""
+    output: OutputPath
+    """The run folder; photographs and poses are in its folder capture."""
+    budget: str | None = None
+    """Time for all of it on this machine (90s, 10min, 2h): sizes and steps are chosen for it; default those of fit."""
+    frames: int = 150
+    """At most this many frames of all videos together."""
+    masks: str | None = None
+    """Masks of an object that was turned or moved: a folder (NAME.png, white is kept), or alpha, the photos' own."""
+    config: Path | None = None
+    """A TOML or JSON file of the configuration of the fit, or a run (docs/configuration.md)."""
+    resume: bool = False
+    """Go on where an earlier command was stopped; name the same files and options."""
+    seed: int = 0
+    """Seed of everything random."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,249 @@
+"""What a budget of time is spent on: sizes and steps, from measurements on this machine before anything long begins.
+
+Poses are planned first: features of two of the photographs are found and matched, and from what that takes follows how
+large photographs may be looked at. What is left belongs to the fit: some steps of it are timed, in growing sizes, with
+as many Gaussians as it will have on average, and the largest size that fits gets as many steps as there is time for.
+Nothing is cut off while it runs: learning rates end where they should.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drgs.data.checks import image_size
+from drgs.data.matching import extract, match, quiet
+from drgs.display.progress import Bar, quietly
+from drgs.fitting.config import FitConfig
+from drgs.fitting.frames import frames_for
+from drgs.fitting.start import start
+from drgs.fitting.threads import fewer_torch_threads
+from drgs.guards.unfinished import temporary_folder
+
+if TYPE_CHECKING:
+    from drgs.data import Dataset
+
+__all__ = ["FitPlan", "PosePlan", "plan_fit", "plan_poses", "seconds_of_budget"]
+
+_UNITS = {"s": 1.0, "sec": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
+_LEAST = 30.0  # seconds: less is not even enough to start all parts
+_FIRST_SIZE = 800  # pixels of the longer side at which two photographs are measured
+_IMAGE_SIZES = (1600, 1200, 1000, 800, 640)
+_POSES_SHARE = 0.4  # of the budget, that poses should not exceed
+# Mapping of 16 photographs (`banana`) took 3.6 s, of 292 (`bonsai`) 2,280 s, where one photograph's features of 1,600
+# pixels took 3.2 s: what features take tells how fast the machine is.
+_MAPPING = (3.6 / 3.2 / 16**2.22, 2.22)
+_EXHAUSTIVE = 60  # photographs up to which all pairs are matched, as in `drgs.data.sfm`
+_NEIGHBORS = 14  # pairs of each photograph where neighbors are matched
+# (pixels of a photograph, Gaussians, steps) of fits, each about three times as long as the one before.
+_SIZES = (
+    (12_000, 8_000, 400),
+    (30_000, 12_000, 800),
+    (60_000, 20_000, 1_500),
+    (130_000, 30_000, 3_000),
+    (250_000, 60_000, 5_000),
+    (430_000, 120_000, 9_000),
+)
+_FEWER, _MORE = 0.5, 1.5  # of the steps of a size, that it may have
+_FEWEST_STEPS = 100
+_TIMED_VIEWS = 8
+_END = 0.1  # of what is left, for held-out views, report and what was measured too low
+
+
+@dataclasses.dataclass(frozen=True)
+class PosePlan:
+    """How large photographs are looked at for their poses.
+
+    Attributes:
+        max_image_size: Pixels of the longer side.
+        seconds: How long that is expected to take.
+    """
+
+    max_image_size: int
+    seconds: float
+
+
+@dataclasses.dataclass(frozen=True)
+class FitPlan:
+    """How large a fit is.
+
+    Attributes:
+        max_pixels: Pixels of a photograph.
+        max_gaussians: Number of Gaussians.
+        max_steps: Number of steps.
+        seconds: How long the steps are expected to take.
+    """
+
+    max_pixels: int
+    max_gaussians: int
+    max_steps: int
+    seconds: float
+
+    def config(self, config: FitConfig) -> FitConfig:
+        """A configuration with these sizes."""
+        return config.replace(
+            max_steps=self.max_steps,
+            data=dataclasses.replace(config.data, max_pixels=self.max_pixels),
+            density=dataclasses.replace(config.density, max_gaussians=self.max_gaussians),
+        )
+
+    def line(self) -> str:
+        """In words."""
+        return (
+            f"{self.max_steps} steps at {self.max_pixels} pixels with up to {self.max_gaussians} Gaussians, about "
+            f"{duration(self.seconds)}"
+        )
+
+
+def seconds_of_budget(text: str) -> float:
+    """Seconds of `90s`, `10min`, `1.5h`.
+
+    Raises:
+        ValueError: If it is no such time, or less than half a minute.
+    """
+    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?|\.\d+)\s*([a-z]+)\s*", text.lower())
+    if found is None or found[2] not in _UNITS:
+        raise ValueError(f"--budget must be a time with its unit, e.g. 90s, 10min or 1.5h, got {text!r}; correct it")
+    seconds = float(found[1]) * _UNITS[found[2]]
+    if not _LEAST <= seconds <= 1e7:
+        raise ValueError(f"--budget must be at least {_LEAST:.0f}s, got {text}; allow more time")
+    return seconds
+
+
+def duration(seconds: float) -> str:
+    """A time in words, e.g. `40 s` or `12 min`."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def plan_poses(folder: Path, names: Sequence[str], budget: float) -> PosePlan:
+    """How large photographs may be looked at, from what two of them take.
+
+    Args:
+        folder, names: The photographs, at least two.
+        budget: Seconds of the whole capture.
+    """
+    largest = max(image_size(folder / names[0]))
+    if not _is_readable(folder / names[0]):  # COLMAP reads no HEIC and no WebP: nothing can be measured before it is
+        return PosePlan(min(largest, _IMAGE_SIZES[1]), _POSES_SHARE * budget)
+    with temporary_folder("plan") as made, Bar("how long poses will take"):
+        database = made / "database.db"
+        two = [names[len(names) // 3], names[min(len(names) // 3 + 1, len(names) - 1)]]
+        began = time.perf_counter()
+        with quiet():
+            extract(
+                database,
+                folder,
+                two,
+                camera_model="SIMPLE_RADIAL",
+                shared_camera=False,
+                max_image_size=_FIRST_SIZE,
+                wide_baseline=True,
+            )
+            features = (time.perf_counter() - began) / len(two)
+            began = time.perf_counter()
+            match(database, [(two[0], two[1])])
+            pair = time.perf_counter() - began
+    measured = min(_FIRST_SIZE, largest)
+    sizes = [size for size in _IMAGE_SIZES if size <= largest] or [largest]
+    plans = [PosePlan(size, _pose_seconds(len(names), features, pair, size / measured)) for size in sizes]
+    return next((plan for plan in plans if plan.seconds <= _POSES_SHARE * budget), plans[-1])
+
+
+def _pose_seconds(count: int, features: float, pair: float, scale: float) -> float:
+    """Seconds of poses of `count` photographs at `scale` times the size at which `features` and `pair` were taken."""
+    pairs = count * (count - 1) / 2 if count <= _EXHAUSTIVE else count * _NEIGHBORS
+    factor, power = _MAPPING
+    # Features are found by their number of pixels, and compared all to all.
+    return (
+        count * features * scale**2
+        + pairs * pair * min(scale**4, 4.0)
+        + factor * features * (1600 / _FIRST_SIZE) ** 2 * count**power
+    )
+
+
+def _is_readable(path: Path) -> bool:
+    return path.suffix.lower() in (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
+
+
+def plan_fit(dataset: Dataset, config: FitConfig, left: float) -> FitPlan:
+    """How large a fit of a data set may be, from timed steps.
+
+    Args:
+        dataset: The data set, with points.
+        config: What else the fit does; its renderers are those that are timed.
+        left: Seconds that are left, for the fit and what follows it.
+    """
+    left *= 1 - _END
+    train, _ = dataset.split()
+    largest = max(view.camera.width * view.camera.height for view in train if view.camera)
+    best: FitPlan | None = None
+    ended = time.perf_counter() + left
+    before: float | None = None
+    with Bar("how long steps take", len(_SIZES)) as bar:
+        for number, (pixels, gaussians, steps) in enumerate(_SIZES):
+            bar.update(number)
+            if best is not None and before is not None and 2 * before * steps > ended - time.perf_counter():
+                break  # a step takes at least twice as long as in the size before
+            size = FitPlan(min(pixels, largest), gaussians, steps, 0.0)
+            each = _seconds_a_step(dataset, size.config(config), warm=number == 0)
+            there = math.floor((ended - time.perf_counter()) / each)
+            if best is not None and there < _FEWER * steps:
+                break
+            count = int(min(max(there, _FEWEST_STEPS), _MORE * steps))
+            best = FitPlan(size.max_pixels, gaussians, count, count * each)
+            before = each
+            if size.max_pixels == largest and pixels > largest:
+                break
+    assert best is not None
+    return best
+
+
+def _seconds_a_step(dataset: Dataset, config: FitConfig, warm: bool) -> float:
+    """Seconds that a step takes on average, with as many Gaussians as there are on average.
+
+    Args:
+        dataset: The data set.
+        config: Configuration with the sizes.
+        warm: Whether to take all renderers' first steps, which compile, beforehand.
+    """
+    train, _ = dataset.split()
+    views = train[:: max(1, len(train) // _TIMED_VIEWS)]
+    with quietly(), fewer_torch_threads():
+        frames = frames_for(views, config.data)
+        timed = config.replace(data=dataclasses.replace(config.data, skybox="off", exposure="off", poses="fixed"))
+        trainer, *_ = start(_filled(dataset, config), views, frames, timed, None, None, False, 0)
+        cycle = len(trainer.renderers.all_settings) + 7
+        for _ in range(cycle if warm else 0):
+            trainer.step()
+        began = time.perf_counter()
+        for _ in range(cycle):
+            trainer.step()
+        return (time.perf_counter() - began) / cycle
+
+
+def _filled(dataset: Dataset, config: FitConfig) -> Dataset:
+    """The data set with as many points as a fit has Gaussians on average: between its points and its most.
+
+    Points are repeated, displaced by a little of their own spread.
+    """
+    points, colors = dataset.points, dataset.colors
+    if points is None or not len(points):
+        return dataset
+    most = config.density.max_gaussians
+    # Growing evenly up to half of the steps, and full from there on.
+    wanted = min(most, int(0.25 * min(len(points), most) + 0.75 * most))
+    rng = np.random.default_rng(0)
+    chosen = rng.integers(0, len(points), wanted)
+    spread = np.median(np.abs(points - np.median(points, axis=0)), axis=0)
+    moved = points[chosen] + 0.01 * spread * rng.normal(size=(wanted, 3))
+    shown = None if colors is None else colors[chosen]
+    return dataclasses.replace(dataset, points=moved, colors=shown)

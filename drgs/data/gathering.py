@@ -1,0 +1,158 @@
+"""Photographs and frames of videos in one folder, for structure from motion."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from drgs.data.checks import IMAGE_SUFFIXES, list_images
+from drgs.data.shooting import Finding
+from drgs.data.video_frames import Picked, pick_frames
+from drgs.data.videos import VIDEO_SUFFIXES, list_videos
+from drgs.files import SCHEMA
+from drgs.guards.foreign import refuse_foreign
+from drgs.guards.outputs import Claim
+from drgs.guards.unfinished import temporary_folder
+
+__all__ = ["FRAMES", "Gathered", "gather", "named_files"]
+
+FRAMES = "frames.json"
+"""Beside the pictures: which of them are of which video, and of which moment."""
+_QUALITY = 97  # of JPEG: what a video's own compression has left is kept
+_SUFFIXES = (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES)
+
+
+@dataclasses.dataclass(frozen=True)
+class Gathered:
+    """What was put into a folder.
+
+    Attributes:
+        folder: The folder.
+        photographs: Number of photographs.
+        frames: Number of frames of videos.
+        findings: What is wrong with the videos.
+    """
+
+    folder: Path
+    photographs: int
+    frames: int
+    findings: tuple[Finding, ...]
+
+    def line(self) -> str:
+        """In one line."""
+        parts = [f"{self.photographs} photographs"] if self.photographs else []
+        parts += [f"{self.frames} frames of videos"] if self.frames else []
+        return " and ".join(parts)
+
+
+def named_files(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """Photographs and videos that paths name: files, or folders with some.
+
+    Raises:
+        FileNotFoundError: Nothing there, or a folder without either.
+        ValueError: A file that is neither.
+    """
+    photographs, videos = list[Path](), list[Path]()
+    for path in paths:
+        if path.is_dir():
+            found = list_images(path), list_videos(path)
+            if not any(found):
+                raise FileNotFoundError(
+                    f"{path}: must hold photographs or videos, holds none ({', '.join(_SUFFIXES)}); check the path"
+                )
+            photographs += found[0]
+            videos += found[1]
+        elif not path.exists():
+            raise FileNotFoundError(f"{path}: must be photographs or a video, found none; check the path")
+        elif path.suffix.lower() in IMAGE_SUFFIXES:
+            photographs.append(path)
+        elif path.suffix.lower() in VIDEO_SUFFIXES:
+            videos.append(path)
+        else:
+            refuse_foreign(path, "a photograph or a video")
+            raise ValueError(
+                f"{path}: must be a photograph or a video ({', '.join(_SUFFIXES)}), got {path.suffix or 'no suffix'}; "
+                "convert it, or leave it out"
+            )
+    return photographs, videos
+
+
+def gather(
+    photographs: Sequence[Path],
+    videos: Sequence[Path],
+    claimed: Claim,
+    name: str = "photos",
+    most: int = 150,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Gathered:
+    """Links to photographs, and frames of videos as JPEG, in a folder that is complete or not there at all.
+
+    Photographs keep their names; where two have the same one, the name of the folder comes before that of the second.
+    Frames are named by video and number, so that they follow each other by name.
+
+    Args:
+        photographs, videos: Files, as `named_files` lists them.
+        claimed: The folder in which the new one is made; it is held by the command.
+        name: Name of the new folder; there must be none.
+        most: Largest number of frames of all videos together, shared out by their lengths in frames that are wanted.
+        progress: Called with (what is done, done, total).
+    Raises:
+        FileNotFoundError, ValueError: A video that cannot be decoded.
+    """
+    tell = progress or (lambda stage, done, total: None)
+    picked = _picked(videos, most, tell)
+    rows = list[dict[str, Any]]()
+    with temporary_folder("photos", claimed.path) as unfinished:
+        made = unfinished / name
+        made.mkdir()
+        for path in photographs:
+            target = made / _free_name(made, path)
+            try:
+                target.symlink_to(path.resolve())
+            except OSError:  # a file system without links
+                shutil.copyfile(path, target)
+        total = sum(len(one.frames) for one in picked)
+        for video, one in zip(videos, picked, strict=True):
+            for frame in one.frames:
+                tell("frames", len(rows), total)
+                file = _free_name(made, Path(video.parent.name) / f"{video.stem}_{frame.frame.index:06d}.jpg")
+                pixels = np.ascontiguousarray(frame.frame.read()[..., ::-1])
+                data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
+                (made / file).write_bytes(data.tobytes())
+                row = {"file": file, "video": str(video), "index": frame.frame.index, "seconds": frame.seconds}
+                rows.append({**row, **{key: getattr(frame, key) for key in ("sharpness", "motion", "parallax")}})
+        findings = tuple(finding for one in picked for finding in one.findings)
+        if rows:
+            listed = {"schema": SCHEMA, "command": claimed.command, "frames": rows}
+            listed["findings"] = [dataclasses.asdict(finding) for finding in findings]
+            (made / FRAMES).write_text(json.dumps(listed, indent=1) + "\n")
+        claimed.put(made, name)
+    return Gathered(claimed.path / name, len(photographs), len(rows), findings)
+
+
+def _picked(videos: Sequence[Path], most: int, tell: Callable[[str, int, int], None]) -> list[Picked]:
+    """Frames of each video; of several, as many of each as its share of those that are wanted."""
+    found = []
+    for video in videos:
+        found.append(pick_frames(video, most, lambda done, total, video=video: tell(f"frames of {video.name}", done, total)))
+    wanted = sum(min(one.wanted, most) for one in found)
+    if len(found) < 2 or wanted <= most:
+        return found
+    shares = [max(1, int(most * min(one.wanted, most) / wanted)) for one in found]
+    return [
+        pick_frames(video, share, lambda done, total, video=video: tell(f"frames of {video.name}", done, total))
+        for video, share in zip(videos, shares, strict=True)
+    ]
+
+
+def _free_name(folder: Path, path: Path) -> str:
+    """Name of a file that is not taken in a folder."""
+    names = (path.name, f"{path.parent.name}_{path.name}", *(f"{path.stem}_{k}{path.suffix}" for k in range(2, 10_000)))
+    return next(name for name in names if not (folder / name).is_symlink() and not (folder / name).exists())

@@ -1,0 +1,26 @@
+"""What a capture shows about how it was taken, and what to do at the next shoot."""
+
+from __future__ import annotations
+
+import dataclasses
+
+__all__ = ["Finding"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """Something that is wrong with photographs or a video.
+
+    Attributes:
+        kind: Name of what it is: `turn`, `fast`, `blur`, `blank`, `overlap`, `poses`, `exposure` or `view`.
+        text: Where it is and what it is, a sentence without a full stop.
+        advice: What to do about it, in the imperative.
+    """
+
+    kind: str
+    text: str
+    advice: str
+
+    def line(self) -> str:
+        """Both in one line."""
+        return f"{self.text}; {self.advice}"
