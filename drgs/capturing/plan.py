@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.data.checks import image_size
+from drgs.data.checks import image_size, read_image
 from drgs.data.matching import extract, match, quiet
 from drgs.display.progress import Bar, quietly
 from drgs.fitting.config import FitConfig
@@ -28,14 +28,14 @@ from drgs.fitting.threads import fewer_torch_threads
 from drgs.guards.unfinished import temporary_folder
 
 if TYPE_CHECKING:
-    from drgs.data import Dataset
+    from drgs.data import Dataset, View
 
-__all__ = ["FitPlan", "PosePlan", "plan_fit", "plan_poses", "seconds_of_budget"]
+__all__ = ["FitPlan", "PosePlan", "duration", "plan_fit", "plan_poses", "planned_poses", "seconds_of_budget"]
 
 _UNITS = {"s": 1.0, "sec": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 _LEAST = 30.0  # seconds: less is not even enough to start all parts
 _FIRST_SIZE = 800  # pixels of the longer side at which two photographs are measured
-_IMAGE_SIZES = (1600, 1200, 1000, 800, 640)
+_IMAGE_SIZES = (1600, 1200, 1000, 800, 640, 480)
 _POSES_SHARE = 0.4  # of the budget, that poses should not exceed
 # Mapping of 16 photographs (`banana`) took 3.6 s, of 292 (`bonsai`) 2,280 s, where one photograph's features of 1,600
 # pixels took 3.2 s: what features take tells how fast the machine is.
@@ -54,7 +54,10 @@ _SIZES = (
 _FEWER, _MORE = 0.5, 1.5  # of the steps of a size, that it may have
 _FEWEST_STEPS = 100
 _TIMED_VIEWS = 8
-_END = 0.1  # of what is left, for held-out views, report and what was measured too low
+_TIMED = 12  # steps: twice all renderers
+_END = 0.05  # of what is left, for what was measured too low
+# Held-out views and report, in seconds and in steps a view.
+_AFTER, _TRAINING, _HELD_OUT = 6.0, 2.0, 4.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,12 +82,14 @@ class FitPlan:
         max_gaussians: Number of Gaussians.
         max_steps: Number of steps.
         seconds: How long the steps are expected to take.
+        after: How long held-out views and the report are expected to take.
     """
 
     max_pixels: int
     max_gaussians: int
     max_steps: int
     seconds: float
+    after: float = 0.0
 
     def config(self, config: FitConfig) -> FitConfig:
         """A configuration with these sizes."""
@@ -132,30 +137,50 @@ def plan_poses(folder: Path, names: Sequence[str], budget: float) -> PosePlan:
         budget: Seconds of the whole capture.
     """
     largest = max(image_size(folder / names[0]))
-    if not _is_readable(folder / names[0]):  # COLMAP reads no HEIC and no WebP: nothing can be measured before it is
-        return PosePlan(min(largest, _IMAGE_SIZES[1]), _POSES_SHARE * budget)
+    chosen = [names[len(names) // 3], names[min(len(names) // 3 + 1, len(names) - 1)]]
     with temporary_folder("plan") as made, Bar("how long poses will take"):
         database = made / "database.db"
-        two = [names[len(names) // 3], names[min(len(names) // 3 + 1, len(names) - 1)]]
+        for name in chosen:
+            _write_small(folder / name, made / f"{name}.png")
+        two = [f"{name}.png" for name in chosen]
         began = time.perf_counter()
         with quiet():
-            extract(
-                database,
-                folder,
-                two,
-                camera_model="SIMPLE_RADIAL",
-                shared_camera=False,
-                max_image_size=_FIRST_SIZE,
-                wide_baseline=True,
-            )
+            extract(database, made, two, camera_model="SIMPLE_RADIAL", shared_camera=False, wide_baseline=True)
             features = (time.perf_counter() - began) / len(two)
             began = time.perf_counter()
             match(database, [(two[0], two[1])])
             pair = time.perf_counter() - began
     measured = min(_FIRST_SIZE, largest)
-    sizes = [size for size in _IMAGE_SIZES if size <= largest] or [largest]
-    plans = [PosePlan(size, _pose_seconds(len(names), features, pair, size / measured)) for size in sizes]
+    sizes = [size for size in _IMAGE_SIZES if size < largest]
+    sizes = [*sizes[: len(_IMAGE_SIZES)], *([largest] if largest <= _IMAGE_SIZES[0] else [])]
+    plans = [PosePlan(size, _pose_seconds(len(names), features, pair, size / measured)) for size in sorted(sizes)[::-1]]
     return next((plan for plan in plans if plan.seconds <= _POSES_SHARE * budget), plans[-1])
+
+
+def planned_poses(plan: PosePlan, count: int, left: float) -> str:
+    """The plan in words.
+
+    Args:
+        plan: How large photographs are looked at.
+        count: Number of photographs.
+        left: Seconds that are left of the budget.
+    """
+    size = plan.max_image_size
+    return (
+        f"{count} photographs at {size} pixels for poses, about {duration(plan.seconds)}; then a fit as large as the "
+        f"{duration(max(left - plan.seconds, 0.0))} after it allow, by timed steps"
+    )
+
+
+def _write_small(path: Path, target: Path) -> None:
+    """A photograph, of whatever format, as PNG of at most `_FIRST_SIZE` pixels along the longer side."""
+    import cv2
+
+    image = read_image(path)
+    image = image[..., 2::-1] if image.ndim == 3 else image
+    scale = min(1.0, _FIRST_SIZE / max(image.shape[:2]))
+    small = cv2.resize(np.ascontiguousarray(image), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    target.write_bytes(cv2.imencode(".png", small)[1].tobytes())
 
 
 def _pose_seconds(count: int, features: float, pair: float, scale: float) -> float:
@@ -170,10 +195,6 @@ def _pose_seconds(count: int, features: float, pair: float, scale: float) -> flo
     )
 
 
-def _is_readable(path: Path) -> bool:
-    return path.suffix.lower() in (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
-
-
 def plan_fit(dataset: Dataset, config: FitConfig, left: float) -> FitPlan:
     """How large a fit of a data set may be, from timed steps.
 
@@ -182,52 +203,56 @@ def plan_fit(dataset: Dataset, config: FitConfig, left: float) -> FitPlan:
         config: What else the fit does; its renderers are those that are timed.
         left: Seconds that are left, for the fit and what follows it.
     """
-    left *= 1 - _END
-    train, _ = dataset.split()
-    largest = max(view.camera.width * view.camera.height for view in train if view.camera)
+    train, test = dataset.split(config.data.test_every, config.data.test_offset, config.data.test_cameras)
+    largest = max(view.camera.width * view.camera.height for view in train)
     best: FitPlan | None = None
-    ended = time.perf_counter() + left
+    end = time.perf_counter() + left
     before: float | None = None
     with Bar("how long steps take", len(_SIZES)) as bar:
         for number, (pixels, gaussians, steps) in enumerate(_SIZES):
             bar.update(number)
-            if best is not None and before is not None and 2 * before * steps > ended - time.perf_counter():
-                break  # a step takes at least twice as long as in the size before
+            rest = end - time.perf_counter()
+            if best is not None and before is not None and 2 * before * (_FEWER * steps + _TIMED) > rest - best.after:
+                break  # a step takes about twice as long as in the size before
             size = FitPlan(min(pixels, largest), gaussians, steps, 0.0)
-            each = _seconds_a_step(dataset, size.config(config), warm=number == 0)
-            there = math.floor((ended - time.perf_counter()) / each)
+            each = _seconds_a_step(train, dataset, size.config(config), is_first=number == 0)
+            after = _AFTER + each * (_TRAINING * len(train) + _HELD_OUT * len(test))
+            room = (1 - _END) * (end - time.perf_counter() - after)
+            there = math.floor(room / each)
             if best is not None and there < _FEWER * steps:
                 break
             count = int(min(max(there, _FEWEST_STEPS), _MORE * steps))
-            best = FitPlan(size.max_pixels, gaussians, count, count * each)
+            best = FitPlan(size.max_pixels, gaussians, count, count * each, after)
             before = each
-            if size.max_pixels == largest and pixels > largest:
+            if pixels >= largest:
                 break
     assert best is not None
     return best
 
 
-def _seconds_a_step(dataset: Dataset, config: FitConfig, warm: bool) -> float:
+def _seconds_a_step(train: list[View], dataset: Dataset, config: FitConfig, is_first: bool) -> float:
     """Seconds that a step takes on average, with as many Gaussians as there are on average.
 
     Args:
+        train: Training views.
         dataset: The data set.
         config: Configuration with the sizes.
-        warm: Whether to take all renderers' first steps, which compile, beforehand.
+        is_first: Whether to take all renderers' first steps, which compile, beforehand.
     """
-    train, _ = dataset.split()
     views = train[:: max(1, len(train) // _TIMED_VIEWS)]
     with quietly(), fewer_torch_threads():
         frames = frames_for(views, config.data)
         timed = config.replace(data=dataclasses.replace(config.data, skybox="off", exposure="off", poses="fixed"))
         trainer, *_ = start(_filled(dataset, config), views, frames, timed, None, None, False, 0)
-        cycle = len(trainer.renderers.all_settings) + 7
-        for _ in range(cycle if warm else 0):
+        # As late in a fit, where all degrees of color are there.
+        while trainer.rows.sh_degree < config.sh_degree:
+            trainer.rows.raise_sh_degree()
+        for _ in range(_TIMED if is_first else 0):
             trainer.step()
         began = time.perf_counter()
-        for _ in range(cycle):
+        for _ in range(_TIMED):
             trainer.step()
-        return (time.perf_counter() - began) / cycle
+        return (time.perf_counter() - began) / _TIMED
 
 
 def _filled(dataset: Dataset, config: FitConfig) -> Dataset:

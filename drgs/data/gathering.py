@@ -141,7 +141,9 @@ def _picked(videos: Sequence[Path], most: int, tell: Callable[[str, int, int], N
     """Frames of each video; of several, as many of each as its share of those that are wanted."""
     found = []
     for video in videos:
-        found.append(pick_frames(video, most, lambda done, total, video=video: tell(f"frames of {video.name}", done, total)))
+        found.append(
+            pick_frames(video, most, lambda done, total, video=video: tell(f"frames of {video.name}", done, total))
+        )
     wanted = sum(min(one.wanted, most) for one in found)
     if len(found) < 2 or wanted <= most:
         return found

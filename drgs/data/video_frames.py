@@ -264,7 +264,12 @@ def _findings(
     )
     is_blank = np.array([look.corners < 2 * _FEWEST_TRACKS for look in looks])
     is_fast = (np.nan_to_num(motion, nan=1.0) > _FAST) & ~is_blank
-    add(is_fast, "fast", "the camera moves too fast, pictures that follow each other share little", "film more slowly there")
+    add(
+        is_fast,
+        "fast",
+        "the camera moves too fast, pictures that follow each other share little",
+        "film more slowly there",
+    )
     add(sharpness < _BLURRED, "blur", "blurred", "hold still or get more light there")
     add(
         is_blank,
@@ -275,7 +280,9 @@ def _findings(
     far = [frame for frame in frames[1:] if frame.motion > _LONGEST_STEP]
     if len(far) > 0.1 * len(frames):
         text = f"{path.name}: {len(far)} of {len(frames)} frames share little with the one before"
-        found.append((times[-1], Finding("overlap", text, f"ask for more frames (--frames {asked}), or film more slowly")))
+        found.append(
+            (times[-1], Finding("overlap", text, f"ask for more frames (--frames {asked}), or film more slowly"))
+        )
     return [finding for _, finding in sorted(found, key=lambda pair: -pair[0])]
 
 

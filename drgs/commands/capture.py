@@ -1,0 +1,332 @@
+"""`drgs capture`: from photographs or videos to a run, its report and one file to send, in steps that can be resumed.
+
+    photos   links to the photographs and frames of the videos, in one folder
+    poses    cameras and points, by structure from motion
+    fit      Gaussians
+    report   what came out, and what to do at the next shoot
+    share    one file to send
+
+Each step is recorded in RUN/capture/capture.json once it is done; --resume begins with the first that is not.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import shlex
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from drgs import data
+from drgs.capturing import diagnosis
+from drgs.capturing.pace import Pacer
+from drgs.capturing.plan import FitPlan, duration, plan_fit, plan_poses, planned_poses, seconds_of_budget
+from drgs.capturing.record import FOLDER, CaptureRecord, Step, inputs_of
+from drgs.commands.report import report_of
+from drgs.data.checks import list_images
+from drgs.data.gathering import gather, named_files
+from drgs.data.sfm import run_sfm
+from drgs.display.progress import Bar
+from drgs.files import Run, state_header
+from drgs.fitting.config import FitConfig, recorded_config
+from drgs.fitting.frames import load_dataset
+from drgs.fitting.records import fit_record, is_run
+from drgs.fitting.resume import claim_run
+from drgs.guards import interrupts
+from drgs.guards.outputs import claim
+from drgs.report.write import FILE
+from drgs.train import fit
+
+if TYPE_CHECKING:
+    from drgs.commands.making_options import Capture
+    from drgs.data import Dataset
+    from drgs.data.sfm import SfmSummary
+    from drgs.data.shooting import Finding
+
+__all__ = ["run"]
+
+_PHOTOS, _SCENE = "photos", "scene"
+_FEWEST = 3  # photographs that a scene needs; two may have poses, but nothing is left to be held out
+
+
+def run(args: Capture) -> None:
+    """`drgs capture PATH... -o RUN`."""
+    if not args.paths:
+        raise ValueError(
+            "there must be photographs, videos or a data set, got none; name them, e.g. drgs capture photos -o RUN"
+        )
+    budget = None if args.budget is None else seconds_of_budget(args.budget)
+    given = _dataset_of(args.paths)
+    photographs, videos = ([], []) if given else named_files(args.paths)
+    if not given and not videos and len(photographs) < _FEWEST:
+        raise ValueError(
+            f"{args.paths[0]}: must be at least {_FEWEST} photographs, got {len(photographs)}; take thirty to eighty, "
+            "each overlapping the one before by two thirds"
+        )
+    clock = _Clock(budget)
+    with (
+        claim_run(Run(args.output), "capture", True, args.paths),
+        claim(args.output / FOLDER, "capture", inputs=args.paths),
+        _kept(args),
+    ):
+        inputs = inputs_of([*photographs, *videos] or [given.path for given in [given] if given])
+        record = _record(args, inputs, given is not None)
+        _Capture(args, clock, record, given).run(photographs, videos)
+
+
+def _dataset_of(paths: tuple[Path, ...]) -> Dataset | None:
+    """The data set, with poses, that a single path names; None where it names photographs or videos."""
+    if len(paths) != 1 or not paths[0].exists() or (paths[0].is_file() and paths[0].suffix not in (".json", ".npy")):
+        return None
+    try:
+        return data.load(paths[0], lazy=True, points=False, semantics=False)
+    except FileNotFoundError:
+        return None
+
+
+def _record(args: Capture, inputs: list, is_dataset: bool) -> CaptureRecord:
+    """The record to go on with.
+
+    Raises:
+        ValueError: If there is one and --resume is not given, or its files or options were others.
+    """
+    folder = args.output / FOLDER
+    options = {"frames": args.frames, "masks": args.masks, "seed": args.seed}
+    before = CaptureRecord.read(folder)
+    if before is None:
+        if is_run(args.output):
+            raise ValueError(
+                f"{args.output}: must be a new folder or that of a capture, holds a run of `drgs fit`; choose another (-o)"
+            )
+        record = CaptureRecord(folder, inputs, options)
+        record.write()
+        return record
+    if not args.resume:
+        raise ValueError(
+            f"{args.output}: must be a new folder, holds a capture already; add --resume or choose another"
+        )
+    if other := next((name for name, value in options.items() if before.options.get(name) != value), None):
+        raise ValueError(
+            f"{args.output}: --resume must continue the same capture, --{other} was {before.options.get(other)!r} and is "
+            f"{options[other]!r}; repeat the options or choose another folder"
+        )
+    if before.inputs != inputs:
+        changed = next(
+            (row[0] for row in [*before.inputs, *inputs] if row not in before.inputs or row not in inputs), ""
+        )
+        kind = "the data set" if is_dataset else "the photographs"
+        raise ValueError(
+            f"{args.output}: --resume must continue the same capture, {kind} changed: {changed}; name the same files or "
+            "choose another folder"
+        )
+    return before
+
+
+@contextlib.contextmanager
+def _kept(args: Capture) -> Iterator[None]:
+    """An interruption says how to go on."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        text = f"{error}; " if str(error) else ""
+        raise interrupts.interruption(f"{text}the steps that are done are kept, --resume goes on") from None
+
+
+class _Clock:
+    """Time of a capture.
+
+    Attributes:
+        began: When it began, as `time.monotonic` counts.
+        end: When it is to be done; None without a budget.
+    """
+
+    def __init__(self, budget: float | None) -> None:
+        self.began = time.monotonic()
+        self.budget = budget
+        self.end = None if budget is None else self.began + budget
+
+    @property
+    def left(self) -> float:
+        """Seconds that are left; infinite without a budget."""
+        return float("inf") if self.end is None else self.end - time.monotonic()
+
+
+class _Capture:
+    """The steps of one capture."""
+
+    def __init__(self, args: Capture, clock: _Clock, record: CaptureRecord, given: Dataset | None) -> None:
+        self.args = args
+        self.clock = clock
+        self.record = record
+        self.given = given
+        self.run_folder = Run(args.output)
+        self.folder = args.output / FOLDER
+        self._summary: SfmSummary | None = None
+
+    def run(self, photographs: list[Path], videos: list[Path]) -> None:
+        """All steps that are not done yet."""
+        with Bar("capture", show=not self.args.quiet, lines_only=True):
+            if self.given is None:
+                self._step("photos", lambda: self._photos(photographs, videos))
+                self._step("poses", self._poses)
+            else:
+                self._step("poses", self._given)
+            self._step("fit", self._fit)
+            self._step("report", self._report)
+            self._finish()
+
+    # ------------------------------------------------------------------------------------------ steps
+
+    def _step(self, name: str, work: Callable[[], tuple[str, list[Finding]]]) -> None:
+        """One step, unless it is done; its outcome is told and recorded."""
+        before = self.record.step(name)
+        if before is not None:
+            self._say(f"{name}: {before.line} (done before)")
+            return
+        began = time.monotonic()
+        line, findings = work()
+        seconds = time.monotonic() - began
+        self.record.done(Step(name, line, seconds), findings)
+        self._say(f"{name}: {line} ({duration(seconds)})")
+
+    def _photos(self, photographs: list[Path], videos: list[Path]) -> tuple[str, list[Finding]]:
+        """All pictures in one folder."""
+        with claim(self.folder, "capture") as held, Bar("photos") as bar:
+            if (self.folder / _PHOTOS).exists():
+                held.remove(self.folder / _PHOTOS)  # of a command that ended before it could say so
+            gathered = gather(photographs, videos, held, _PHOTOS, self.args.frames, bar.stage)
+        names = [path.name for path in list_images(gathered.folder)]
+        if len(names) < _FEWEST:
+            raise ValueError(
+                f"{self.args.paths[0]}: there must be at least {_FEWEST} pictures, got {len(names)}; film or photograph "
+                "more, and move while you do"
+            )
+        return gathered.line(), [*gathered.findings, *diagnosis.of_photographs(gathered.folder, names)]
+
+    def _poses(self) -> tuple[str, list[Finding]]:
+        """Structure from motion."""
+        photos = self.folder / _PHOTOS
+        names = [path.name for path in list_images(photos)]
+        size = {}
+        if self.clock.budget is not None:
+            plan = plan_poses(photos, names, self.clock.budget)
+            self.record.plan["poses"] = dataclasses.asdict(plan)
+            size = {"max_image_size": plan.max_image_size}
+            self._say(f"plan for {duration(self.clock.budget)}: {planned_poses(plan, len(names), self.clock.left)}")
+        try:
+            with Bar("poses") as bar:
+                summary = run_sfm(
+                    photos,
+                    self.folder / _SCENE,
+                    bar.stage,
+                    seed=self.args.seed,
+                    masks=self.args.masks,
+                    doing=lambda text: bar.update(bar.done, text=text),
+                    **size,
+                )
+        except ValueError as error:
+            self._say_findings(self.record.findings)
+            first = (
+                self.record.findings[0].line() if self.record.findings else "each should show much of the one before"
+            )
+            raise ValueError(
+                f"poses: {error}; {first}; the photographs are kept: --resume goes on"
+                if self.record.findings
+                else f"{error}"
+            ) from None
+        line = (
+            f"{summary.registered} of {summary.total} photographs have a pose, {summary.points} points, "
+            f"{summary.reprojection_error:.2f} px"
+        )
+        with Bar("what poses say"):
+            dataset = data.load(self.folder / _SCENE, semantics=False)
+            findings = diagnosis.of_poses(dataset, names, summary) + diagnosis.of_exposure(dataset, self.args.seed)
+        return line, findings
+
+    def _given(self) -> tuple[str, list[Finding]]:
+        """What is to be said of a data set that has poses."""
+        assert self.given is not None
+        dataset = self._dataset(FitConfig())
+        views = len(dataset.views)
+        findings = []
+        if not dataset.is_dynamic:
+            names = [view.name for view in dataset.views]
+            findings = diagnosis.of_poses(dataset, names) + diagnosis.of_exposure(dataset, self.args.seed)
+        return f"{views} photographs with their poses, as the data set has them", findings
+
+    def _fit(self) -> tuple[str, list[Finding]]:
+        """Gaussians."""
+        config = FitConfig.of(seed=self.args.seed, exposure="auto")
+        resume = is_run(self.args.output)
+        if resume:
+            config = _config_of(self.run_folder)
+        dataset = self._dataset(config)
+        pace = None
+        if self.clock.end is not None and not dataset.is_dynamic:
+            if not resume:
+                plan = plan_fit(dataset, config, self.clock.left)
+                config = plan.config(config)
+                self.record.plan["fit"] = dataclasses.asdict(plan)
+                self.record.write()
+                self._say(
+                    f"plan for the {duration(self.clock.left)} left: {plan.line()}, and {duration(plan.after)} for what follows"
+                )
+            else:
+                plan = FitPlan(**self.record.plan["fit"]) if "fit" in self.record.plan else None
+            after = plan.after if plan else 0.1 * self.clock.left
+            pace = Pacer(self.clock.end - after, config.max_steps)
+        result = fit(dataset, self.args.output, config, resume=resume, pace=pace)
+        mean = result.metrics["mean"]
+        quality = f", held-out PSNR {mean['psnr']:.2f} dB" if result.metrics["views"] and mean.get("psnr") else ""
+        steps = result.metrics["step"]
+        line = f"{len(result.gaussians)} Gaussians after {steps} steps{quality}"
+        record = fit_record(result.run)
+        psnr = {row["name"]: row["psnr"] for row in result.metrics["views"] if row.get("psnr") is not None}
+        return line, diagnosis.of_views(dataset, record.train, psnr if result.metrics["split"] == "test" else {})
+
+    def _report(self) -> tuple[str, list[Finding]]:
+        """The page of the run."""
+        record = fit_record(self.run_folder)
+        dataset = record.with_refined_poses(
+            load_dataset(record.data, record.config, lazy=True, points=False, semantics=False)
+        )
+        page = self.run_folder.path / FILE
+        claim_run(self.run_folder, "report").check([FILE])
+        report_of(self.run_folder, page, dataset)
+        return str(page), []
+
+    def _finish(self) -> None:
+        """What to know at the next shoot, and what to do now."""
+        self._say_findings(self.record.findings)
+        run = shlex.quote(str(self.args.output))
+        used = time.monotonic() - self.clock.began
+        of = "" if self.clock.budget is None else f" of {duration(self.clock.budget)}"
+        self._say(
+            f"done in {duration(used)}{of}; next: drgs view {run}, or what to photograph next: drgs capture --more -o {run}"
+        )
+
+    # ---------------------------------------------------------------------------------------- helpers
+
+    def _dataset(self, config: FitConfig) -> Dataset:
+        """The data set to fit to."""
+        place = self.folder / _SCENE if self.given is None else self.given.path
+        return load_dataset(place, config)
+
+    def _say(self, text: str) -> None:
+        if not self.args.quiet:
+            print(text, flush=True)
+
+    def _say_findings(self, findings: list[Finding]) -> None:
+        """What is wrong with the capture, one line each."""
+        for finding in findings:
+            self._say(f"at the next shoot: {finding.line()}")
+
+
+def _config_of(run: Run) -> FitConfig:
+    """The configuration that a fit goes on with: of its checkpoint, whose number of steps config.json may not have yet."""
+    config = fit_record(run).config
+    if not run.state.is_file():
+        return config
+    return config.replace(max_steps=recorded_config(state_header(run.state)["config"]).max_steps)
