@@ -89,9 +89,8 @@ def _relative(values: Sequence[float]) -> list[float]:
     for index, value in enumerate(values):
         first = max(0, index - _NEIGHBORS)
         near = [x for other, x in enumerate(values[first : index + _NEIGHBORS + 1], first) if other != index]
-        found.append(
-            value / max(float(np.median(near)), 1e-12) if near else 1.0
-        )  # a blank neighbor has a sharpness of 0
+        usual = max(float(np.median(near)), 1e-12) if near else value  # a blank neighbor has a sharpness of 0
+        found.append(value / usual if usual else 1.0)
     return found
 
 
@@ -157,9 +156,7 @@ def of_poses(dataset: Dataset, names: Sequence[str], summary: SfmSummary | None 
     if wide:
         shown = ", ".join(f"{a} and {b} ({angle:.0f} degrees apart)" for angle, a, b in wide)
         found.append(
-            Finding(
-                "overlap", f"too little overlap between {shown}", "take two or three photographs on the way between"
-            )
+            Finding("overlap", f"too little overlap between {shown}", "take two or three photographs in between")
         )
     return found
 

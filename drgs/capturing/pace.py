@@ -19,9 +19,9 @@ _MOST = 1.5  # times the planned steps, however fast they turn out to be
 class Pacer:
     """How many steps a fit is to have so that the last one is done in time; what `drgs.train.fit` takes as `pace`.
 
-    While Gaussians still grow in number, later steps take longer than those seen so far: steps are only taken away then,
-    where even these are too slow. After that their number follows the clock in both directions, up to 1.5 times what was
-    planned. Schedules of a fit go by the share of its steps that is done, so that they always end where they should.
+    While Gaussians still grow in number, later steps take longer than those seen so far: steps are only taken away
+    then, where even these are too slow. After that their number follows the clock in both directions, up to 1.5 times
+    what was planned. Schedules of a fit go by the share of its steps that is done, so that they end where they should.
 
     Args:
         end: When the last step is to be done, as `clock` counts.

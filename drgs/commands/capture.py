@@ -24,6 +24,7 @@ from drgs.capturing import diagnosis
 from drgs.capturing.pace import Pacer
 from drgs.capturing.plan import FitPlan, duration, plan_fit, plan_poses, planned_poses, seconds_of_budget
 from drgs.capturing.record import FOLDER, CaptureRecord, Step, inputs_of
+from drgs.commands.next_views import rank_next
 from drgs.commands.report import report_of
 from drgs.data.checks import list_images
 from drgs.data.gathering import gather, named_files
@@ -52,7 +53,10 @@ _FEWEST = 3  # photographs that a scene needs; two may have poses, but nothing i
 
 
 def run(args: Capture) -> None:
-    """`drgs capture PATH... -o RUN`."""
+    """`drgs capture PATH... -o RUN`, and `drgs capture --more -o RUN`."""
+    if args.more:
+        _tell_next(args)
+        return
     if not args.paths:
         raise ValueError(
             "there must be photographs, videos or a data set, got none; name them, e.g. drgs capture photos -o RUN"
@@ -74,6 +78,28 @@ def run(args: Capture) -> None:
         inputs = inputs_of([*photographs, *videos] or [given.path for given in [given] if given])
         record = _record(args, inputs, given is not None)
         _Capture(args, clock, record, given).run(photographs, videos)
+
+
+def _tell_next(args: Capture) -> None:
+    """Which photographs to take next."""
+    if args.paths:
+        raise ValueError(f"--more must have no photographs, got {args.paths[0]}; drop one or the other")
+    if args.k < 1:
+        raise ValueError(f"-k must be at least 1, got {args.k}; ask for some")
+    picks = rank_next(args.output, args.k, args.length, not args.quiet)
+    if args.quiet:
+        return
+    if args.length is None:
+        print("lengths are told in shares of the way from a photograph to what it shows; --length tells them in meters")
+    for pick in picks:
+        worth = "" if pick["gain"] is None else f" (tells as much as {_counted(pick['gain'])})"
+        print(f"{pick['rank']}. {pick['text']}{worth}")
+    print(f"arrows on the map: drgs report {shlex.quote(str(args.output))}; in the browser: drgs view")
+
+
+def _counted(gain: float) -> str:
+    """How many photographs something is worth."""
+    return "one of your photographs" if gain < 1.5 else f"{gain:.0f} of your photographs"
 
 
 def _dataset_of(paths: tuple[Path, ...]) -> Dataset | None:
@@ -98,7 +124,7 @@ def _record(args: Capture, inputs: list, is_dataset: bool) -> CaptureRecord:
     if before is None:
         if is_run(args.output):
             raise ValueError(
-                f"{args.output}: must be a new folder or that of a capture, holds a run of `drgs fit`; choose another (-o)"
+                f"{args.output}: must be a new folder, or that of a capture, holds a run of `drgs fit`; choose another"
             )
         record = CaptureRecord(folder, inputs, options)
         record.write()
@@ -109,17 +135,16 @@ def _record(args: Capture, inputs: list, is_dataset: bool) -> CaptureRecord:
         )
     if other := next((name for name, value in options.items() if before.options.get(name) != value), None):
         raise ValueError(
-            f"{args.output}: --resume must continue the same capture, --{other} was {before.options.get(other)!r} and is "
-            f"{options[other]!r}; repeat the options or choose another folder"
+            f"{args.output}: --resume must continue the same capture, --{other} was {before.options.get(other)!r} and "
+            f"is {options[other]!r}; repeat the options or choose another folder"
         )
     if before.inputs != inputs:
-        changed = next(
-            (row[0] for row in [*before.inputs, *inputs] if row not in before.inputs or row not in inputs), ""
-        )
+        rows = [*before.inputs, *inputs]
+        changed = next((row[0] for row in rows if row not in before.inputs or row not in inputs), "their order")
         kind = "the data set" if is_dataset else "the photographs"
         raise ValueError(
-            f"{args.output}: --resume must continue the same capture, {kind} changed: {changed}; name the same files or "
-            "choose another folder"
+            f"{args.output}: --resume must continue the same capture, {kind} changed: {changed}; name the same files "
+            "or choose another folder"
         )
     return before
 
@@ -200,8 +225,8 @@ class _Capture:
         names = [path.name for path in list_images(gathered.folder)]
         if len(names) < _FEWEST:
             raise ValueError(
-                f"{self.args.paths[0]}: there must be at least {_FEWEST} pictures, got {len(names)}; film or photograph "
-                "more, and move while you do"
+                f"{self.args.paths[0]}: there must be at least {_FEWEST} pictures, got {len(names)}; film or "
+                "photograph more, and move while you do"
             )
         return gathered.line(), [*gathered.findings, *diagnosis.of_photographs(gathered.folder, names)]
 
@@ -227,15 +252,8 @@ class _Capture:
                     **size,
                 )
         except ValueError as error:
-            self._say_findings(self.record.findings)
-            first = (
-                self.record.findings[0].line() if self.record.findings else "each should show much of the one before"
-            )
-            raise ValueError(
-                f"poses: {error}; {first}; the photographs are kept: --resume goes on"
-                if self.record.findings
-                else f"{error}"
-            ) from None
+            found = "".join(f"; {finding.line()}" for finding in self.record.findings)
+            raise ValueError(f"poses: {error}{found}") from None
         line = (
             f"{summary.registered} of {summary.total} photographs have a pose, {summary.points} points, "
             f"{summary.reprojection_error:.2f} px"
@@ -270,13 +288,12 @@ class _Capture:
                 config = plan.config(config)
                 self.record.plan["fit"] = dataclasses.asdict(plan)
                 self.record.write()
-                self._say(
-                    f"plan for the {duration(self.clock.left)} left: {plan.line()}, and {duration(plan.after)} for what follows"
-                )
+                after = f"{duration(plan.after)} for what follows"
+                self._say(f"plan for the {duration(self.clock.left)} left: {plan.line()}, and {after}")
             else:
                 plan = FitPlan(**self.record.plan["fit"]) if "fit" in self.record.plan else None
-            after = plan.after if plan else 0.1 * self.clock.left
-            pace = Pacer(self.clock.end - after, config.max_steps)
+            rest = plan.after if plan else 0.1 * self.clock.left
+            pace = Pacer(self.clock.end - rest, config.max_steps)
         result = fit(dataset, self.args.output, config, resume=resume, pace=pace)
         mean = result.metrics["mean"]
         quality = f", held-out PSNR {mean['psnr']:.2f} dB" if result.metrics["views"] and mean.get("psnr") else ""
@@ -303,9 +320,8 @@ class _Capture:
         run = shlex.quote(str(self.args.output))
         used = time.monotonic() - self.clock.began
         of = "" if self.clock.budget is None else f" of {duration(self.clock.budget)}"
-        self._say(
-            f"done in {duration(used)}{of}; next: drgs view {run}, or what to photograph next: drgs capture --more -o {run}"
-        )
+        self._say(f"done in {duration(used)}{of}")
+        self._say(f"next: drgs view {run}; which photographs to take next: drgs capture --more -o {run}")
 
     # ---------------------------------------------------------------------------------------- helpers
 
@@ -325,7 +341,7 @@ class _Capture:
 
 
 def _config_of(run: Run) -> FitConfig:
-    """The configuration that a fit goes on with: of its checkpoint, whose number of steps config.json may not have yet."""
+    """The configuration that a fit goes on with; of its steps the checkpoint knows, not yet config.json maybe."""
     config = fit_record(run).config
     if not run.state.is_file():
         return config

@@ -38,8 +38,8 @@ class Sfm(Common):
 class Capture(Common):
     """Make a run of photographs or videos in one go: frames, poses, fit, report; each step can be resumed."""
 
-    paths: Annotated[Positional[tuple[Path, ...]], arg(metavar="PATH")]
-    """Photographs, videos, folders of both, or one data set that has poses."""
+    paths: Annotated[Positional[tuple[Path, ...]], arg(metavar="PATH")] = ()
+    """Photographs, videos, folders of both, or one data set that has poses; none with --more."""
     output: OutputPath
     """The run folder; photographs and poses are in its folder capture."""
     budget: str | None = None
@@ -48,10 +48,14 @@ class Capture(Common):
     """At most this many frames of all videos together."""
     masks: str | None = None
     """Masks of an object that was turned or moved: a folder (NAME.png, white is kept), or alpha, the photos' own."""
-    config: Path | None = None
-    """A TOML or JSON file of the configuration of the fit, or a run (docs/configuration.md)."""
     resume: bool = False
     """Go on where an earlier command was stopped; name the same files and options."""
+    more: bool = False
+    """Say which photographs to take next: where to stand, where to look, and what that is worth."""
+    k: Annotated[int, arg(aliases=["-k"])] = 5
+    """How many of these."""
+    length: str | None = None
+    """A distance you know, 'IMG_0001 IMG_0004 1.5 m': places are then told in meters."""
     seed: int = 0
     """Seed of everything random."""
 

@@ -16,9 +16,22 @@ from drgs.guards.json_files import check_json, read_json
 if TYPE_CHECKING:
     from drgs.data import View
 
-__all__ = ["Ranking", "Score", "Sight", "PlacedView", "read_ranking", "scale_colors", "score_colors", "placed_views_of"]
+__all__ = [
+    "NEXT",
+    "Ranking",
+    "Score",
+    "Sight",
+    "PlacedView",
+    "read_ranking",
+    "scale_colors",
+    "score_colors",
+    "placed_views_of",
+]
 
 Kind = Literal["training", "held out", "candidate"]
+
+NEXT = "next.json"
+"""File of a run with the places of the next photographs, as `drgs capture --more` writes it."""
 
 _ADVICE = "name what drgs select or an active fit has written"
 _SCORED = {"name": str, "score": (None, float), "parts": (None, dict)}
@@ -144,7 +157,7 @@ def placed_views_of(views: Sequence[View], fitted: Iterable[str], ranking: Ranki
 
 
 def read_ranking(path: Path) -> Ranking:
-    """What `drgs select` has written, or an active fit so far: its last pick and those before.
+    """What `drgs select` or `drgs capture --more` has written, or an active fit so far: its last pick and those before.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -153,7 +166,7 @@ def read_ranking(path: Path) -> Ranking:
     found = read_json(path, "a selection", _ADVICE)
     where = str(path)
     check_json(where, found, {"picks": [{"name": str}]}, _ADVICE)
-    if found.get("command") == "select":
+    if found.get("command") in ("select", "capture"):
         check_json(where, found, {"policy": str, "criterion": (None, str), "candidates": [_SCORED]}, _ADVICE)
         rows = found["candidates"]
         criterion = found["criterion"]
