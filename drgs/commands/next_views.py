@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from drgs.capturing.places import Place, meters_of, places_around
 from drgs.commands.orbits import seen_distance
@@ -21,6 +22,7 @@ from drgs.fitting.records import fitted_views
 from drgs.guards.outputs import claim
 from drgs.information.cache import Cache
 from drgs.information.scoring import Scoring
+from drgs.integrator import render
 from drgs.select import select
 from drgs.sizes import at_most
 from drgs.viewing.placed_views import NEXT
@@ -29,12 +31,15 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.data import View
     from drgs.ellipsoids import Gaussians
+    from drgs.settings import RenderSettings
 
 __all__ = ["rank_next"]
 
 _PIXELS = 20_000  # of views whose information is compared
 _SOLID = 0.3  # opacity of Gaussians that one does not walk through
 _MOST_SOLID = 20_000
+_EMPTY = 0.1  # of a picture, that may show nothing; more where photographs do
+_LOOK = 2_500  # pixels of a picture that says how much shows nothing
 _MOST_PHOTOGRAPHS = 8  # of those there are, that the gain is compared with
 _SPREAD = 3.0  # times the median distance of cameras and what they see: floaters are beyond
 
@@ -69,9 +74,13 @@ def rank_next(run: Path, k: int, length: str | None, show: bool = True) -> list[
         up = upright(list(cameras.values()))
         obstacles = _solid(given.gaussians, train)
         places = places_around(list(cameras.values()), up, seen_distance(given.gaussians), obstacles)
+        settings = given.settings("fast")
+        # What looks past the scene would tell most, of what nobody wants to see.
+        most = max(_EMPTY, *(_empty_share(given.gaussians, camera, settings) for camera in train))
+        places = [place for place in places if _empty_share(given.gaussians, place.camera, settings) <= most]
         if not places:
             raise ValueError(f"{run}: there must be a place to stand at, found none that is free; use drgs select")
-        scoring = Scoring(settings=given.settings("fast"), semantics=given.semantics()).over(given.estimated)
+        scoring = Scoring(settings=settings, semantics=given.semantics()).over(given.estimated)
         cache = Cache()
         told = len(train) + len(places)
         bar.update(0, told)
@@ -127,6 +136,13 @@ def _camera(view: View, given: SceneInput) -> Camera:
     assert given.record is not None
     pixels = min(_PIXELS, given.record.config.data.max_pixels)
     return at_most(dataclasses.replace(view.camera.undistorted(), name=view.name), pixels)
+
+
+def _empty_share(gaussians: Gaussians, camera: Camera, settings: RenderSettings) -> float:
+    """Share of a picture in which nothing is seen."""
+    with torch.no_grad():  # looked at only
+        alpha = render(gaussians, at_most(camera, _LOOK), settings, outputs=()).alpha
+    return float((alpha.cpu() < 0.5).float().mean())
 
 
 def _solid(gaussians: Gaussians, cameras: list[Camera]) -> np.ndarray:
