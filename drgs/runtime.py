@@ -46,6 +46,7 @@ __all__ = [
     "optix_status",
     "prepare",
     "setup",
+    "thread_count",
     "uncompiled",
     "version",
 ]
@@ -304,6 +305,13 @@ def setup(variant: str | None = None, threads: int | None = None) -> Backend:
         threads=dr.thread_count(),
     )
     return _active
+
+
+def thread_count() -> int:
+    """Threads that other libraries should take: those of the backend if there is one, else DRGS_THREADS, else every core
+    that this process may use.
+    """
+    return _active.threads if _active else _wanted_threads(None) or _usable_cores()
 
 
 def backend() -> Backend:

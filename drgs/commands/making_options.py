@@ -16,18 +16,20 @@ __all__ = ["Capture", "Demo", "Reproduce", "Scene", "Sfm", "Teach"]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Sfm(Common):
-    """Recover cameras and points from plain photographs (COLMAP on the CPU)."""
+    """Recover cameras and points from plain photographs or videos (COLMAP on the CPU)."""
 
-    images: Positional[Path]
-    """A folder of photographs."""
+    paths: Annotated[Positional[tuple[Path, ...]], arg(metavar="PATH")]
+    """A folder of photographs; a video, whose sharp frames with parallax are taken; or several of both."""
     output: OutputPath
     """Folder for the data set."""
+    frames: int = 150
+    """At most this many frames of all videos together."""
     camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"] = (
         "SIMPLE_RADIAL"
     )
     """COLMAP's name of the lens; photographs of one size share one camera."""
-    matcher: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Match all pairs, or neighbors by name (video); auto decides by their number."""
+    matcher: Literal["auto", "exhaustive", "sequential", "retrieval"] = "auto"
+    """Match all pairs, neighbors by name (video), or those and the nearest by appearance; auto: all of up to 60."""
     masks: str | None = None
     """Masks of an object that was turned or moved: a folder (NAME.png, white is kept), or alpha, the photos' own."""
     seed: int = 0

@@ -1,4 +1,4 @@
-"""`drgs sfm`: photographs to a data set that `drgs fit` reads."""
+"""`drgs sfm`: photographs and videos to a data set that `drgs fit` reads."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ __all__ = ["run"]
 
 
 def run(args: Sfm) -> None:
-    """`drgs sfm IMAGES -o OUT`."""
+    """`drgs sfm PATH... -o OUT`."""
     with Bar("features", show=not args.quiet) as bar:
         summary = run_sfm(
-            args.images,
+            args.paths,
             args.output,
             bar.stage,
             camera_model=args.camera_model,
@@ -26,14 +26,19 @@ def run(args: Sfm) -> None:
             seed=args.seed,
             masks=args.masks,
             doing=lambda text: bar.update(bar.done, text=text),
+            frames=args.frames,
         )
     if args.quiet:
         return
+    if summary.frames:
+        print(f"{summary.frames} of the photos are frames of videos; images/frames.json has their times")
     stages = ", ".join(f"{stage} {seconds:.1f} s" for stage, seconds in summary.seconds.items())
     print(
         f"{summary.registered} of {summary.total} photos have a pose, {summary.points} points, "
         f"mean reprojection error {summary.reprojection_error:.2f} px ({stages})"
     )
-    for line in summary.explanation:
+    for line in (*([summary.left_out] if summary.left_out else []), *summary.explanation):
         print(line)
+    for finding in summary.findings:
+        print(f"at the next shoot: {finding.line()}")
     print(f"next: drgs fit {shlex.quote(str(args.output))} -o RUN")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -21,12 +22,14 @@ from drgs.guards.foreign import refuse_foreign
 from drgs.guards.outputs import Claim
 from drgs.guards.unfinished import temporary_folder
 
-__all__ = ["FRAMES", "Gathered", "gather", "named_files"]
+__all__ = ["FRAMES", "Gathered", "fill", "gather", "named_files"]
 
 FRAMES = "frames.json"
 """Beside the pictures: which of them are of which video, and of which moment."""
 _QUALITY = 97  # of JPEG: what a video's own compression has left is kept
 _SUFFIXES = (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES)
+
+_log = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +71,7 @@ def named_files(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
                     f"{path}: must hold photographs or videos, holds none ({', '.join(_SUFFIXES)}); check the path"
                 )
             photographs += found[0]
-            videos += found[1]
+            videos += [video for video in found[1] if not _is_moment(video, found[0])]
         elif not path.exists():
             raise FileNotFoundError(f"{path}: must be photographs or a video, found none; check the path")
         elif path.suffix.lower() in IMAGE_SUFFIXES:
@@ -82,6 +85,14 @@ def named_files(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
                 "convert it, or leave it out"
             )
     return photographs, videos
+
+
+def _is_moment(video: Path, photographs: Sequence[Path]) -> bool:
+    """Whether a video is the seconds around a photograph, which phones keep beside it under its name."""
+    is_one = any(photograph.stem == video.stem for photograph in photographs)
+    if is_one:
+        _log.info("%s: left out, it is of the moment of a photograph of that name; name it to use it", video)
+    return is_one
 
 
 def gather(
@@ -106,35 +117,55 @@ def gather(
     Raises:
         FileNotFoundError, ValueError: A video that cannot be decoded.
     """
-    tell = progress or (lambda stage, done, total: None)
-    picked = _picked(videos, most, tell)
-    rows = list[dict[str, Any]]()
     with temporary_folder("photos", claimed.path) as unfinished:
         made = unfinished / name
-        made.mkdir()
-        for path in photographs:
-            target = made / _free_name(made, path)
-            try:
-                target.symlink_to(path.resolve())
-            except OSError:  # a file system without links
-                shutil.copyfile(path, target)
-        total = sum(len(one.frames) for one in picked)
-        for video, one in zip(videos, picked, strict=True):
-            for frame in one.frames:
-                tell("frames", len(rows), total)
-                file = _free_name(made, Path(video.parent.name) / f"{video.stem}_{frame.frame.index:06d}.jpg")
-                pixels = np.ascontiguousarray(frame.frame.read()[..., ::-1])
-                data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
-                (made / file).write_bytes(data.tobytes())
-                row = {"file": file, "video": str(video), "index": frame.frame.index, "seconds": frame.seconds}
-                rows.append({**row, **{key: getattr(frame, key) for key in ("sharpness", "motion", "parallax")}})
-        findings = tuple(finding for one in picked for finding in one.findings)
-        if rows:
-            listed = {"schema": SCHEMA, "command": claimed.command, "frames": rows}
-            listed["findings"] = [dataclasses.asdict(finding) for finding in findings]
-            (made / FRAMES).write_text(json.dumps(listed, indent=1) + "\n")
+        gathered = fill(made, photographs, videos, claimed.command, most, progress)
         claimed.put(made, name)
-    return Gathered(claimed.path / name, len(photographs), len(rows), findings)
+    return dataclasses.replace(gathered, folder=claimed.path / name)
+
+
+def fill(
+    folder: Path,
+    photographs: Sequence[Path],
+    videos: Sequence[Path],
+    command: str,
+    most: int = 150,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Gathered:
+    """Make the folder that `gather` puts in its place.
+
+    Args:
+        folder: The new folder; there must be none.
+        photographs, videos, most, progress: The arguments of `gather`.
+        command: Name of the command, for frames.json.
+    """
+    tell = progress or (lambda stage, done, total: None)
+    picked = _picked(videos, most, tell)
+    folder.mkdir()
+    for path in photographs:
+        target = folder / _free_name(folder, path)
+        try:
+            target.symlink_to(path.resolve())
+        except OSError:  # a file system without links
+            shutil.copyfile(path, target)
+    rows = list[dict[str, Any]]()
+    total = sum(len(one.frames) for one in picked)
+    for video, one in zip(videos, picked, strict=True):
+        for frame in one.frames:
+            tell("frames", len(rows), total)
+            file = _free_name(folder, Path(video.parent.name) / f"{video.stem}_{frame.frame.index:06d}.jpg")
+            pixels = np.ascontiguousarray(frame.frame.read()[..., ::-1])
+            data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
+            (folder / file).write_bytes(data.tobytes())
+            row = {"file": file, "video": str(video), "index": frame.frame.index, "seconds": frame.seconds}
+            row |= {key: getattr(frame, key) for key in ("sharpness", "motion", "parallax", "why")}
+            rows.append({**row, "rolling_shutter": one.shutter, "readout_seconds": None})
+    findings = tuple(finding for one in picked for finding in one.findings)
+    if rows:
+        listed = {"schema": SCHEMA, "command": command, "frames": rows}
+        listed["findings"] = [dataclasses.asdict(finding) for finding in findings]
+        (folder / FRAMES).write_text(json.dumps(listed, indent=1) + "\n")
+    return Gathered(folder, len(photographs), len(rows), findings)
 
 
 def _picked(videos: Sequence[Path], most: int, tell: Callable[[str, int, int], None]) -> list[Picked]:

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from drgs.data.matching import Progress
+from drgs.runtime import thread_count
 
 __all__ = ["PhotoGroups", "map_photos", "runs"]
 
@@ -42,11 +43,11 @@ _LINE = re.compile(rb"^[IWEF]\d{8} \S+ +\d+ [^\]]+\] (.*)$")
 class _Told:
     """What `map_photos` tells of: poses found in the model that is being made, and what is being done."""
 
-    def __init__(self, total: int, progress: Progress, doing: Callable[[str], None]) -> None:
+    def __init__(self, total: int, progress: Progress, doing: Callable[[str], None], registered: int = 0) -> None:
         self.total = total
         self._progress = progress
         self._doing = doing
-        self.registered = 0
+        self.registered = registered
         self._model = 0
         self._what = "reading the matches"
         self._since = time.monotonic()
@@ -97,6 +98,8 @@ def map_photos(
     total: int,
     progress: Progress,
     doing: Callable[[str], None],
+    base: Path | None = None,
+    posed: int = 0,
 ) -> dict[int, Any]:
     """COLMAP's incremental mapping.
 
@@ -108,12 +111,15 @@ def map_photos(
         total: photographs.
         progress: Called with ("mapping", poses found in the current model, total), also from another thread.
         doing: Called with what is being done, in words, also from another thread.
+        base: Folder of a model to go on with; default none.
+        posed: Number of photographs in it.
     Returns:
         pycolmap's models by number; empty if no two photographs could be connected.
     """
     from drgs.data.colmap_bindings import pycolmap
 
-    told = _Told(total, progress, doing)
+    options.num_threads = options.mapper.num_threads = thread_count()
+    told = _Told(total, progress, doing, posed)
     told.still()
     with _followed(folder, told):
         return pycolmap.incremental_mapping(
@@ -121,6 +127,7 @@ def map_photos(
             image_dir,
             folder,
             options=options,
+            input_path=base or "",
             initial_image_pair_callback=told.begun,
             next_image_callback=told.one_more,
         )
@@ -204,13 +211,13 @@ class PhotoGroups:
             featureless=tuple((name, features[name]) for name in alone if features.get(name, 0) < _FEW_FEATURES),
         )
 
-    def lines(self, names: Sequence[str], is_masked: bool, is_sequential: bool) -> list[str]:
+    def lines(self, names: Sequence[str], is_masked: bool, is_partial: bool) -> list[str]:
         """Whole sentences for people; none where every photograph is in the kept model.
 
         Args:
             names: Names of all photographs, in their order.
             is_masked: Whether masks said where features may lie.
-            is_sequential: Whether only photographs near each other by name were compared.
+            is_partial: Whether some pairs of photographs were not compared.
         """
         if len(self.kept) == len(names):
             return []
@@ -227,9 +234,9 @@ class PhotoGroups:
                 found.append(f"model {number}, left out, has {len(other)} photos{also}: {runs(other, names)}")
         if self.alone:
             found.append(f"in no model: {len(self.alone)} photos: {runs(self.alone, names)}")
-        return found + [f"what would help: {advice}" for advice in self._advice(is_masked, is_sequential)]
+        return found + [f"what would help: {advice}" for advice in self._advice(is_masked, is_partial)]
 
-    def _advice(self, is_masked: bool, is_sequential: bool) -> Iterator[str]:
+    def _advice(self, is_masked: bool, is_partial: bool) -> Iterator[str]:
         """What would bring more photographs into the kept model, the surest first, by what the database shows."""
         dull = {name for name, _ in self.featureless}
         for ours, theirs, matches in [gap for gap in self.gaps if gap[1] not in dull][:_ADVISED]:
@@ -240,8 +247,8 @@ class PhotoGroups:
             more = f" and {len(self.featureless) - _ADVISED} more" if len(self.featureless) > _ADVISED else ""
             where = "a larger mask, or a sharper photo" if is_masked else "a sharper, brighter photo"
             yield f"{where} in place of {shown}{more}: too few features, their number is in brackets"
-        if is_sequential:
-            yield "--matcher exhaustive: only photos near each other by name were compared"
+        if is_partial:
+            yield "--matcher exhaustive: not all pairs of photos were compared"
         if not is_masked:
             yield "--masks, if the object was turned or moved between photos while its background stood still"
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -14,12 +13,12 @@ import numpy as np
 
 from drgs.guards import interrupts
 from drgs.guards.unfinished import temporary_folder
+from drgs.runtime import thread_count
 
 __all__ = ["extract", "match", "nearby_pairs", "quiet", "sequential_pairs", "state_focal_lengths"]
 
 Progress = Callable[[str, int, int], None]
-_IMAGES_A_STEP = min(8, os.cpu_count() or 1)  # one a core: all of them are busy, and progress is seen
-_PAIRS_A_STEP = 16
+_PAIRS_A_STEP = 16  # a thread: all of them are busy, and progress is seen
 _MASKED_CONTRAST = 0.002  # a third of COLMAP's: an object alone has few features, and weak ones match as well
 
 
@@ -47,6 +46,7 @@ def extract(
     max_image_size: int = 0,
     wide_baseline: bool = False,
     masks: Path | None = None,
+    camera: int | None = None,
     progress: Progress | None = None,
 ) -> None:
     """SIFT features of images into a COLMAP database.
@@ -60,12 +60,15 @@ def extract(
         wide_baseline: Affine shapes and pooled scales: connects views further apart, at 2.5 times
             the cost.
         masks: Folder with `NAME.EXT.png` of every image, of its size: no features where it is 0.
+        camera: Number of a camera in the database that the images share; default a new one.
         progress: Called with ("features", done, total).
     """
     from drgs.data.colmap_bindings import pycolmap
 
+    threads = thread_count()
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
+    options.num_threads = threads
     if max_image_size:
         options.max_image_size = max_image_size
     options.sift.estimate_affine_shape = wide_baseline
@@ -75,18 +78,21 @@ def extract(
     if masks is not None:
         reader.mask_path = masks
         options.sift.peak_threshold = _MASKED_CONTRAST
+    shared_camera = shared_camera or camera is not None
     mode = pycolmap.CameraMode.SINGLE if shared_camera else pycolmap.CameraMode.PER_IMAGE
-    for start in range(0, len(names), _IMAGES_A_STEP):
+    if camera is not None:
+        reader.existing_camera_id = camera
+    for start in range(0, len(names), threads):  # one a thread: all of them are busy, and progress is seen
         if progress:
             progress("features", start, len(names))
-        if shared_camera and start:
-            # Every call would otherwise open a camera of its own.
+        if shared_camera and start and camera is None:
+            # Every call would otherwise open a camera of its own; the first of these is the newest.
             with pycolmap.Database.open(database) as handle:
-                reader.existing_camera_id = handle.read_all_cameras()[0].camera_id
+                reader.existing_camera_id = max(found.camera_id for found in handle.read_all_cameras())
         pycolmap.extract_features(
             database,
             folder,
-            image_names=names[start : start + _IMAGES_A_STEP],
+            image_names=names[start : start + threads],
             camera_mode=mode,
             reader_options=reader,
             extraction_options=options,
@@ -134,18 +140,21 @@ def match(
     """
     from drgs.data.colmap_bindings import pycolmap
 
+    threads = thread_count()
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
+    options.num_threads = threads
     options.guided_matching = guided
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     with temporary_folder("pairs") as folder, _numbered(database) as numbers:
         pairing = pycolmap.ImportedPairingOptions()
         pairing.match_list_path = folder / "pairs.txt"
-        for start in range(0, len(pairs), _PAIRS_A_STEP):
+        at_once = _PAIRS_A_STEP * threads
+        for start in range(0, len(pairs), at_once):
             if progress:
                 progress("matching", start, len(pairs))
-            step = pairs[start : start + _PAIRS_A_STEP]
+            step = pairs[start : start + at_once]
             pairing.match_list_path.write_text("".join(f"{numbers[a]} {numbers[b]}\n" for a, b in step))
             pycolmap.match_image_pairs(
                 database,

@@ -1,31 +1,32 @@
-"""Structure from motion: photos to a COLMAP data set, by pycolmap on the CPU."""
+"""Structure from motion: photos and videos to a COLMAP data set, by pycolmap on the CPU."""
 
 from __future__ import annotations
 
-import itertools
-import logging
+import dataclasses
 import os
-import re
 import shutil
 import time
-import unicodedata
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.data.checks import IMAGE_SUFFIXES, image_size, list_images, read_image
-from drgs.data.heif import heif_as_jpeg, is_heif
+from drgs.data.checks import image_size, list_images
+from drgs.data.gathering import fill, named_files
 from drgs.data.mapping import PhotoGroups, map_photos
 from drgs.data.masks import ALPHA_MASKS, feature_mask, masked_photo, masks_of
+from drgs.data.pairing import choose_pairs
+from drgs.data.photo_files import check_names, readable_photos
+from drgs.data.videos import list_videos
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.outputs import claim
 from drgs.guards.unfinished import temporary_folder
 
 if TYPE_CHECKING:
     from drgs.data.matching import Progress
+    from drgs.data.shooting import Finding
     from drgs.guards.outputs import Claim
 
 __all__ = ["CAMERA_MODELS", "MATCHING", "SfmSummary", "run_sfm"]
@@ -38,19 +39,10 @@ CAMERA_MODELS = (
     "OPENCV",
     "OPENCV_FISHEYE",
 )
-MATCHING = ("auto", "exhaustive", "sequential")
-# an object alone has a tenth of the features to compare
-_MAX_EXHAUSTIVE = 60
-_MAX_EXHAUSTIVE_MASKED = 150
-_WINDOW = 10
+MATCHING = ("auto", "exhaustive", "sequential", "retrieval")
 # Matches that a pose needs where an object alone is looked at, which has few: half of COLMAP's own numbers.
 _MASKED_INLIERS_FIRST = 50
 _MASKED_INLIERS = 15
-_QUALITY = 98  # of JPEG, for what has been compressed before
-_LONGEST = 251  # bytes of a name, where file systems allow 255 and COLMAP wants .png behind it
-_SHOWN = 5  # names that a message repeats
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -63,8 +55,12 @@ class SfmSummary:
         reprojection_error: mean, in pixels.
         models: Separate models found; the largest was kept.
         explanation: Sentences about the photos without a pose: which models they are in, and what would help.
-        seconds: Time by stage: features, matching, mapping.
+        seconds: Time by stage: features, matching, mapping; videos, too, where there are some.
         missing: Names of the photos without a pose.
+        matched, pairs: Pairs of photos that were compared, and all.
+        left_out: A sentence about the pairs that were not compared; empty where all were.
+        frames: Photos that are frames of videos.
+        findings: What is wrong with the videos, and what to do at the next shoot.
     """
 
     registered: int
@@ -75,10 +71,15 @@ class SfmSummary:
     seconds: dict[str, float]
     missing: tuple[str, ...]
     explanation: tuple[str, ...] = ()
+    matched: int = 0
+    pairs: int = 0
+    left_out: str = ""
+    frames: int = 0
+    findings: tuple[Finding, ...] = ()
 
 
 def run_sfm(
-    image_dir: str | os.PathLike,
+    photos: str | os.PathLike | Sequence[str | os.PathLike],
     out_dir: str | os.PathLike,
     progress: Callable[[str, int, int], None] | None = None,
     camera_model: str = "SIMPLE_RADIAL",
@@ -87,57 +88,68 @@ def run_sfm(
     seed: int = 0,
     masks: str | os.PathLike | None = None,
     doing: Callable[[str], None] | None = None,
+    frames: int = 150,
 ) -> SfmSummary:
-    """Find camera poses and points from photos; afterwards `drgs.data.load(out_dir)` works.
+    """Find camera poses and points from photos or videos; afterwards `drgs.data.load(out_dir)` works.
 
-    Writes `out_dir/{database.db, sparse/0, images}`, and `masks` if there are any, where a fit finds them;
-    `images` and `masks` are links to the folders given where links work, copies elsewhere. An earlier result of
-    this function is replaced, and only once the new one is complete; nothing else ever is.
+    Writes `out_dir/{database.db, sparse/0, images}`, and `masks` if there are any, where a fit finds them. Of one folder
+    of photos, `images` is a link to it where links work, a copy elsewhere, and so is `masks`; of several, or of videos,
+    it is a folder of links, of the frames that were picked, and of frames.json, which says when each was taken. An
+    earlier result of this function is replaced, and only once the new one is complete; nothing else ever is.
 
     Args:
-        image_dir: Folder of photos.
+        photos: Folder of photos; or a photo, a video, a folder with some of both, or several of all these.
         out_dir: Folder of the data set; made if absent.
-        progress: Called with (stage, done, total); stages are masks, features, matching and mapping. Of mapping, which
-            may begin anew, `done` is the number of photos with a pose so far; it is called from another thread, too.
+        progress: Called with (stage, done, total); stages are frames of each video, masks, features, matching and
+            mapping. Of mapping, which may begin anew, `done` is the number of photos with a pose so far; it is called
+            from another thread, too.
         camera_model: COLMAP's name of the lens. Photos of one size share one camera.
         max_image_size: Pixels on the longer side that features are found at; 0 for the photos' own.
-        matching: `exhaustive`, `sequential` (photos in the order of a walk or video) or
-            `auto` (exhaustive up to 60 photos, 150 with masks).
+        matching: `exhaustive`, `sequential` (photos in the order of a walk or video), `retrieval` (those and the nearest
+            by appearance) or `auto` (exhaustive up to 60 photos, 150 with masks, then retrieval).
         seed: Seed of all random sampling.
         masks: What features are looked for in, where an object was turned or moved between photos: a folder with a mask
             of every photo, `NAME.EXT.png` or `NAME.png`, white where the object is, of the photo's shape; or
             `"alpha"`, the photos' own alpha channel. Weights below a half count as black.
         doing: Called with what is being done within mapping, in words; from another thread, too.
+        frames: Largest number of frames of all videos together (`pick_frames`).
     Raises:
-        FileNotFoundError: No such folder, or no mask of a photo.
-        ValueError: Fewer than 2 photos, an unknown option, photos that do not connect, or an
-            `out_dir` that holds a COLMAP project or photos that were not made here; a mask of another shape, one that
-            keeps nothing, or a photo without alpha.
+        FileNotFoundError: No such folder or file, or no mask of a photo.
+        ValueError: Fewer than 2 photos, an unknown option, a video that cannot be decoded, photos that do not connect,
+            or an `out_dir` that holds a COLMAP project or photos that were not made here; a mask of another shape, one
+            that keeps nothing, or a photo without alpha.
     """
-    image_dir, out_dir = Path(image_dir), Path(out_dir)
-    if image_dir.is_file():
-        refuse_foreign(image_dir, "a folder of photos")
-    if not image_dir.is_dir():
-        raise FileNotFoundError(f"{image_dir}: must be a folder of photos, found none; check the path")
-    names = [path.name for path in list_images(image_dir)]
-    _check_names(image_dir, names, masked=masks is not None)
-    if len(names) < 2:
-        raise ValueError(f"{image_dir}: must hold at least 2 photos, got {len(names)}; add overlapping photos")
+    out_dir = Path(out_dir)
+    paths = [Path(photos)] if isinstance(photos, str | os.PathLike) else [Path(path) for path in photos]
     if camera_model not in CAMERA_MODELS:
         raise ValueError(f"run_sfm: camera_model must be one of {', '.join(CAMERA_MODELS)}, got {camera_model!r}")
     if matching not in MATCHING:
-        raise ValueError(f"run_sfm: matching must be auto, exhaustive or sequential, got {matching!r}; choose one")
-    mask_files = None if masks is None else masks_of([image_dir / name for name in names], masks)
-    linked = {"images": image_dir} | ({} if masks in (None, ALPHA_MASKS) else {"masks": Path(masks)})
-    with claim(out_dir, "sfm", inputs=list(linked.values())) as output:
-        _check_output(output, linked, masks == ALPHA_MASKS)
+        raise ValueError(f"run_sfm: matching must be auto, exhaustive, sequential or retrieval, got {matching!r}")
+    report = progress or (lambda stage, done, total: None)
+    image_dir = _one_folder(paths)
+    photographs, videos = ([], []) if image_dir else named_files(paths)
+    if image_dir:
+        _checked(image_dir, masks)
+    elif not videos and len(photographs) < 2:
+        raise ValueError(f"{paths[0]}: must be at least 2 photos, got {len(photographs)}; add overlapping photos")
+    linked = {} if image_dir is None else {"images": image_dir}
+    linked |= {} if masks in (None, ALPHA_MASKS) else {"masks": Path(masks)}
+    made = [name for name, is_made in (("images", not image_dir), ("masks", masks == ALPHA_MASKS)) if is_made]
+    marks = [time.perf_counter()]
+    with claim(out_dir, "sfm", inputs=[*paths, *linked.values()]) as output:
+        _check_output(output, linked, made)
         with temporary_folder("sfm", output.path) as partial:
             (partial / "models").mkdir()
-            report = progress or (lambda stage, done, total: None)
+            gathered = None
+            if image_dir is None:
+                gathered = fill(partial / "images", photographs, videos, "sfm", frames, report)
+                marks.append(time.perf_counter())
+            folder = image_dir or partial / "images"
+            names, mask_files = _checked(folder, masks)
             if mask_files is not None:
-                _write_masked(image_dir, names, mask_files, partial, report)
+                _write_masked(folder, names, mask_files, partial, report)
             summary = _reconstruct(
-                image_dir,
+                folder,
                 names,
                 partial,
                 report,
@@ -148,8 +160,32 @@ def run_sfm(
                 seed,
                 mask_files is not None,
             )
-            _install(partial, output, linked, masks == ALPHA_MASKS)
-    return summary
+            _install(partial, output, linked, made)
+    if gathered is None:
+        return summary
+    seconds = {"videos": marks[1] - marks[0]} if videos else {}
+    return dataclasses.replace(
+        summary, seconds=seconds | summary.seconds, frames=gathered.frames, findings=gathered.findings
+    )
+
+
+def _one_folder(paths: list[Path]) -> Path | None:
+    """The folder of photos that is all there is to read, if it is that."""
+    if len(paths) != 1 or paths[0].is_file():
+        return None
+    folder = paths[0]
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: must be a folder of photos, or a photo or video, found none; check the path")
+    return None if list_videos(folder) else folder
+
+
+def _checked(folder: Path, masks: str | os.PathLike | None) -> tuple[list[str], list[Path] | None]:
+    """Names of the photos in a folder, which must be enough and such that COLMAP can hold them, and their masks."""
+    names = [path.name for path in list_images(folder)]
+    check_names(folder, names, masked=masks is not None)
+    if len(names) < 2:
+        raise ValueError(f"{folder}: must hold at least 2 photos, got {len(names)}; add overlapping photos")
+    return names, None if masks is None else masks_of([folder / name for name in names], masks)
 
 
 def _write_masked(image_dir: Path, names: list[str], masks: list[Path], partial: Path, report: Progress) -> None:
@@ -177,11 +213,17 @@ def _write_masked(image_dir: Path, names: list[str], masks: list[Path], partial:
     report("masks", len(names), len(names))
 
 
-def _check_output(output: Claim, linked: dict[str, Path], makes_masks: bool) -> None:
-    """Find out that what is to be replaced is an earlier result, before minutes of work."""
+def _check_output(output: Claim, linked: dict[str, Path], made: list[str]) -> None:
+    """Find out that what is to be replaced is an earlier result, before minutes of work.
+
+    Args:
+        output: The folder of the data set.
+        linked: Folders that it will have links to, by the name of the link.
+        made: Names of folders that are made for it.
+    """
     places = ["sparse", *(path.name for path in output.path.glob("database.db*"))]
     places += [name for name, folder in linked.items() if (output.path / name).resolve() != folder.resolve()]
-    places += ["masks"] if makes_masks else []
+    places += made
     try:
         output.check(places)
     except ValueError as error:
@@ -202,13 +244,13 @@ def _reconstruct(
 ) -> SfmSummary:
     """Run the three stages; leaves `database.db` and `sparse/0` in `partial`."""
     from drgs.data.colmap_bindings import pycolmap
-    from drgs.data.matching import extract, match, quiet, sequential_pairs, state_focal_lengths
+    from drgs.data.matching import extract, match, quiet, state_focal_lengths
 
     database = partial / "database.db"
     shared = len({image_size(image_dir / name) for name in names}) == 1
     marks = [time.perf_counter()]
     with quiet():
-        readable = _readable_photos(image_dir, names, partial / "readable", report)
+        readable = readable_photos(image_dir, names, partial / "readable", report)
         extract(
             database,
             partial / "photos" if is_masked else readable,
@@ -223,10 +265,8 @@ def _reconstruct(
         if is_masked:
             state_focal_lengths(database, readable)
         marks.append(time.perf_counter())
-        most = _MAX_EXHAUSTIVE_MASKED if is_masked else _MAX_EXHAUSTIVE
-        is_sequential = matching == "sequential" or (matching == "auto" and len(names) > most)
-        pairs = sequential_pairs(names, _WINDOW) if is_sequential else list(itertools.combinations(names, 2))
-        match(database, pairs, seed=seed, guided=is_masked, progress=report)
+        chosen = choose_pairs(database, names, matching, is_masked, seed)
+        match(database, chosen.pairs, seed=seed, guided=is_masked, progress=report)
         marks.append(time.perf_counter())
         options = pycolmap.IncrementalPipelineOptions()
         options.random_seed = seed
@@ -258,104 +298,40 @@ def _reconstruct(
         models=len(models),
         seconds={stage: marks[i + 1] - marks[i] for i, stage in enumerate(("features", "matching", "mapping"))},
         missing=tuple(name for name in names if name not in kept),
-        explanation=tuple(parts.lines(names, is_masked, is_sequential)),
+        explanation=tuple(parts.lines(names, is_masked, bool(chosen.left_out))),
+        matched=len(chosen.pairs),
+        pairs=len(names) * (len(names) - 1) // 2,
+        left_out=chosen.left_out,
     )
 
 
-def _install(partial: Path, output: Claim, linked: dict[str, Path], makes_masks: bool) -> None:
+def _install(partial: Path, output: Claim, linked: dict[str, Path], made: list[str]) -> None:
     """Move the finished result to its place; the model, which makes the folder a data set, comes
     last.
     """
-    _check_output(output, linked, makes_masks)  # minutes later
+    _check_output(output, linked, made)  # minutes later
     output.remove(output.path / "sparse")
     masks = output.path / "masks"
     # Those of an earlier result; an empty folder is nobody's.
     is_stale = output.is_made(masks, ("sfm",)) and (masks.is_symlink() or any(masks.iterdir()))
-    if makes_masks or (is_stale and "masks" not in linked):
+    if is_stale and "masks" not in linked:
         output.remove(masks)
-    if makes_masks:
-        output.put(partial / "masks", "masks")
+    for name in made:
+        output.remove(output.path / name)
+        output.put(partial / name, name)
     for name, folder in linked.items():
         if (output.path / name).resolve() == folder.resolve():
             continue
         output.remove(output.path / name)
-        made = partial / f"linked_{name}"
+        link = partial / f"linked_{name}"
         try:
-            made.symlink_to(folder.resolve(), target_is_directory=True)
+            link.symlink_to(folder.resolve(), target_is_directory=True)
         except OSError:
-            shutil.copytree(folder, made)
-        output.put(made, name)
+            shutil.copytree(folder, link)
+        output.put(link, name)
     # SQLite may have left side files; they belong to the database.
     for stale in output.path.glob("database.db*"):
         output.remove(stale)
     for file in partial.glob("database.db*"):
         output.put(file, file.name)
     output.put(partial / "sparse", "sparse")
-
-
-def _check_names(folder: Path, names: list[str], masked: bool = False) -> None:
-    """Refuse names that a COLMAP model cannot hold: with line breaks or other control characters, or bytes that are not
-    UTF-8; with masks, whose names are those and `.png`, also too long ones. Say which photographs are hidden, and left
-    out.
-
-    Raises:
-        ValueError: There is one.
-    """
-    for name in names:
-        if any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") for c in name):
-            raise ValueError(
-                f"{folder}: the name of a photo must be one line of UTF-8 without control characters, got "
-                f"{name[:80]!r}; rename this photo"
-            )
-        if masked and len(name.encode()) > _LONGEST:
-            raise ValueError(
-                f"{folder}: with masks, the name of a photo must have at most {_LONGEST} bytes, got "
-                f"{len(name.encode())}: {name[:40]}...; rename this photo and its mask"
-            )
-    # Those of ._ are no photographs, but what macOS notes about them on other systems.
-    hidden = [p.name for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and re.match(r"\.(?!_)", p.name)]
-    if hidden:
-        shown = ", ".join(sorted(hidden)[:_SHOWN]) + (", ..." if len(hidden) > _SHOWN else "")
-        _log.warning("%s: %d hidden photos are left out (%s); rename them to use them", folder, len(hidden), shown)
-
-
-def _readable_photos(folder: Path, names: list[str], target: Path, progress: Callable[[str, int, int], None]) -> Path:
-    """A folder where COLMAP can read all photographs under their names.
-
-    Args:
-        folder, names: The photographs.
-        target: Folder that is made if some of them are HEIC, AVIF or WebP: these become JPEG there, whatever their
-            names say, with their EXIF (which of WebP is lost), and the others links.
-        progress: Called with ("decoding", done, total) where there are such.
-    Returns:
-        `target`, or `folder` if COLMAP reads all of it.
-    Raises:
-        ValueError: One cannot be decoded, or pillow-heif is missing.
-    """
-    import cv2
-
-    foreign = [name for name in names if is_heif(folder / name) or _is_webp(folder / name)]
-    if not foreign:
-        return folder
-    target.mkdir()
-    for name in set(names) - set(foreign):
-        try:
-            (target / name).symlink_to((folder / name).resolve())
-        except OSError:
-            shutil.copyfile(folder / name, target / name)
-    for done, name in enumerate(foreign):
-        progress("decoding", done, len(foreign))
-        if is_heif(folder / name):
-            (target / name).write_bytes(heif_as_jpeg(folder / name, _QUALITY))
-        else:
-            pixels = np.ascontiguousarray(read_image(folder / name)[..., 2::-1])  # without alpha, in OpenCV's order
-            _, encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-            (target / name).write_bytes(encoded.tobytes())
-    progress("decoding", len(foreign), len(foreign))
-    return target
-
-
-def _is_webp(path: Path) -> bool:
-    with path.open("rb") as file:
-        head = file.read(12)
-    return head[:4] == b"RIFF" and head[8:] == b"WEBP"

@@ -1,0 +1,147 @@
+"""Which pairs of photographs are matched: all of few; of many, neighbors by name and the nearest by appearance.
+
+Appearance is a global descriptor of a photograph's own local features: they are assigned to the nearest of a few centers,
+found in the capture itself by k-means, and their differences from it are summed up by center (VLAD). No vocabulary is
+downloaded; pycolmap's wheel carries none.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from drgs.data.matching import sequential_pairs
+
+__all__ = ["Pairing", "choose_pairs", "global_descriptors", "nearest_pairs"]
+
+MAX_EXHAUSTIVE = 60
+"""Photographs of which all pairs are matched by default."""
+MAX_EXHAUSTIVE_MASKED = 150
+"""The same with masks: an object alone has a tenth of the features to compare."""
+_WINDOW = 10
+_NARROW_WINDOW = 4  # beside those that appearance finds
+_NEAREST = 20  # by appearance
+_CENTERS = 64
+_SAMPLE = 400  # features of a photograph that the centers are found from
+_ROUNDS = 12  # of k-means
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """Pairs of photographs that are matched.
+
+    Attributes:
+        pairs: Their names.
+        left_out: A sentence about those that are not; empty if all are.
+    """
+
+    pairs: list[tuple[str, str]]
+    left_out: str
+
+
+def choose_pairs(database: Path, names: list[str], matching: str, is_masked: bool, seed: int) -> Pairing:
+    """The pairs to match.
+
+    Args:
+        database: COLMAP's database, with the features of all photographs.
+        names: Photographs in their order.
+        matching: `exhaustive`, `sequential`, `retrieval`, or `auto`, which decides by the number of photographs.
+        is_masked: Whether features are those of an object alone.
+        seed: Seed of the k-means.
+    """
+    total = len(names) * (len(names) - 1) // 2
+    if matching == "auto":
+        most = MAX_EXHAUSTIVE_MASKED if is_masked else MAX_EXHAUSTIVE
+        matching = "exhaustive" if len(names) <= most else "retrieval"
+    if matching == "exhaustive":
+        return Pairing(list(itertools.combinations(names, 2)), "")
+    if matching == "sequential":
+        pairs = sequential_pairs(names, _WINDOW)
+        what = f"the {_WINDOW} next by name, and some further on"
+    else:
+        near = nearest_pairs(global_descriptors(database, names, seed), _NEAREST)
+        by_name = sequential_pairs(names, _NARROW_WINDOW)
+        place = {name: index for index, name in enumerate(names)}
+        pairs = sorted({*by_name, *((names[i], names[j]) for i, j in near)}, key=lambda p: (place[p[0]], place[p[1]]))
+        what = f"the {_NEAREST} nearest by appearance, and the {_NARROW_WINDOW} next by name"
+    if len(pairs) == total:
+        return Pairing(pairs, "")
+    return Pairing(pairs, f"{len(pairs):,} of {total:,} pairs are matched: {what}; --matcher exhaustive matches all")
+
+
+def nearest_pairs(descriptors: np.ndarray, count: int, firsts: int | None = None) -> list[tuple[int, int]]:
+    """Index pairs (i, j), i < j, of each photograph with its nearest ones.
+
+    Args:
+        descriptors: (V, D) of length 1.
+        count: Partners of each.
+        firsts: Photographs before this number are looked for, not with: of those that are there when others come.
+    """
+    alike = descriptors @ descriptors.T
+    np.fill_diagonal(alike, -np.inf)
+    # Stable: of equal ones the lower index wins on every machine.
+    nearest = np.argsort(-alike, axis=1, kind="stable")[:, : min(count, len(alike) - 1)]
+    return sorted({(min(i, j), max(i, j)) for i in range(firsts or 0, len(alike)) for j in nearest[i].tolist()})
+
+
+def global_descriptors(database: Path, names: list[str], seed: int = 0) -> np.ndarray:
+    """(V, 64 * 128) float32 of length 1: VLAD of the SIFT features of each photograph.
+
+    Residuals are normalized by center, then the root is taken of their sizes, as in the references.
+
+    Args:
+        database: COLMAP's database, with features.
+        names: Photographs.
+        seed: Of the sample and the first centers.
+    Reference:
+        Jegou et al., "Aggregating local descriptors into a compact image representation", CVPR 2010; Arandjelovic and
+        Zisserman, "All about VLAD", CVPR 2013.
+    """
+    rng = np.random.default_rng(seed)
+    samples = []
+    for features in _features(database, names):
+        few = len(features) > _SAMPLE
+        samples.append(features[np.sort(rng.choice(len(features), _SAMPLE, replace=False))] if few else features)
+    centers = _centers(np.concatenate(samples), rng)
+    found = np.zeros((len(names), len(centers), 128), np.float32)
+    for index, features in enumerate(_features(database, names)):
+        if not len(features):
+            continue
+        label = _nearest(features, centers)
+        np.add.at(found[index], label, features - centers[label])
+    found /= np.maximum(np.linalg.norm(found, axis=2, keepdims=True), 1e-12)
+    flat = found.reshape(len(names), -1)
+    flat = np.sign(flat) * np.sqrt(np.abs(flat))
+    return flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
+
+
+def _features(database: Path, names: list[str]):
+    """(N, 128) float32 of length 1 of each photograph, in the order of names; one is held at a time."""
+    from drgs.data.colmap_bindings import pycolmap
+
+    with pycolmap.Database.open(database) as handle:
+        numbers = {image.name: image.image_id for image in handle.read_all_images()}
+        for name in names:
+            data = np.asarray(handle.read_descriptors(numbers[name]).data, np.float32).reshape(-1, 128)
+            yield data / np.maximum(np.linalg.norm(data, axis=1, keepdims=True), 1e-12)
+
+
+def _centers(features: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """(K, 128) by k-means (Lloyd 1982), begun at random features."""
+    count = min(_CENTERS, len(features))
+    centers = features[np.sort(rng.choice(len(features), count, replace=False))].copy()
+    for _ in range(_ROUNDS):
+        label = _nearest(features, centers)
+        sums = np.zeros_like(centers, np.float64)
+        np.add.at(sums, label, features)
+        sizes = np.bincount(label, minlength=count)
+        centers[sizes > 0] = (sums[sizes > 0] / sizes[sizes > 0, None]).astype(np.float32)
+    return centers
+
+
+def _nearest(features: np.ndarray, centers: np.ndarray) -> np.ndarray:
+    """(N,) index of the nearest center of each feature."""
+    return np.argmax(features @ centers.T - 0.5 * (centers**2).sum(axis=1), axis=1)

@@ -1,0 +1,327 @@
+"""Further photographs into a COLMAP model that `run_sfm` made: the cameras that are there stay where they are.
+
+Features are found in the new photographs alone, matched against those of the database, and COLMAP's incremental mapping
+goes on from the model with its frames and its lenses held. What has been fitted to the model stays valid.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from drgs.data.checks import IMAGE_SUFFIXES, image_size
+from drgs.data.gathering import FRAMES
+from drgs.data.mapping import PhotoGroups, map_photos
+from drgs.data.photo_files import check_names, readable_photos
+from drgs.data.sfm import SfmSummary
+from drgs.guards.json_files import check_json, read_json
+from drgs.guards.outputs import claim
+from drgs.guards.unfinished import temporary_folder
+
+if TYPE_CHECKING:
+    from drgs.data.matching import Progress
+    from drgs.guards.outputs import Claim
+
+__all__ = ["Registration", "register"]
+
+_MODEL = ("cameras.bin", "images.bin", "points3D.bin")
+_SAME_LENS = 0.1  # relative difference of focal lengths, in EXIF and in the model, of one lens
+
+
+@dataclass(frozen=True)
+class Registration:
+    """What became of further photographs.
+
+    Attributes:
+        summary: Of all photographs of the data set, old and new; `missing` may name old ones, too.
+        added: Names in the data set of the new photographs, in the order in which they were given.
+        posed: Those of them that have a pose.
+        moved: Largest distance that a camera which was there moved, over the largest distance of such a camera to
+            their middle: rounding.
+    """
+
+    summary: SfmSummary
+    added: tuple[str, ...]
+    posed: tuple[str, ...]
+    moved: float
+
+
+def register(
+    scene: str | os.PathLike,
+    photographs: Sequence[str | os.PathLike],
+    progress: Callable[[str, int, int], None] | None = None,
+    max_image_size: int = 1600,
+    seed: int = 0,
+    doing: Callable[[str], None] | None = None,
+) -> Registration:
+    """Find the poses of further photographs in the world of a data set that `run_sfm` made.
+
+    The data set has the new photographs afterwards (as links where links work), their poses, and points that they
+    show; poses and lenses that were there do not change. `images` becomes a folder of links to the photographs where it
+    was one link. A frames.json beside the new photographs is joined with that of the data set.
+
+    Args:
+        scene: Folder of the data set.
+        photographs: Files. Those of one size, in a data set with one camera of that size and about the focal length
+            that their EXIF states, share it. One with a name that is taken gets a number behind its own.
+        progress: Called with (stage, done, total) as by `run_sfm`; also from another thread.
+        max_image_size: Pixels on the longer side that features are found at, best as for the data set; 0 for all.
+        seed: Seed of all random sampling.
+        doing: Called with what is being done within mapping, in words; from another thread, too.
+    Raises:
+        FileNotFoundError: No such data set or photograph.
+        ValueError: A data set that `run_sfm` did not make or that has masks, a file that is no photograph or is in the
+            data set already, or none of the photographs connects to those that are there; then nothing has changed.
+    """
+    scene, files = Path(scene), [Path(path) for path in photographs]
+    _check(scene, files)
+    with claim(scene, "sfm", inputs=files) as output:
+        output.check(["sparse", "database.db"])
+        names = _new_names(output.path / "images", files)
+        with temporary_folder("register", output.path) as partial:
+            found = _registered(
+                output.path,
+                files,
+                names,
+                partial,
+                progress or (lambda stage, done, total: None),
+                doing or (lambda text: None),
+                max_image_size,
+                seed,
+            )
+            _install(output, partial, files, names)
+    return found
+
+
+def _check(scene: Path, files: list[Path]) -> None:
+    """Refuse what is no data set of ours, and files that are no photographs, before any work."""
+    missing = [name for name in ("database.db", *(f"sparse/0/{name}" for name in _MODEL)) if not (scene / name).is_file()]
+    if missing:
+        raise FileNotFoundError(
+            f"{scene}: must be a data set that `drgs sfm` made, has no {missing[0]}; run `drgs sfm PHOTOS -o {scene}` first"
+        )
+    if (scene / "masks").exists():
+        raise ValueError(
+            f"{scene}: must be a data set without masks to join photographs to it; run `drgs sfm` on all photographs "
+            "with all masks"
+        )
+    if not files:
+        raise ValueError(f"{scene}: there must be photographs to join to it, got none; name some")
+    images = (scene / "images").resolve()
+    there = {path.resolve() for path in images.iterdir()} if images.is_dir() else set()
+    seen = set[Path]()
+    for file in files:
+        if not file.is_file():
+            raise FileNotFoundError(f"{file}: must be a photograph, found none; check the path")
+        if file.suffix.lower() not in IMAGE_SUFFIXES:
+            raise ValueError(f"{file}: must be a photograph ({', '.join(IMAGE_SUFFIXES)}); convert it, or leave it out")
+        if file.resolve() in there or file.resolve() in seen:
+            raise ValueError(f"{file}: must be a new photograph, is in {scene} already or named twice; leave it out")
+        seen.add(file.resolve())
+        check_names(file.parent, [file.name])
+
+
+def _new_names(images: Path, files: list[Path]) -> list[str]:
+    """Names for new photographs, as theirs as far as these are free."""
+    taken = {path.name for path in images.iterdir()} if images.is_dir() else set()
+    names = []
+    for file in files:
+        number, name = 2, file.name
+        while name in taken:
+            name = f"{file.stem}_{number}{file.suffix}"
+            number += 1
+        taken.add(name)
+        names.append(name)
+    return names
+
+
+def _registered(
+    scene: Path,
+    files: list[Path],
+    names: list[str],
+    partial: Path,
+    report: Progress,
+    doing: Callable[[str], None],
+    max_image_size: int,
+    seed: int,
+) -> Registration:
+    """Run the three stages; leaves `database.db`, `sparse/0` and the `photos` under their new names in `partial`."""
+    from drgs.data.colmap_bindings import pycolmap
+    from drgs.data.matching import extract, match, quiet
+
+    for folder in ("photos", "models", "sparse/0"):
+        (partial / folder).mkdir(parents=True)
+    for path in _photographs(scene / "images"):
+        _link(path, partial / "photos" / path.name)
+    for file, name in zip(files, names, strict=True):
+        _link(file, partial / "photos" / name)
+    database = partial / "database.db"
+    shutil.copyfile(scene / "database.db", database)
+    before = pycolmap.Reconstruction(str(scene / "sparse/0"))
+    with pycolmap.Database.open(database) as handle:
+        old = [image.name for image in handle.read_all_images()]
+    marks = [time.perf_counter()]
+    with quiet():
+        readable = readable_photos(partial / "photos", [*old, *names], partial / "readable", report)
+        cameras = list(before.cameras.values())
+        extract(
+            database,
+            readable,
+            names,
+            camera_model=cameras[0].model_name,
+            shared_camera=len({image_size(file) for file in files}) == 1,
+            max_image_size=max_image_size,
+            wide_baseline=True,
+            camera=_shared_camera(cameras, [readable / name for name in names]),
+            progress=report,
+        )
+        marks.append(time.perf_counter())
+        pairs = [(a, b) for i, b in enumerate(names) for a in (*old, *names[:i])]
+        match(database, pairs, seed=seed, progress=report)
+        marks.append(time.perf_counter())
+        options = pycolmap.IncrementalPipelineOptions()
+        options.random_seed = seed
+        options.multiple_models = False
+        options.fix_existing_frames = True
+        options.constant_cameras = {camera.camera_id for camera in cameras}
+        total = len(old) + len(names)
+        models = map_photos(
+            database,
+            readable,
+            partial / "models",
+            options,
+            total,
+            report,
+            doing,
+            base=scene / "sparse/0",
+            posed=before.num_reg_images(),
+        )
+        marks.append(time.perf_counter())
+    model = max(models.values(), key=lambda model: model.num_reg_images(), default=before)
+    kept = {model.images[i].name for i in model.reg_image_ids()}
+    parts = PhotoGroups.of(database, [*old, *names], kept, [])
+    lines = parts.lines([*old, *names], False, False)
+    posed = tuple(name for name in names if name in kept)
+    if not posed:
+        raise ValueError(
+            f"{files[0].parent}: photographs that are joined to {scene} must show what those there show, none of "
+            f"{len(names)} could be connected; {lines[-1] if lines else 'take some in between'}"
+        )
+    moved = _moved(before, model)
+    model.update_point_3d_errors()
+    model.write_binary(partial / "sparse/0")
+    report("mapping", len(kept), total)
+    summary = SfmSummary(
+        registered=len(kept),
+        total=total,
+        points=model.num_points3D(),
+        reprojection_error=float(model.compute_mean_reprojection_error()),
+        models=1,
+        seconds={stage: marks[i + 1] - marks[i] for i, stage in enumerate(("features", "matching", "mapping"))},
+        missing=tuple(name for name in (*old, *names) if name not in kept),
+        explanation=tuple(lines),
+    )
+    return Registration(summary, tuple(names), posed, moved)
+
+
+def _shared_camera(cameras: list[Any], files: list[Path]) -> int | None:
+    """Number of the one camera of a model, if photographs are of its size and, as far as EXIF says, of its lens."""
+    from drgs.data.colmap_bindings import pycolmap
+
+    if len(cameras) != 1:
+        return None
+    camera = cameras[0]
+    for file in files:
+        if image_size(file) != (camera.width, camera.height):
+            return None
+        stated = pycolmap.infer_camera_from_image(file)
+        focal = camera.mean_focal_length()
+        if stated.has_prior_focal_length and abs(stated.mean_focal_length() - focal) > _SAME_LENS * focal:
+            return None
+    return camera.camera_id
+
+
+def _photographs(folder: Path) -> list[Path]:
+    """Photographs in a folder, hidden ones, too, if there is one."""
+    return sorted(path for path in folder.iterdir() if path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES)
+
+
+def _link(file: Path, target: Path) -> None:
+    try:
+        target.symlink_to(file.resolve())
+    except OSError:  # a file system without links
+        shutil.copyfile(file, target)
+
+
+def _moved(before: Any, after: Any) -> float:
+    """How far cameras that two models share are apart at most, over the spread of those of the first."""
+    names = {after.images[i].name: i for i in after.reg_image_ids()}
+    shared = [(i, names[before.images[i].name]) for i in before.reg_image_ids() if before.images[i].name in names]
+    old = np.array([before.images[i].projection_center() for i, _ in shared])
+    new = np.array([after.images[j].projection_center() for _, j in shared])
+    spread = np.linalg.norm(old - old.mean(axis=0), axis=1).max()
+    return float(np.linalg.norm(new - old, axis=1).max() / max(spread, 1e-12))
+
+
+def _install(output: Claim, partial: Path, files: list[Path], names: list[str]) -> None:
+    """Add the photographs, then put the new database and the new model in the place of the old ones."""
+    images = output.path / "images"
+    frames = _joined_frames(images, files, names)
+    if images.is_symlink():  # to the folder of the first photographs, which is not ours to add to
+        made = partial / "images"
+        made.mkdir()
+        for path in _photographs(images):
+            _link(path, made / path.name)
+        output.remove(images)
+        output.put(made, "images")
+    for name in names:
+        output.put(partial / "photos" / name, f"images/{name}")
+    if frames is not None:
+        (partial / FRAMES).write_text(json.dumps(frames, indent=1) + "\n")
+        output.remove(images / FRAMES)
+        output.put(partial / FRAMES, f"images/{FRAMES}")
+    for stale in output.path.glob("database.db*"):
+        output.remove(stale)
+    for file in partial.glob("database.db*"):
+        output.put(file, file.name)
+    output.check(["sparse"])  # minutes later
+    os.rename(output.path / "sparse", partial / "sparse_before")
+    output.put(partial / "sparse", "sparse")
+
+
+def _joined_frames(images: Path, files: list[Path], names: list[str]) -> dict[str, Any] | None:
+    """The content of frames.json for the data set: that of its photographs, and of those among the new ones that are
+    frames of videos, under their new names; None where there is none.
+    """
+    joined = _frames_of(images)
+    for folder in dict.fromkeys(file.parent for file in files):
+        name_of = {file.name: name for file, name in zip(files, names, strict=True) if file.parent == folder}
+        more = _frames_of(folder)
+        if more is None:
+            continue
+        joined = joined or {**more, "frames": [], "findings": []}
+        rows = [{**row, "file": name_of[row["file"]]} for row in more["frames"] if row["file"] in name_of]
+        joined = {
+            **joined,
+            "frames": [*joined["frames"], *rows],
+            "findings": [*joined["findings"], *more["findings"]],
+        }
+    return joined
+
+
+def _frames_of(folder: Path) -> dict[str, Any] | None:
+    """The content of the frames.json of a folder; None without one."""
+    path = folder / FRAMES
+    if not path.is_file():
+        return None
+    found = read_json(path, "a list of frames that drgs wrote", "gather the frames again")
+    check_json(f"{path}", found, {"frames": [{"file": str}], "findings": list}, "gather the frames again")
+    return found
