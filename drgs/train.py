@@ -121,6 +121,7 @@ def fit(
     workers: Workers | None = None,
     active: SelectionConfig | None = None,
     pace: Pace | None = None,
+    begin: str | Path | None = None,
 ) -> FitResult:
     """Fit Gaussians to a data set and write a run folder.
 
@@ -142,6 +143,9 @@ def fit(
         pace: Called after every step with the steps done and those of the whole fit; returns how many the whole fit is
             to have. Where that is another number, schedules go on from the share that is then done, and config.json
             says so. Only where nothing moves and all views are fitted to.
+        begin: Checkpoint of another fit (`state.safetensors`), in the same world, whose Gaussians this one begins with
+            instead of points; where new photographs show what these leave empty, points of the data set are added.
+            Only where nothing moves, all views are fitted to, and there are no features.
     Raises:
         ValueError: On a bad config, data set or run folder, when another process writes there, and when losses stay
             not finite.
@@ -157,7 +161,7 @@ def fit(
     threads = one_thread() if config.deterministic else contextlib.nullcontext()
     with claim_run(Run(out_dir), "fit", resume, [dataset.path]), threads, Bar("fit", show=progress):
         try:
-            return _fit(dataset, out_dir, config, parts, resume, workers, pace)
+            return _fit(dataset, out_dir, config, parts, resume, workers, pace, None if begin is None else Path(begin))
         except (MemoryError, RuntimeError) as error:
             if not is_out_of_memory(error):
                 raise
@@ -175,6 +179,7 @@ def _fit(
     resume: bool,
     workers: Workers | None,
     pace: Pace | None = None,
+    begin: Path | None = None,
 ) -> FitResult:
     """`fit` in a run folder that is claimed: what there is to fit or to go on from, all steps, and the metrics."""
     train, test = dataset.split(config.data.test_every, config.data.test_offset, config.data.test_cameras)
@@ -193,6 +198,11 @@ def _fit(
     selection = config.selection
     if pace is not None and (selection or motion is not None):
         raise ValueError("fit: pace must be None where views are chosen on the way or things move; leave it out")
+    if begin is not None and (selection or motion is not None or parts is not None):
+        raise ValueError(
+            "fit: begin must be None where views are chosen on the way, things move or parts are a caller's own; "
+            "leave it out"
+        )
     check_photographs(config, motion is not None)
     plan = ActiveViews(train, config, motion is not None, workers) if selection else None
     if selection and selection.measure and not test:
@@ -205,6 +215,8 @@ def _fit(
     tensors, header = _checkpoint(run, plan, taught) if resume else (None, None)
     frames = plan.frames() if plan else frames_for(train, config.data)
     held_out = frames_for(test, config.data)
+    if begin is not None and taught is not None:
+        raise ValueError("fit: begin must be None where features are fitted, too; ignore semantics, or fit anew")
     if taught and taught.embeddings:
         from drgs.fitting.segments import check_references
 
@@ -225,13 +237,14 @@ def _fit(
         looks = plan is not None and parts is None and config.data.exposure != "off"
         compared = plan.compared_points(dataset.points) if plan and looks else None
         trainer, source, exposure, evidence, choice = start(
-            dataset, views, frames, config, parts, taught, plan is not None, room, motion, compared
+            dataset, views, frames, config, parts, taught, plan is not None, room, motion, compared, begin
         )
         if plan and exposure is not None:
             plan.exposure = exposure.to_json(plan.names)
         seconds = 0.0
     recorded = config_record(dataset, config, plan, taught, frames, held_out, source, motion.times if motion else ())
     recorded |= photographs_record(run, trainer, exposure, evidence, choice)
+    recorded |= {"begin": str(begin)} if begin is not None else {}
     recorded |= {"exposure": plan.exposure} if plan and plan.exposure else {}
     recorded |= {"lenses": lenses.to_json()} if lenses and lenses.lost else {}
     poses = trainer.parts.poses
@@ -254,6 +267,8 @@ def _fit(
     loop = _Loop(run, trainer, held_out, source, seconds, plan, taught, measured, joins)
     if pace is not None:
         loop.keep_pace(pace, recorded)
+    if begin is not None and trainer.step_index == 0:
+        loop.save()  # the run shows from now on what it begins with
     with fewer_torch_threads(), Bar("fit", config.max_steps, done=trainer.step_index) as bar:
         if len(named := [settings.nearest_preset()[0] for settings in trainer.renderers.all_settings]) > 1:
             bar.note(f"every step has one of the renderers {', '.join(named)}; --for fast fits for one alone")

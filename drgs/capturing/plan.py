@@ -195,13 +195,14 @@ def _pose_seconds(count: int, features: float, pair: float, scale: float) -> flo
     )
 
 
-def plan_fit(dataset: Dataset, config: FitConfig, left: float) -> FitPlan:
+def plan_fit(dataset: Dataset, config: FitConfig, left: float, least: int = 1) -> FitPlan:
     """How large a fit of a data set may be, from timed steps.
 
     Args:
         dataset: The data set, with points.
         config: What else the fit does; its renderers are those that are timed.
         left: Seconds that are left, for the fit and what follows it.
+        least: Gaussians that there are already, of which none are taken away.
     """
     train, test = dataset.split(config.data.test_every, config.data.test_offset, config.data.test_cameras)
     largest = max(view.camera.width * view.camera.height for view in train)
@@ -214,7 +215,7 @@ def plan_fit(dataset: Dataset, config: FitConfig, left: float) -> FitPlan:
             rest = end - time.perf_counter()
             if best is not None and before is not None and 2 * before * (_FEWER * steps + _TIMED) > rest - best.after:
                 break  # a step takes about twice as long as in the size before
-            size = FitPlan(min(pixels, largest), gaussians, steps, 0.0)
+            size = FitPlan(min(pixels, largest), max(gaussians, least), steps, 0.0)
             each = _seconds_a_step(train, dataset, size.config(config), is_first=number == 0)
             after = _AFTER + each * (_TRAINING * len(train) + _HELD_OUT * len(test))
             room = (1 - _END) * (end - time.perf_counter() - after)
@@ -222,7 +223,7 @@ def plan_fit(dataset: Dataset, config: FitConfig, left: float) -> FitPlan:
             if best is not None and there < _FEWER * steps:
                 break
             count = int(min(max(there, _FEWEST_STEPS), _MORE * steps))
-            best = FitPlan(size.max_pixels, gaussians, count, count * each, after)
+            best = FitPlan(size.max_pixels, size.max_gaussians, count, count * each, after)
             before = each
             if pixels >= largest:
                 break

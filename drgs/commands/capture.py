@@ -17,46 +17,56 @@ import shlex
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from drgs import data
 from drgs.capturing import diagnosis
 from drgs.capturing.pace import Pacer
 from drgs.capturing.plan import FitPlan, duration, plan_fit, plan_poses, planned_poses, seconds_of_budget
-from drgs.capturing.record import FOLDER, CaptureRecord, Step, inputs_of
+from drgs.capturing.record import FOLDER, Batch, CaptureRecord, Step, inputs_of
 from drgs.commands.next_views import rank_next
 from drgs.commands.report import report_of
 from drgs.data.checks import list_images
 from drgs.data.gathering import gather, named_files
+from drgs.data.held_out import HELD_OUT, write_held_out
+from drgs.data.registering import register
 from drgs.data.sfm import run_sfm
 from drgs.display.progress import Bar
-from drgs.files import Run, state_header
+from drgs.files import Run, save_state, state_header
 from drgs.fitting.config import FitConfig, recorded_config
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import fit_record, is_run
-from drgs.fitting.resume import claim_run
+from drgs.fitting.resume import FILES, claim_run, last_checkpoint
 from drgs.guards import interrupts
 from drgs.guards.outputs import claim
 from drgs.report.write import FILE
 from drgs.train import fit
+from drgs.viewing.placed_views import NEXT
 
 if TYPE_CHECKING:
     from drgs.commands.making_options import Capture
     from drgs.data import Dataset
-    from drgs.data.sfm import SfmSummary
     from drgs.data.shooting import Finding
+
+    Outcome: TypeAlias = tuple[str, list[Finding]]  # of a step: its line, and what is wrong with the capture
 
 __all__ = ["run"]
 
 _PHOTOS, _SCENE = "photos", "scene"
+_BEFORE = "before.safetensors"  # checkpoint that a fit to further photographs goes on from
+_SHARE_OF_STEPS = 0.5  # of those of the fit before, that further photographs get without a budget
 _FEWEST = 3  # photographs that a scene needs; two may have poses, but nothing is left to be held out
 
 
 def run(args: Capture) -> None:
-    """`drgs capture PATH... -o RUN`, and `drgs capture --more -o RUN`."""
+    """`drgs capture PATH... -o RUN`, with `--add` further photographs, and `drgs capture --more -o RUN`."""
     if args.more:
         _tell_next(args)
         return
+    before = CaptureRecord.read(args.output / FOLDER)
+    if not args.paths and args.resume and before is not None:
+        named = tuple(Path(row[0]) for row in before.batch.inputs)
+        args = dataclasses.replace(args, paths=named, add=len(before.batches) > 1)
     if not args.paths:
         raise ValueError(
             "there must be photographs, videos or a data set, got none; name them, e.g. drgs capture photos -o RUN"
@@ -64,7 +74,7 @@ def run(args: Capture) -> None:
     budget = None if args.budget is None else seconds_of_budget(args.budget)
     given = _dataset_of(args.paths)
     photographs, videos = ([], []) if given else named_files(args.paths)
-    if not given and not videos and len(photographs) < _FEWEST:
+    if not given and not videos and not args.add and len(photographs) < _FEWEST:
         raise ValueError(
             f"{args.paths[0]}: must be at least {_FEWEST} photographs, got {len(photographs)}; take thirty to eighty, "
             "each overlapping the one before by two thirds"
@@ -75,6 +85,10 @@ def run(args: Capture) -> None:
         claim(args.output / FOLDER, "capture", inputs=args.paths),
         _kept(args),
     ):
+        if args.add and given:
+            raise ValueError(f"{given.path}: --add must have photographs or videos, got a data set; name its pictures")
+        if args.add and before is not None:
+            photographs, videos = _new_files(args, before, photographs, videos)
         inputs = inputs_of([*photographs, *videos] or [given.path for given in [given] if given])
         record = _record(args, inputs, given is not None)
         _Capture(args, clock, record, given).run(photographs, videos)
@@ -112,41 +126,90 @@ def _dataset_of(paths: tuple[Path, ...]) -> Dataset | None:
         return None
 
 
+def _new_files(
+    args: Capture, before: CaptureRecord, photographs: list[Path], videos: list[Path]
+) -> tuple[list[Path], list[Path]]:
+    """Files that are not in a capture yet: a phone's folder has the old ones, too."""
+    others = before.batches[:-1] if args.resume and len(before.batches) > 1 else before.batches
+    others = others[:-1] if _is_droppable(before) and not args.resume else others
+    known = [row for batch in others for row in batch.inputs]
+    new = [[path for path in paths if inputs_of([path])[0] not in known] for paths in (photographs, videos)]
+    if not any(new):
+        raise ValueError(f"{args.paths[0]}: --add must have photographs that are not in the capture yet, got none")
+    if not args.quiet and (old := len(photographs) + len(videos) - sum(map(len, new))):
+        print(f"{old} of the files are in the capture already", flush=True)
+    return new[0], new[1]
+
+
+def _is_droppable(record: CaptureRecord) -> bool:
+    """Whether the last batch was to be added, and has changed nothing yet."""
+    return len(record.batches) > 1 and record.batch.step("poses") is None
+
+
 def _record(args: Capture, inputs: list, is_dataset: bool) -> CaptureRecord:
-    """The record to go on with.
+    """The record to go on with, whose last batch is the one to work at.
 
     Raises:
-        ValueError: If there is one and --resume is not given, or its files or options were others.
+        ValueError: If there is one and neither --resume nor --add is given, its files or options were others, or it
+            cannot be added to.
     """
     folder = args.output / FOLDER
     options = {"frames": args.frames, "masks": args.masks, "seed": args.seed}
     before = CaptureRecord.read(folder)
     if before is None:
+        if args.add:
+            raise ValueError(f"{args.output}: --add must have a capture to add to, found none; leave --add out")
         if is_run(args.output):
             raise ValueError(
                 f"{args.output}: must be a new folder, or that of a capture, holds a run of `drgs fit`; choose another"
             )
-        record = CaptureRecord(folder, inputs, options)
+        record = CaptureRecord(folder, [Batch(inputs, options)])
         record.write()
         return record
+    if args.add and not args.resume:
+        return _with_batch(args, before, Batch(inputs, options))
     if not args.resume:
         raise ValueError(
-            f"{args.output}: must be a new folder, holds a capture already; add --resume or choose another"
+            f"{args.output}: must be a new folder, holds a capture already; add --resume or --add, or choose another"
         )
-    if other := next((name for name, value in options.items() if before.options.get(name) != value), None):
+    if args.add != (len(before.batches) > 1):
+        now, advice = ("first", "leave --add out") if args.add else ("added", "say --add, too, or name no photographs")
+        raise ValueError(f"{args.output}: --resume must continue the last photographs, the {now} ones; {advice}")
+    was = before.batch.options
+    if other := next((name for name, value in options.items() if was.get(name) != value), None):
         raise ValueError(
-            f"{args.output}: --resume must continue the same capture, --{other} was {before.options.get(other)!r} and "
-            f"is {options[other]!r}; repeat the options or choose another folder"
+            f"{args.output}: --resume must continue the same capture, --{other} was {was.get(other)!r} and is "
+            f"{options[other]!r}; repeat the options or choose another folder"
         )
-    if before.inputs != inputs:
-        rows = [*before.inputs, *inputs]
-        changed = next((row[0] for row in rows if row not in before.inputs or row not in inputs), "their order")
+    if before.batch.inputs != inputs:
+        rows = [*before.batch.inputs, *inputs]
+        changed = next((row[0] for row in rows if row not in before.batch.inputs or row not in inputs), "their order")
         kind = "the data set" if is_dataset else "the photographs"
         raise ValueError(
             f"{args.output}: --resume must continue the same capture, {kind} changed: {changed}; name the same files "
             "or choose another folder"
         )
     return before
+
+
+def _with_batch(args: Capture, record: CaptureRecord, batch: Batch) -> CaptureRecord:
+    """A record whose last batch is a new one; one without poses is dropped, it has changed nothing."""
+    if _is_droppable(record):
+        record.batches.pop()
+    if not (record.path / _SCENE).is_dir():
+        raise ValueError(
+            f"{args.output}: --add must have a capture of photographs, this one was of a data set with poses; fit anew "
+            "to all of it"
+        )
+    if record.batch.step("report") is None:
+        raise ValueError(
+            f"{args.output}: --add must follow a capture that is done, this one is not; go on with --resume first"
+        )
+    if args.masks is not None or record.batches[0].options.get("masks") is not None:
+        raise ValueError(f"{args.output}: --add must have photographs without masks; capture all of them anew")
+    record.batches.append(batch)
+    record.write()
+    return record
 
 
 @contextlib.contextmanager
@@ -188,25 +251,33 @@ class _Capture:
         self.given = given
         self.run_folder = Run(args.output)
         self.folder = args.output / FOLDER
-        self._summary: SfmSummary | None = None
+        self.batch = record.batch
+        number = len(record.batches)
+        self.is_added = number > 1
+        self.photos = self.folder / (f"{_PHOTOS}_{number}" if self.is_added else _PHOTOS)
 
     def run(self, photographs: list[Path], videos: list[Path]) -> None:
         """All steps that are not done yet."""
         with Bar("capture", show=not self.args.quiet, lines_only=True):
-            if self.given is None:
-                self._step("photos", lambda: self._photos(photographs, videos))
-                self._step("poses", self._poses)
-            else:
-                self._step("poses", self._given)
-            self._step("fit", self._fit)
-            self._step("report", self._report)
+            for name, work in self._steps(photographs, videos).items():
+                self._step(name, work)
             self._finish()
+
+    def _steps(self, photographs: list[Path], videos: list[Path]) -> dict[str, Callable[[], Outcome]]:
+        """What each step is, in their order."""
+        steps: dict[str, Callable[[], Outcome]] = {}
+        if self.given is None:
+            steps["photos"] = lambda: self._photos(photographs, videos)
+            steps["poses"] = self._further_poses if self.is_added else self._poses
+        else:
+            steps["poses"] = self._given
+        return {**steps, "fit": self._fit, "report": self._report}
 
     # ------------------------------------------------------------------------------------------ steps
 
-    def _step(self, name: str, work: Callable[[], tuple[str, list[Finding]]]) -> None:
+    def _step(self, name: str, work: Callable[[], Outcome]) -> None:
         """One step, unless it is done; its outcome is told and recorded."""
-        before = self.record.step(name)
+        before = self.batch.step(name)
         if before is not None:
             self._say(f"{name}: {before.line} (done before)")
             return
@@ -216,28 +287,28 @@ class _Capture:
         self.record.done(Step(name, line, seconds), findings)
         self._say(f"{name}: {line} ({duration(seconds)})")
 
-    def _photos(self, photographs: list[Path], videos: list[Path]) -> tuple[str, list[Finding]]:
+    def _photos(self, photographs: list[Path], videos: list[Path]) -> Outcome:
         """All pictures in one folder."""
         with claim(self.folder, "capture") as held, Bar("photos") as bar:
-            if (self.folder / _PHOTOS).exists():
-                held.remove(self.folder / _PHOTOS)  # of a command that ended before it could say so
-            gathered = gather(photographs, videos, held, _PHOTOS, self.args.frames, bar.stage)
+            held.remove(self.photos)  # of a command that ended before it could say so
+            gathered = gather(photographs, videos, held, self.photos.name, self.args.frames, bar.stage)
         names = [path.name for path in list_images(gathered.folder)]
-        if len(names) < _FEWEST:
+        if len(names) < _FEWEST and not self.is_added:
             raise ValueError(
                 f"{self.args.paths[0]}: there must be at least {_FEWEST} pictures, got {len(names)}; film or "
                 "photograph more, and move while you do"
             )
         return gathered.line(), [*gathered.findings, *diagnosis.of_photographs(gathered.folder, names)]
 
-    def _poses(self) -> tuple[str, list[Finding]]:
+    def _poses(self) -> Outcome:
         """Structure from motion."""
-        photos = self.folder / _PHOTOS
+        photos = self.photos
         names = [path.name for path in list_images(photos)]
         size = {}
         if self.clock.budget is not None:
             plan = plan_poses(photos, names, self.clock.budget)
-            self.record.plan["poses"] = dataclasses.asdict(plan)
+            self.batch.plan["poses"] = dataclasses.asdict(plan)
+            self.record.write()
             size = {"max_image_size": plan.max_image_size}
             self._say(f"plan for {duration(self.clock.budget)}: {planned_poses(plan, len(names), self.clock.left)}")
         try:
@@ -252,7 +323,7 @@ class _Capture:
                     **size,
                 )
         except ValueError as error:
-            found = "".join(f"; {finding.line()}" for finding in self.record.findings)
+            found = "".join(f"; {finding.line()}" for finding in self.batch.findings)
             raise ValueError(f"poses: {error}{found}") from None
         line = (
             f"{summary.registered} of {summary.total} photographs have a pose, {summary.points} points, "
@@ -263,7 +334,46 @@ class _Capture:
             findings = diagnosis.of_poses(dataset, names, summary) + diagnosis.of_exposure(dataset, self.args.seed)
         return line, findings
 
-    def _given(self) -> tuple[str, list[Finding]]:
+    def _further_poses(self) -> Outcome:
+        """Poses of photographs that join others, whose own stay."""
+        scene = self.folder / _SCENE
+        files = list_images(self.photos)
+        if not (scene / HELD_OUT).is_file():
+            write_held_out(scene, fit_record(self.run_folder).test, "capture")
+        posed, summary = self._joined(scene, files), None
+        if not posed:
+            with claim(scene, "capture") as held:
+                for link in _links_to(scene / "images", files):  # of a command that ended before it had poses
+                    held.remove(link)
+            size = self.record.batches[0].plan.get("poses", {})
+            try:
+                with Bar("poses") as bar:
+                    summary = register(
+                        scene,
+                        files,
+                        bar.stage,
+                        seed=self.args.seed,
+                        doing=lambda text: bar.update(bar.done, text=text),
+                        **{key: size[key] for key in ("max_image_size",) if key in size},
+                    ).summary
+            except ValueError as error:
+                found = "".join(f"; {finding.line()}" for finding in self.batch.findings)
+                raise ValueError(f"poses: {error}{found}") from None
+            posed = self._joined(scene, files)
+        with Bar("what poses say"):
+            dataset = data.load(scene, semantics=False)
+            names = [path.name for path in list_images(scene / "images")]
+            findings = diagnosis.of_poses(dataset, names, summary) + diagnosis.of_exposure(dataset, self.args.seed)
+        line = f"{len(posed)} of {len(files)} further photographs have a pose, {len(dataset.views)} of all together"
+        return line, findings
+
+    def _joined(self, scene: Path, files: list[Path]) -> list[str]:
+        """Names of the further photographs that have a pose in the data set."""
+        named = {path.resolve() for path in files}
+        views = data.load(scene, lazy=True, points=False, semantics=False).views
+        return [view.name for view in views if view.image_path.resolve() in named]
+
+    def _given(self) -> Outcome:
         """What is to be said of a data set that has poses."""
         assert self.given is not None
         dataset = self._dataset(FitConfig())
@@ -274,9 +384,14 @@ class _Capture:
             findings = diagnosis.of_poses(dataset, names) + diagnosis.of_exposure(dataset, self.args.seed)
         return f"{views} photographs with their poses, as the data set has them", findings
 
-    def _fit(self) -> tuple[str, list[Finding]]:
-        """Gaussians."""
+    def _fit(self) -> Outcome:
+        """Gaussians: new ones, or, of photographs that join others, those that there are and more."""
         config = FitConfig.of(seed=self.args.seed, exposure="auto")
+        begin = None
+        if self.is_added:
+            begin = self._make_room()
+            before = recorded_config(self.batch.plan["before"]["fit"])
+            config = before.replace(max_steps=max(1, round(_SHARE_OF_STEPS * before.max_steps)), seed=self.args.seed)
         resume = is_run(self.args.output)
         if resume:
             config = _config_of(self.run_folder)
@@ -284,26 +399,59 @@ class _Capture:
         pace = None
         if self.clock.end is not None and not dataset.is_dynamic:
             if not resume:
-                plan = plan_fit(dataset, config, self.clock.left)
+                plan = plan_fit(dataset, config, self.clock.left, self.batch.plan.get("before", {}).get("gaussians", 1))
                 config = plan.config(config)
-                self.record.plan["fit"] = dataclasses.asdict(plan)
+                self.batch.plan["fit"] = dataclasses.asdict(plan)
                 self.record.write()
                 after = f"{duration(plan.after)} for what follows"
                 self._say(f"plan for the {duration(self.clock.left)} left: {plan.line()}, and {after}")
             else:
-                plan = FitPlan(**self.record.plan["fit"]) if "fit" in self.record.plan else None
+                plan = FitPlan(**self.batch.plan["fit"]) if "fit" in self.batch.plan else None
             rest = plan.after if plan else 0.1 * self.clock.left
             pace = Pacer(self.clock.end - rest, config.max_steps)
-        result = fit(dataset, self.args.output, config, resume=resume, pace=pace)
+        result = fit(dataset, self.args.output, config, resume=resume, pace=pace, begin=begin)
         mean = result.metrics["mean"]
         quality = f", held-out PSNR {mean['psnr']:.2f} dB" if result.metrics["views"] and mean.get("psnr") else ""
+        size = config.data.max_pixels
+        self.batch.result = {"psnr": mean.get("psnr") if quality else None, "max_pixels": size}
+        earlier = self.record.batches[-2].result if self.is_added else {}
+        if quality and earlier.get("psnr") is not None and earlier.get("max_pixels") == size:
+            quality += f", {earlier['psnr']:.2f} dB before"
+        if begin is not None:
+            with claim(self.folder, "capture") as held:
+                held.remove(begin)
         steps = result.metrics["step"]
         line = f"{len(result.gaussians)} Gaussians after {steps} steps{quality}"
         record = fit_record(result.run)
         psnr = {row["name"]: row["psnr"] for row in result.metrics["views"] if row.get("psnr") is not None}
         return line, diagnosis.of_views(dataset, record.train, psnr if result.metrics["split"] == "test" else {})
 
-    def _report(self) -> tuple[str, list[Finding]]:
+    def _make_room(self) -> Path:
+        """The checkpoint of the fit so far, beside the run, whose files give way to those of a fit that goes on."""
+        kept = self.folder / _BEFORE
+        if not self.batch.handover:
+            tensors, header = last_checkpoint(self.run_folder)
+            if tensors is None or header is None:
+                raise ValueError(f"{self.args.output}: must hold a checkpoint to go on from, found none; capture anew")
+            save_state(kept, tensors, header)
+            record = fit_record(self.run_folder)
+            self.batch.plan["before"] = {
+                "fit": record.config.to_json(),
+                "gaussians": len(tensors["parameter.means"]),
+            }
+            self._hand_over("kept")
+        if self.batch.handover == "kept":
+            with claim_run(self.run_folder, "capture") as held:
+                for name in (*FILES, "renders", NEXT):
+                    held.remove(self.run_folder.path / name)
+            self._hand_over("cleared")
+        return kept
+
+    def _hand_over(self, state: str) -> None:
+        self.batch.handover = state
+        self.record.write()
+
+    def _report(self) -> Outcome:
         """The page of the run."""
         record = fit_record(self.run_folder)
         dataset = record.with_refined_poses(
@@ -316,7 +464,7 @@ class _Capture:
 
     def _finish(self) -> None:
         """What to know at the next shoot, and what to do now."""
-        self._say_findings(self.record.findings)
+        self._say_findings(self.batch.findings)
         run = shlex.quote(str(self.args.output))
         used = time.monotonic() - self.clock.began
         of = "" if self.clock.budget is None else f" of {duration(self.clock.budget)}"
@@ -338,6 +486,12 @@ class _Capture:
         """What is wrong with the capture, one line each."""
         for finding in findings:
             self._say(f"at the next shoot: {finding.line()}")
+
+
+def _links_to(folder: Path, files: list[Path]) -> list[Path]:
+    """What in a folder is a link to one of the files."""
+    named = {path.resolve() for path in files}
+    return [path for path in folder.iterdir() if path.is_symlink() and path.resolve() in named]
 
 
 def _config_of(run: Run) -> FitConfig:

@@ -51,7 +51,9 @@ class Capture(Common):
     masks: str | None = None
     """Masks of an object that was turned or moved: a folder (NAME.png, white is kept), or alpha, the photos' own."""
     resume: bool = False
-    """Go on where an earlier command was stopped; name the same files and options."""
+    """Go on where an earlier command was stopped: with the same options, and the same files or none."""
+    add: bool = False
+    """Further photographs of what RUN shows: they join its data set, and the fit goes on from its Gaussians."""
     more: bool = False
     """Say which photographs to take next: where to stand, where to look, and what that is worth."""
     k: Annotated[int, arg(aliases=["-k"])] = 5

@@ -1,0 +1,95 @@
+"""A fit that begins with the Gaussians of another one, whose photographs have been joined by others."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from drgs.files import load_state
+from drgs.fitting.config import FitConfig
+from drgs.fitting.frames import Frame
+from drgs.fitting.records import check_checkpoint
+from drgs.fitting.rows import GaussianRows
+from drgs.integrator import render
+
+__all__ = ["Beginning", "begin_with"]
+
+_OPEN = 0.5  # opacity of a pixel below which nothing is taken to be there yet
+
+_log = logging.getLogger("drgs.train")
+
+
+@dataclasses.dataclass(frozen=True)
+class Beginning:
+    """What such a fit begins with.
+
+    Attributes:
+        rows: The Gaussians, without moments of an optimizer.
+        source: Where they come from, in words.
+    """
+
+    rows: GaussianRows
+    source: str
+
+
+def begin_with(
+    checkpoint: Path,
+    frames: list[Frame],
+    points: np.ndarray | None,
+    colors: np.ndarray | None,
+    config: FitConfig,
+) -> Beginning:
+    """The Gaussians of a checkpoint, and one at each point that new photographs show where these leave them empty.
+
+    Args:
+        checkpoint: File of a fit to what stands still.
+        frames: Training photographs, of which the checkpoint names those that are not new.
+        points, colors: (P, 3) of the data set, in the same world; None where it has none.
+        config: Configuration of the new fit.
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is damaged, or of a fit with features or to what moves.
+    """
+    tensors, header = load_state(checkpoint)
+    check_checkpoint(checkpoint, tensors, header)
+    old = GaussianRows.from_state(tensors)
+    names = {"means", "quats", "log_scales", "logit_opacities", "sh_dc", "sh_rest"}
+    if other := sorted({*old.tensors} - names):
+        raise ValueError(
+            f"{checkpoint}: a fit must go on from Gaussians with colors alone, these have {other[0]}; fit anew"
+        )
+    rows = GaussianRows(old.tensors)
+    rows.skybox = header.get("skybox", 0)
+    before = len(rows)
+    new = [frame for frame in frames if frame.name not in header["views"]]
+    room = config.density.max_gaussians - before
+    if points is not None and colors is not None and new and room > 0:
+        shown = _open_points(rows, new, points, config)
+        shown = np.sort(np.random.default_rng(config.seed).permutation(shown)[:room])
+        if len(shown):
+            chosen = torch.from_numpy(points[shown]), torch.from_numpy(colors[shown])
+            more = GaussianRows.from_points(*chosen, *config.density.start_of(False)).take(torch.arange(len(shown)))
+            del more["sh_rest"]  # 0 up to the degree that the others have
+            rows.append(more)
+    source = f"{before} Gaussians of an earlier fit, and {len(rows) - before} points that new photographs show"
+    _log.info("%s", source)
+    return Beginning(rows, source)
+
+
+def _open_points(rows: GaussianRows, frames: list[Frame], points: np.ndarray, config: FitConfig) -> np.ndarray:
+    """Indices of points that are in photographs where Gaussians leave them more than half transparent."""
+    found = np.zeros(len(points), bool)
+    with torch.no_grad():  # looked at only
+        gaussians = rows.gaussians()
+        for frame in frames:
+            alpha = render(gaussians, frame.camera, config.settings, outputs=()).alpha.cpu().numpy()
+            pixels, depth = frame.camera.project(points)
+            size = frame.camera.width, frame.camera.height
+            inside = np.flatnonzero((depth > 0) & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1))
+            columns, lines = pixels[inside].astype(int).T
+            found[inside[alpha[lines, columns] < _OPEN]] = True
+    return np.flatnonzero(found)
