@@ -17,7 +17,7 @@ import shlex
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from drgs import data
 from drgs.capturing import diagnosis
@@ -58,8 +58,14 @@ _SHARE_OF_STEPS = 0.5  # of those of the fit before, that further photographs ge
 _FEWEST = 3  # photographs that a scene needs; two may have poses, but nothing is left to be held out
 
 
-def run(args: Capture) -> None:
-    """`drgs capture PATH... -o RUN`, with `--add` further photographs, and `drgs capture --more -o RUN`."""
+def run(args: Capture, config: FitConfig | None = None) -> None:
+    """`drgs capture PATH... -o RUN`, with `--add` further photographs, and `drgs capture --more -o RUN`.
+
+    Args:
+        args: Options.
+        config: What the fit of the first photographs does where no budget says so; default that of `drgs fit`, with
+            exposures where photographs differ. The seed is that of the options.
+    """
     if args.more:
         _tell_next(args)
         return
@@ -91,7 +97,8 @@ def run(args: Capture) -> None:
             photographs, videos = _new_files(args, before, photographs, videos)
         inputs = inputs_of([*photographs, *videos] or [given.path for given in [given] if given])
         record = _record(args, inputs, given is not None)
-        _Capture(args, clock, record, given).run(photographs, videos)
+        config = (config or FitConfig.of(exposure="auto")).replace(seed=args.seed)
+        _Capture(args, clock, record, given, config).run(photographs, videos)
 
 
 def _tell_next(args: Capture) -> None:
@@ -244,11 +251,14 @@ class _Clock:
 class _Capture:
     """The steps of one capture."""
 
-    def __init__(self, args: Capture, clock: _Clock, record: CaptureRecord, given: Dataset | None) -> None:
+    def __init__(
+        self, args: Capture, clock: _Clock, record: CaptureRecord, given: Dataset | None, config: FitConfig
+    ) -> None:
         self.args = args
         self.clock = clock
         self.record = record
         self.given = given
+        self.config = config
         self.run_folder = Run(args.output)
         self.folder = args.output / FOLDER
         self.batch = record.batch
@@ -304,7 +314,7 @@ class _Capture:
         """Structure from motion."""
         photos = self.photos
         names = [path.name for path in list_images(photos)]
-        size = {}
+        size: dict[str, Any] = {}
         if self.clock.budget is not None:
             plan = plan_poses(photos, names, self.clock.budget)
             self.batch.plan["poses"] = dataclasses.asdict(plan)
@@ -371,7 +381,7 @@ class _Capture:
         """Names of the further photographs that have a pose in the data set."""
         named = {path.resolve() for path in files}
         views = data.load(scene, lazy=True, points=False, semantics=False).views
-        return [view.name for view in views if view.image_path.resolve() in named]
+        return [view.name for view in views if view.image_path and view.image_path.resolve() in named]
 
     def _given(self) -> Outcome:
         """What is to be said of a data set that has poses."""
@@ -386,7 +396,7 @@ class _Capture:
 
     def _fit(self) -> Outcome:
         """Gaussians: new ones, or, of photographs that join others, those that there are and more."""
-        config = FitConfig.of(seed=self.args.seed, exposure="auto")
+        config = self.config
         begin = None
         if self.is_added:
             begin = self._make_room()
@@ -396,7 +406,7 @@ class _Capture:
         if resume:
             config = _config_of(self.run_folder)
         dataset = self._dataset(config)
-        pace = None
+        pace, plan = None, None
         if self.clock.end is not None and not dataset.is_dynamic:
             if not resume:
                 plan = plan_fit(dataset, config, self.clock.left, self.batch.plan.get("before", {}).get("gaussians", 1))
@@ -405,8 +415,8 @@ class _Capture:
                 self.record.write()
                 after = f"{duration(plan.after)} for what follows"
                 self._say(f"plan for the {duration(self.clock.left)} left: {plan.line()}, and {after}")
-            else:
-                plan = FitPlan(**self.batch.plan["fit"]) if "fit" in self.batch.plan else None
+            elif "fit" in self.batch.plan:
+                plan = FitPlan(**self.batch.plan["fit"])
             rest = plan.after if plan else 0.1 * self.clock.left
             pace = Pacer(self.clock.end - rest, config.max_steps)
         result = fit(dataset, self.args.output, config, resume=resume, pace=pace, begin=begin)

@@ -103,9 +103,7 @@ def register(
 
 def _check(scene: Path, files: list[Path]) -> None:
     """Refuse what is no data set of ours, and files that are no photographs, before any work."""
-    missing = [
-        name for name in ("database.db", *(f"sparse/0/{name}" for name in _MODEL)) if not (scene / name).is_file()
-    ]
+    missing = [name for name in ("database.db", *(f"sparse/0/{name}" for name in _MODEL)) if not (scene / name).is_file()]
     if missing:
         raise FileNotFoundError(
             f"{scene}: must be a data set that `drgs sfm` made, has no {missing[0]}; run `drgs sfm PHOTOS -o {scene}` first"

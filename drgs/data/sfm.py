@@ -175,9 +175,7 @@ def _one_folder(paths: list[Path]) -> Path | None:
         return None
     folder = paths[0]
     if not folder.is_dir():
-        raise FileNotFoundError(
-            f"{folder}: must be a folder of photos, or a photo or video, found none; check the path"
-        )
+        raise FileNotFoundError(f"{folder}: must be a folder of photos, or a photo or video, found none; check the path")
     return None if list_videos(folder) else folder
 
 
