@@ -308,8 +308,8 @@ def setup(variant: str | None = None, threads: int | None = None) -> Backend:
 
 
 def thread_count() -> int:
-    """Threads that other libraries should take: those of the backend if there is one, else DRGS_THREADS, else every core
-    that this process may use.
+    """Threads that other libraries should take: those of the backend if there is one, else DRGS_THREADS, else every
+    core that this process may use.
     """
     return _active.threads if _active else _wanted_threads(None) or _usable_cores()
 

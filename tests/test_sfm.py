@@ -348,7 +348,7 @@ def test_bad_input(tmp_path, rng):
     plane_views(photos, rng, count=2)
     with pytest.raises(ValueError, match="camera_model must be one of .*, got 'FOV'"):
         run_sfm(photos, tmp_path / "out", camera_model="FOV")
-    with pytest.raises(ValueError, match="matching must be auto, exhaustive or sequential"):
+    with pytest.raises(ValueError, match="matching must be auto, exhaustive, sequential or retrieval"):
         run_sfm(photos, tmp_path / "out", matching="all")
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match="must be a folder that can be written, got: File exists"):

@@ -22,7 +22,7 @@ from drgs.data.checks import native_stderr
 from drgs.data.reader_process import serve
 from drgs.guards import memory
 
-__all__ = ["frame", "walk"]
+__all__ = ["frame", "gray", "walk"]
 
 _MAX_PIXELS = 2**31
 _MAX_FRAMES = 10**7  # four days at 30 a second; a time stamp of each is held
@@ -75,6 +75,22 @@ def frame(path: Path, version: Sequence[int], is_mp4: bool, index: int, tell: Ca
         _readers[key] = _Reader(path, video["stamps"], video["count"])
     _readers.move_to_end(key)
     return _readers[key].frame(index)
+
+
+def gray(
+    path: Path, version: Sequence[int], is_mp4: bool, index: int, longest: int, tell: Callable[[int], None]
+) -> np.ndarray:
+    """(h, w) uint8 of a frame, reduced.
+
+    Args:
+        path, version, is_mp4, index, tell: The arguments of `frame`.
+        longest: Pixels that the longer side has at most.
+    Raises:
+        ValueError: It cannot be decoded.
+    """
+    found = cv2.cvtColor(frame(path, version, is_mp4, index, tell), cv2.COLOR_RGB2GRAY)
+    scale = longest / max(found.shape)
+    return found if scale >= 1 else cv2.resize(found, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
 
 
 def _walk(path: Path, is_mp4: bool, tell: Callable[[int], None]) -> dict[str, Any]:
@@ -217,4 +233,4 @@ _readers: OrderedDict[tuple, _Reader] = OrderedDict()
 
 
 if __name__ == "__main__":
-    serve({"walk": walk, "frame": frame})
+    serve({"walk": walk, "frame": frame, "gray": gray})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import logging
 import shutil
@@ -15,14 +16,15 @@ import numpy as np
 
 from drgs.data.checks import IMAGE_SUFFIXES, list_images
 from drgs.data.shooting import Finding
-from drgs.data.video_frames import Picked, pick_frames
+from drgs.data.video_frames import Picked, look_at
 from drgs.data.videos import VIDEO_SUFFIXES, list_videos
 from drgs.files import SCHEMA
 from drgs.guards.foreign import refuse_foreign
+from drgs.guards.json_files import check_json, read_json
 from drgs.guards.outputs import Claim
 from drgs.guards.unfinished import temporary_folder
 
-__all__ = ["FRAMES", "Gathered", "fill", "gather", "named_files"]
+__all__ = ["FRAMES", "Gathered", "fill", "gather", "joined_frames", "named_files", "recorded_frames"]
 
 FRAMES = "frames.json"
 """Beside the pictures: which of them are of which video, and of which moment."""
@@ -56,7 +58,7 @@ class Gathered:
 
 
 def named_files(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
-    """Photographs and videos that paths name: files, or folders with some.
+    """Photographs and videos that paths name: files, or folders with some; each once.
 
     Raises:
         FileNotFoundError: Nothing there, or a folder without either.
@@ -84,7 +86,15 @@ def named_files(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
                 f"{path}: must be a photograph or a video ({', '.join(_SUFFIXES)}), got {path.suffix or 'no suffix'}; "
                 "convert it, or leave it out"
             )
-    return photographs, videos
+    return _once(photographs), _once(videos)
+
+
+def _once(files: Sequence[Path]) -> list[Path]:
+    """Files without those that were named before."""
+    first = dict[Path, Path]()
+    for file in files:
+        first.setdefault(file.resolve(), file)
+    return list(first.values())
 
 
 def _is_moment(video: Path, photographs: Sequence[Path]) -> bool:
@@ -140,52 +150,125 @@ def fill(
         command: Name of the command, for frames.json.
     """
     tell = progress or (lambda stage, done, total: None)
-    picked = _picked(videos, most, tell)
+    picked = _picked(videos, most, tell) if videos else []
     folder.mkdir()
+    names = list[str]()
     for path in photographs:
-        target = folder / _free_name(folder, path)
+        names.append(_free_name(folder, path))
+        target = folder / names[-1]
         try:
             target.symlink_to(path.resolve())
         except OSError:  # a file system without links
             shutil.copyfile(path, target)
     rows = list[dict[str, Any]]()
     total = sum(len(one.frames) for one in picked)
-    for video, one in zip(videos, picked, strict=True):
+    for video, stem, one in zip(videos, _stems(videos), picked, strict=True):
         for frame in one.frames:
             tell("frames", len(rows), total)
-            file = _free_name(folder, Path(video.parent.name) / f"{video.stem}_{frame.frame.index:06d}.jpg")
+            file = _free_name(folder, Path(video.resolve().parent.name) / f"{stem}_{frame.frame.index:06d}.jpg")
             pixels = np.ascontiguousarray(frame.frame.read()[..., ::-1])
             data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
             (folder / file).write_bytes(data.tobytes())
             row = {"file": file, "video": str(video), "index": frame.frame.index, "seconds": frame.seconds}
-            row |= {key: getattr(frame, key) for key in ("sharpness", "motion", "parallax", "why")}
-            rows.append({**row, "rolling_shutter": one.shutter, "readout_seconds": None})
+            rows.append({**row, **{key: getattr(frame, key) for key in ("sharpness", "motion", "parallax")}})
     findings = tuple(finding for one in picked for finding in one.findings)
-    if rows:
-        listed = {"schema": SCHEMA, "command": command, "frames": rows}
-        listed["findings"] = [dataclasses.asdict(finding) for finding in findings]
+    listed = {
+        "schema": SCHEMA,
+        "command": command,
+        "videos": [_video_row(video, one) for video, one in zip(videos, picked, strict=True)],
+        "frames": rows,
+        "findings": [dataclasses.asdict(finding) for finding in findings],
+    }
+    listed = joined_frames(listed if videos else None, photographs, names, command)
+    if listed is not None:
         (folder / FRAMES).write_text(json.dumps(listed, indent=1) + "\n")
     return Gathered(folder, len(photographs), len(rows), findings)
 
 
+def recorded_frames(folder: Path) -> dict[str, Any] | None:
+    """The content of the frames.json of a folder of pictures; None without one, or where it is not of ours.
+
+    Raises:
+        ValueError: One of ours that is damaged.
+    """
+    path = folder / FRAMES
+    if not path.is_file():
+        return None
+    found = read_json(path, "a list of frames that drgs wrote", "gather the frames again")
+    if not isinstance(found, dict) or not {"schema", "command", "frames"} <= found.keys():
+        return None
+    shape = {"videos": list, "frames": [{"file": str, "video": str}], "findings": list}
+    check_json(f"{path}", found, shape, "gather the frames again")
+    return found
+
+
+def joined_frames(
+    listed: dict[str, Any] | None, files: Sequence[Path], names: Sequence[str], command: str
+) -> dict[str, Any] | None:
+    """The content of a frames.json, and what those beside further pictures say of these.
+
+    Args:
+        listed: The content; None for none.
+        files: Pictures, some of which may be frames of videos by the frames.json of their folder.
+        names: What each of them is called here.
+        command: Name of the command that joins them.
+    Returns:
+        None if there is nothing to say.
+    Raises:
+        ValueError: A frames.json of ours that is damaged.
+    """
+    for folder in dict.fromkeys(file.parent for file in files):
+        more = recorded_frames(folder)
+        if more is None:
+            continue
+        name_of = {file.name: name for file, name in zip(files, names, strict=True) if file.parent == folder}
+        frames = [{**row, "file": name_of[row["file"]]} for row in more["frames"] if row["file"] in name_of]
+        if not frames:
+            continue
+        listed = listed or {"schema": SCHEMA, "command": command, "videos": [], "frames": [], "findings": []}
+        listed = {
+            **listed,
+            "videos": [*listed["videos"], *more["videos"]],
+            "frames": [*listed["frames"], *frames],
+            "findings": [*listed["findings"], *more["findings"]],
+        }
+    return listed
+
+
+def _video_row(video: Path, picked: Picked) -> dict[str, Any]:
+    """A video in frames.json. How long its sensor takes from the first line to the last one no file says."""
+    row = {"video": str(video), "frame_seconds": picked.frame_seconds, "readout_seconds": None}
+    return row | {"looks": picked.looks, "wanted": picked.wanted, "frames": len(picked.frames)}
+
+
 def _picked(videos: Sequence[Path], most: int, tell: Callable[[str, int, int], None]) -> list[Picked]:
     """Frames of each video; of several, as many of each as its share of those that are wanted."""
+    if most < max(1, len(videos)):
+        raise ValueError(f"frames: must be at least one of each video, {len(videos)}, got {most}; ask for more")
     found = []
     for video in videos:
+        found.append(look_at(video, lambda done, total, video=video: tell(f"looking at {video.name}", done, total)))
+    wanted = [min(one.wanted, most) for one in found]
+    shares = wanted
+    if sum(wanted) > most:  # one of each, and the rest by what is wanted
+        rest = most - len(wanted)
+        shares = [1 + int(rest * (one - 1) / max(sum(wanted) - len(wanted), 1)) for one in wanted]
+    return [one.pick(share) for one, share in zip(found, shares, strict=True)]
+
+
+def _stems(videos: Sequence[Path]) -> list[str]:
+    """What the names of frames begin with, of each video another: frames of one follow each other by name."""
+    found = list[str]()
+    for video in videos:
+        names = (video.stem, f"{video.resolve().parent.name}_{video.stem}")
         found.append(
-            pick_frames(video, most, lambda done, total, video=video: tell(f"frames of {video.name}", done, total))
+            next(name for name in (*names, *(f"{video.stem}_{k}" for k in itertools.count(2))) if name not in found)
         )
-    wanted = sum(min(one.wanted, most) for one in found)
-    if len(found) < 2 or wanted <= most:
-        return found
-    shares = [max(1, int(most * min(one.wanted, most) / wanted)) for one in found]
-    return [
-        pick_frames(video, share, lambda done, total, video=video: tell(f"frames of {video.name}", done, total))
-        for video, share in zip(videos, shares, strict=True)
-    ]
+    return found
 
 
 def _free_name(folder: Path, path: Path) -> str:
     """Name of a file that is not taken in a folder."""
-    names = (path.name, f"{path.parent.name}_{path.name}", *(f"{path.stem}_{k}{path.suffix}" for k in range(2, 10_000)))
+    numbered = (f"{path.stem}_{k}{path.suffix}" for k in itertools.count(2))
+    names = itertools.chain((path.name, f"{path.parent.name}_{path.name}"), numbered)
     return next(name for name in names if not (folder / name).is_symlink() and not (folder / name).exists())

@@ -1,13 +1,14 @@
 """Which pairs of photographs are matched: all of few; of many, neighbors by name and the nearest by appearance.
 
-Appearance is a global descriptor of a photograph's own local features: they are assigned to the nearest of a few centers,
-found in the capture itself by k-means, and their differences from it are summed up by center (VLAD). No vocabulary is
-downloaded; pycolmap's wheel carries none.
+Appearance is a global descriptor of a photograph's own local features: they are assigned to the nearest of a few
+centers, found in the capture itself by k-means, and their differences from it are summed up by center (VLAD). No
+vocabulary is downloaded; pycolmap's wheel carries none.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from drgs.data.matching import sequential_pairs
 
-__all__ = ["Pairing", "choose_pairs", "global_descriptors", "nearest_pairs"]
+__all__ = ["Pairing", "choose_new_pairs", "choose_pairs", "global_descriptors", "nearest_pairs"]
 
 MAX_EXHAUSTIVE = 60
 """Photographs of which all pairs are matched by default."""
@@ -24,6 +25,7 @@ MAX_EXHAUSTIVE_MASKED = 150
 _WINDOW = 10
 _NARROW_WINDOW = 4  # beside those that appearance finds
 _NEAREST = 20  # by appearance
+_NEAREST_NEW = 30  # the same for photographs that come later, whose only way into the model these are
 _CENTERS = 64
 _SAMPLE = 400  # features of a photograph that the centers are found from
 _ROUNDS = 12  # of k-means
@@ -72,13 +74,33 @@ def choose_pairs(database: Path, names: list[str], matching: str, is_masked: boo
     return Pairing(pairs, f"{len(pairs):,} of {total:,} pairs are matched: {what}; --matcher exhaustive matches all")
 
 
+def choose_new_pairs(database: Path, old: list[str], new: list[str], seed: int) -> Pairing:
+    """The pairs to match where photographs join others that are matched already: all with few, else the nearest.
+
+    Args:
+        database: COLMAP's database, with the features of all photographs.
+        old, new: Photographs that are there, and those that join them.
+        seed: Seed of the k-means.
+    """
+    names = [*old, *new]
+    total = len(new) * (len(new) - 1) // 2 + len(new) * len(old)
+    if len(names) <= MAX_EXHAUSTIVE:
+        return Pairing([(names[i], names[j]) for j in range(len(old), len(names)) for i in range(j)], "")
+    near = nearest_pairs(global_descriptors(database, names, seed), _NEAREST_NEW, firsts=len(old))
+    pairs = sorted({*((names[i], names[j]) for i, j in near), *sequential_pairs(new, _NARROW_WINDOW)})
+    if len(pairs) == total:
+        return Pairing(pairs, "")
+    what = f"the {_NEAREST_NEW} nearest by appearance, and the {_NARROW_WINDOW} next by name"
+    return Pairing(pairs, f"{len(pairs):,} of {total:,} pairs with new photographs are matched: {what}")
+
+
 def nearest_pairs(descriptors: np.ndarray, count: int, firsts: int | None = None) -> list[tuple[int, int]]:
     """Index pairs (i, j), i < j, of each photograph with its nearest ones.
 
     Args:
         descriptors: (V, D) of length 1.
         count: Partners of each.
-        firsts: Photographs before this number are looked for, not with: of those that are there when others come.
+        firsts: Photographs before this number have no partners of their own: those that are there when others come.
     """
     alike = descriptors @ descriptors.T
     np.fill_diagonal(alike, -np.inf)
@@ -111,14 +133,15 @@ def global_descriptors(database: Path, names: list[str], seed: int = 0) -> np.nd
         if not len(features):
             continue
         label = _nearest(features, centers)
-        np.add.at(found[index], label, features - centers[label])
+        sums, sizes = _sums(features, label, len(centers))
+        found[index] = sums - sizes[:, None] * centers
     found /= np.maximum(np.linalg.norm(found, axis=2, keepdims=True), 1e-12)
     flat = found.reshape(len(names), -1)
     flat = np.sign(flat) * np.sqrt(np.abs(flat))
     return flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
 
 
-def _features(database: Path, names: list[str]):
+def _features(database: Path, names: list[str]) -> Iterator[np.ndarray]:
     """(N, 128) float32 of length 1 of each photograph, in the order of names; one is held at a time."""
     from drgs.data.colmap_bindings import pycolmap
 
@@ -134,12 +157,18 @@ def _centers(features: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     count = min(_CENTERS, len(features))
     centers = features[np.sort(rng.choice(len(features), count, replace=False))].copy()
     for _ in range(_ROUNDS):
-        label = _nearest(features, centers)
-        sums = np.zeros_like(centers, np.float64)
-        np.add.at(sums, label, features)
-        sizes = np.bincount(label, minlength=count)
+        sums, sizes = _sums(features, _nearest(features, centers), count)
         centers[sizes > 0] = (sums[sizes > 0] / sizes[sizes > 0, None]).astype(np.float32)
     return centers
+
+
+def _sums(features: np.ndarray, label: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """(count, 128) float64 sum of the features of each label, and (count,) how many these are."""
+    order = np.argsort(label, kind="stable")
+    sizes = np.bincount(label, minlength=count)
+    ends = np.concatenate([np.zeros((1, features.shape[1])), np.cumsum(features[order], axis=0, dtype=np.float64)])
+    bounds = np.concatenate([[0], np.cumsum(sizes)])
+    return np.diff(ends[bounds], axis=0), sizes
 
 
 def _nearest(features: np.ndarray, centers: np.ndarray) -> np.ndarray:

@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drgs.data.checks import IMAGE_SUFFIXES, image_size
-from drgs.data.gathering import FRAMES
+from drgs.data.gathering import FRAMES, joined_frames, recorded_frames
 from drgs.data.mapping import PhotoGroups, map_photos
+from drgs.data.pairing import choose_new_pairs
 from drgs.data.photo_files import check_names, readable_photos
 from drgs.data.sfm import SfmSummary
-from drgs.guards.json_files import check_json, read_json
 from drgs.guards.outputs import claim
 from drgs.guards.unfinished import temporary_folder
 
@@ -103,7 +103,9 @@ def register(
 
 def _check(scene: Path, files: list[Path]) -> None:
     """Refuse what is no data set of ours, and files that are no photographs, before any work."""
-    missing = [name for name in ("database.db", *(f"sparse/0/{name}" for name in _MODEL)) if not (scene / name).is_file()]
+    missing = [
+        name for name in ("database.db", *(f"sparse/0/{name}" for name in _MODEL)) if not (scene / name).is_file()
+    ]
     if missing:
         raise FileNotFoundError(
             f"{scene}: must be a data set that `drgs sfm` made, has no {missing[0]}; run `drgs sfm PHOTOS -o {scene}` first"
@@ -184,8 +186,8 @@ def _registered(
             progress=report,
         )
         marks.append(time.perf_counter())
-        pairs = [(a, b) for i, b in enumerate(names) for a in (*old, *names[:i])]
-        match(database, pairs, seed=seed, progress=report)
+        chosen = choose_new_pairs(database, old, names, seed)
+        match(database, chosen.pairs, seed=seed, progress=report)
         marks.append(time.perf_counter())
         options = pycolmap.IncrementalPipelineOptions()
         options.random_seed = seed
@@ -208,7 +210,7 @@ def _registered(
     model = max(models.values(), key=lambda model: model.num_reg_images(), default=before)
     kept = {model.images[i].name for i in model.reg_image_ids()}
     parts = PhotoGroups.of(database, [*old, *names], kept, [])
-    lines = parts.lines([*old, *names], False, False)
+    lines = parts.lines([*old, *names], is_masked=False, is_partial=False)
     posed = tuple(name for name in names if name in kept)
     if not posed:
         raise ValueError(
@@ -228,6 +230,9 @@ def _registered(
         seconds={stage: marks[i + 1] - marks[i] for i, stage in enumerate(("features", "matching", "mapping"))},
         missing=tuple(name for name in (*old, *names) if name not in kept),
         explanation=tuple(lines),
+        matched=len(chosen.pairs),
+        pairs=len(names) * (len(names) - 1) // 2 + len(names) * len(old),
+        left_out=chosen.left_out,
     )
     return Registration(summary, tuple(names), posed, moved)
 
@@ -274,7 +279,7 @@ def _moved(before: Any, after: Any) -> float:
 def _install(output: Claim, partial: Path, files: list[Path], names: list[str]) -> None:
     """Add the photographs, then put the new database and the new model in the place of the old ones."""
     images = output.path / "images"
-    frames = _joined_frames(images, files, names)
+    frames = joined_frames(recorded_frames(images), files, names, output.command)
     if images.is_symlink():  # to the folder of the first photographs, which is not ours to add to
         made = partial / "images"
         made.mkdir()
@@ -295,33 +300,3 @@ def _install(output: Claim, partial: Path, files: list[Path], names: list[str]) 
     output.check(["sparse"])  # minutes later
     os.rename(output.path / "sparse", partial / "sparse_before")
     output.put(partial / "sparse", "sparse")
-
-
-def _joined_frames(images: Path, files: list[Path], names: list[str]) -> dict[str, Any] | None:
-    """The content of frames.json for the data set: that of its photographs, and of those among the new ones that are
-    frames of videos, under their new names; None where there is none.
-    """
-    joined = _frames_of(images)
-    for folder in dict.fromkeys(file.parent for file in files):
-        name_of = {file.name: name for file, name in zip(files, names, strict=True) if file.parent == folder}
-        more = _frames_of(folder)
-        if more is None:
-            continue
-        joined = joined or {**more, "frames": [], "findings": []}
-        rows = [{**row, "file": name_of[row["file"]]} for row in more["frames"] if row["file"] in name_of]
-        joined = {
-            **joined,
-            "frames": [*joined["frames"], *rows],
-            "findings": [*joined["findings"], *more["findings"]],
-        }
-    return joined
-
-
-def _frames_of(folder: Path) -> dict[str, Any] | None:
-    """The content of the frames.json of a folder; None without one."""
-    path = folder / FRAMES
-    if not path.is_file():
-        return None
-    found = read_json(path, "a list of frames that drgs wrote", "gather the frames again")
-    check_json(f"{path}", found, {"frames": [{"file": str}], "findings": list}, "gather the frames again")
-    return found

@@ -14,13 +14,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.data.checks import image_size, list_images
-from drgs.data.gathering import fill, named_files
+from drgs.data.gathering import fill, named_files, recorded_frames
 from drgs.data.mapping import PhotoGroups, map_photos
 from drgs.data.masks import ALPHA_MASKS, feature_mask, masked_photo, masks_of
 from drgs.data.pairing import choose_pairs
 from drgs.data.photo_files import check_names, readable_photos
 from drgs.data.videos import list_videos
-from drgs.guards.foreign import refuse_foreign
 from drgs.guards.outputs import claim
 from drgs.guards.unfinished import temporary_folder
 
@@ -92,10 +91,10 @@ def run_sfm(
 ) -> SfmSummary:
     """Find camera poses and points from photos or videos; afterwards `drgs.data.load(out_dir)` works.
 
-    Writes `out_dir/{database.db, sparse/0, images}`, and `masks` if there are any, where a fit finds them. Of one folder
-    of photos, `images` is a link to it where links work, a copy elsewhere, and so is `masks`; of several, or of videos,
-    it is a folder of links, of the frames that were picked, and of frames.json, which says when each was taken. An
-    earlier result of this function is replaced, and only once the new one is complete; nothing else ever is.
+    Writes `out_dir/{database.db, sparse/0, images}`, and `masks` if there are any, where a fit finds them. Of one
+    folder of photos, `images` is a link to it where links work, a copy elsewhere, and so is `masks`; of several, or of
+    videos, it is a folder of links, of the frames that were picked, and of frames.json, which says when each was taken.
+    An earlier result of this function is replaced, and only once the new one is complete; nothing else ever is.
 
     Args:
         photos: Folder of photos; or a photo, a video, a folder with some of both, or several of all these.
@@ -103,10 +102,11 @@ def run_sfm(
         progress: Called with (stage, done, total); stages are frames of each video, masks, features, matching and
             mapping. Of mapping, which may begin anew, `done` is the number of photos with a pose so far; it is called
             from another thread, too.
-        camera_model: COLMAP's name of the lens. Photos of one size share one camera.
+        camera_model: COLMAP's name of the lens. Photos of one size and focal length (EXIF) share one camera, and so do
+            frames of one video.
         max_image_size: Pixels on the longer side that features are found at; 0 for the photos' own.
-        matching: `exhaustive`, `sequential` (photos in the order of a walk or video), `retrieval` (those and the nearest
-            by appearance) or `auto` (exhaustive up to 60 photos, 150 with masks, then retrieval).
+        matching: `exhaustive`, `sequential` (photos in the order of a walk or video), `retrieval` (those and the
+            nearest by appearance) or `auto` (exhaustive up to 60 photos, 150 with masks, then retrieval).
         seed: Seed of all random sampling.
         masks: What features are looked for in, where an object was turned or moved between photos: a folder with a mask
             of every photo, `NAME.EXT.png` or `NAME.png`, white where the object is, of the photo's shape; or
@@ -145,21 +145,28 @@ def run_sfm(
                 gathered = fill(partial / "images", photographs, videos, "sfm", frames, report)
                 marks.append(time.perf_counter())
             folder = image_dir or partial / "images"
-            names, mask_files = _checked(folder, masks)
-            if mask_files is not None:
-                _write_masked(folder, names, mask_files, partial, report)
-            summary = _reconstruct(
-                folder,
-                names,
-                partial,
-                report,
-                doing or (lambda text: None),
-                camera_model,
-                max_image_size,
-                matching,
-                seed,
-                mask_files is not None,
-            )
+            try:
+                names, mask_files = _checked(folder, masks)
+                if mask_files is not None:
+                    _write_masked(folder, names, mask_files, partial, report)
+                summary = _reconstruct(
+                    folder,
+                    names,
+                    partial,
+                    report,
+                    doing or (lambda text: None),
+                    camera_model,
+                    max_image_size,
+                    matching,
+                    seed,
+                    mask_files is not None,
+                )
+            except ValueError as error:
+                if gathered is None:
+                    raise
+                text = str(error).replace(str(folder), str(paths[0]))
+                found = (finding.line() for finding in gathered.findings)
+                raise ValueError("; ".join([text, *found])) from None
             _install(partial, output, linked, made)
     if gathered is None:
         return summary
@@ -175,7 +182,9 @@ def _one_folder(paths: list[Path]) -> Path | None:
         return None
     folder = paths[0]
     if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: must be a folder of photos, or a photo or video, found none; check the path")
+        raise FileNotFoundError(
+            f"{folder}: must be a folder of photos, or photos or a video, found none; check the path"
+        )
     return None if list_videos(folder) else folder
 
 
@@ -244,23 +253,20 @@ def _reconstruct(
 ) -> SfmSummary:
     """Run the three stages; leaves `database.db` and `sparse/0` in `partial`."""
     from drgs.data.colmap_bindings import pycolmap
-    from drgs.data.matching import extract, match, quiet, state_focal_lengths
+    from drgs.data.matching import match, quiet, state_focal_lengths
 
     database = partial / "database.db"
-    shared = len({image_size(image_dir / name) for name in names}) == 1
     marks = [time.perf_counter()]
     with quiet():
         readable = readable_photos(image_dir, names, partial / "readable", report)
-        extract(
+        _extract(
             database,
             partial / "photos" if is_masked else readable,
-            names,
-            camera_model=camera_model,
-            shared_camera=shared,
-            max_image_size=max_image_size,
-            wide_baseline=True,
-            masks=partial / "masks" if is_masked else None,
-            progress=report,
+            _lenses(image_dir, readable, names, report),
+            camera_model,
+            max_image_size,
+            partial / "masks" if is_masked else None,
+            report,
         )
         if is_masked:
             state_focal_lengths(database, readable)
@@ -303,6 +309,60 @@ def _reconstruct(
         pairs=len(names) * (len(names) - 1) // 2,
         left_out=chosen.left_out,
     )
+
+
+def _lenses(image_dir: Path, readable: Path, names: list[str], report: Progress) -> list[list[str]]:
+    """Names of the photos that share a camera: frames of one video, or photos of one size and one focal length, as far
+    as EXIF states it.
+
+    Args:
+        image_dir: The photos, maybe with a frames.json.
+        readable: The same, as COLMAP reads them.
+        names: Their names.
+        report: Told that it has begun.
+    """
+    from drgs.data.colmap_bindings import pycolmap
+
+    videos = {row["file"]: row["video"] for row in (recorded_frames(image_dir) or {"frames": []})["frames"]}
+    groups = dict[tuple, list[str]]()
+    report("features", 0, len(names))
+    for name in names:
+        focal = ""
+        if name not in videos:
+            stated = pycolmap.infer_camera_from_image(readable / name)
+            focal = f"{stated.mean_focal_length():.3g}" if stated.has_prior_focal_length else ""
+        groups.setdefault((videos.get(name), image_size(image_dir / name), focal), []).append(name)
+    return list(groups.values())
+
+
+def _extract(
+    database: Path,
+    folder: Path,
+    lenses: list[list[str]],
+    camera_model: str,
+    max_image_size: int,
+    masks: Path | None,
+    report: Progress,
+) -> None:
+    """Features of all photos, those of each lens with a camera of theirs; those that share it with no other at once."""
+    from drgs.data.matching import extract
+
+    alone = [lens[0] for lens in lenses if len(lens) == 1]
+    groups = [*((lens, True) for lens in lenses if len(lens) > 1), *([(alone, False)] if alone else [])]
+    total, before = sum(len(lens) for lens in lenses), 0
+    for names, is_shared in groups:
+        extract(
+            database,
+            folder,
+            names,
+            camera_model=camera_model,
+            shared_camera=is_shared,
+            max_image_size=max_image_size,
+            wide_baseline=True,
+            masks=masks,
+            progress=lambda stage, done, _, before=before: report(stage, before + done, total),
+        )
+        before += len(names)
 
 
 def _install(partial: Path, output: Claim, linked: dict[str, Path], made: list[str]) -> None:

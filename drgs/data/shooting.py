@@ -12,7 +12,8 @@ class Finding:
     """Something that is wrong with photographs or a video.
 
     Attributes:
-        kind: Name of what it is: `turn`, `fast`, `blur`, `blank`, `overlap`, `poses`, `exposure` or `view`.
+        kind: Name of what it is: `turn`, `still`, `fast`, `blur`, `blank`, `overlap`, `poses`, `exposure` or
+            `view`.
         text: Where it is and what it is, a sentence without a full stop.
         advice: What to do about it, in the imperative.
     """

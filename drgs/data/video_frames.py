@@ -1,11 +1,12 @@
 """Frames of a video that structure from motion can use: sharp ones, with parallax between them.
 
-A video is looked at about ten times a second, reduced. Corners are tracked from look to look (Lucas-Kanade), the motion
-that a turn of the camera would make is fitted to the tracks and taken out, and what is left is parallax: the part of
-the motion that tells how far away things are. Frames are spread evenly over the sum of both, parallax counting most, so
-that a walk gives many frames, a camera at rest one, and a turn on the spot as many as keep its ends connected. Of each
-stretch the sharpest frame is taken, compared with those next to it alone: how sharp a frame is depends on what it
-shows, too.
+A video is looked at about ten times a second, reduced; each look is the sharpest of the frames around it. Corners are
+tracked from look to look (Lucas-Kanade), the motion that a turn of the camera would make is fitted to the tracks and
+taken out, and what is left is parallax: the part of the motion that tells how far away things are. Frames are spread
+evenly over what is new, which is parallax, or motion where that is large; so a walk gives many frames and a camera at
+rest one. A turn on the spot gives as many as keep what comes before it connected to what comes after, and none where
+nothing does. Of each stretch the sharpest frame is taken, compared with those next to it alone: how sharp a frame is
+depends on what it shows, too.
 """
 
 from __future__ import annotations
@@ -21,25 +22,32 @@ import numpy as np
 from drgs.data.shooting import Finding
 from drgs.data.videos import VideoFile, VideoFrame, read_video
 
-__all__ = ["PickedFrame", "Picked", "pick_frames"]
+__all__ = ["Looked", "Picked", "PickedFrame", "look_at", "pick_frames"]
 
 Progress = Callable[[int, int], None]
 
 _LOOKS = 10.0  # a second
 _MOST_LOOKS = 6_000  # ten minutes; of longer videos they are further apart
-_WIDTH = 480  # pixels of the longer side that is looked at
+_CANDIDATES = 3  # frames of a look, at most, of which the sharpest is kept
+_SHARP_AT = 960  # pixels of the longer side at which sharpness is measured
+_WIDTH = 480  # the same of motion
 _CORNERS = 400
 _FOCAL = 0.9  # of the longer side: phones have 0.7 to 1.1; a wrong one leaves a turn's motion of second order alone
 _PARALLAX = 0.02  # of the longer side, between two frames that are taken
-_MOTION = 0.12  # the same of all motion, where there is no parallax: such frames connect
+_MOTION = 0.12  # the same of all motion, where there is little parallax: such frames connect
+_TURN_STEP = 0.25  # the same within a turn, which is only to be bridged: three quarters are in both
 _FEWEST_TRACKS = 20
 _BLURRED = 0.45  # of the sharpness that is usual near by
 _NEAR = 1.5  # seconds that are near by
+_INSTEAD = 0.35  # seconds that a sharp frame may be away from a blurred one whose place it takes
 _TURN = 0.08  # share of parallax in the motion, below which the camera only turns
-_TURN_MOTION = 0.15  # of the longer side: least motion of a turn that is worth a sentence
+_TURN_MOTION = 0.15  # of the longer side, in a second: least motion of a turn that is worth a sentence
+_TURN_LENGTH = 1.0  # seconds: a shorter one is a step's
+_FEW = 3  # frames that a video must be worth beside its turns, for these to be left out
 _FAST = 0.12  # of the longer side from one look to the next, a tenth of a second or less
 _LONGEST_STEP = 0.3  # of the longer side: motion between two frames that leaves enough in both
 _SHORTEST = 0.4  # seconds: a stretch that is shorter is not worth a sentence
+_STILL = 0.2  # frames a second that are asked for, below which the camera hardly moves
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,14 +77,16 @@ class Picked:
     Attributes:
         frames: The frames, in order; at least one.
         findings: What is wrong with the video, and what to do about it at the next shoot.
-        looks: Number of frames that were looked at.
+        looks: Number of frames that were compared with the one before.
         wanted: Number of frames that parallax and motion ask for; more than `frames` where these were bounded.
+        frame_seconds: Time from one frame of the video to the next, on average; 0 of a single one.
     """
 
     frames: tuple[PickedFrame, ...]
     findings: tuple[Finding, ...]
     looks: int
     wanted: int
+    frame_seconds: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,11 +103,79 @@ class _Look:
     corners: int
 
 
+class Looked:
+    """A video that was looked at, from which frames can be picked.
+
+    Attributes:
+        wanted: Number of frames that parallax and motion ask for.
+    """
+
+    def __init__(self, video: VideoFile, looks: Sequence[_Look], frame_seconds: float) -> None:
+        self._video = video
+        self._looks = looks
+        self._frame_seconds = frame_seconds
+        self._times = np.array([look.seconds for look in looks])
+        values = np.array([look.sharpness for look in looks])
+        self._sharpness = values / _usual_sharpness(self._times, values)
+        self._turns = _turns(self._times, looks)
+        self._novelty, self._is_open = _novelty(looks, self._turns)
+        self.wanted = max(1, math.ceil(float(self._novelty[-1]) - 1e-9))
+
+    def pick(self, most: int) -> Picked:
+        """At most so many frames, at least one."""
+        chosen = _spread(self._novelty, self._sharpness, self._is_open, min(most, self.wanted))
+        chosen = _sharp_instead(chosen, self._times, self._sharpness, self._is_open)
+        frames = [self._taken(before, at) for before, at in zip([None, *chosen], chosen, strict=False)]
+        findings = self._findings(frames)
+        return Picked(tuple(frames), tuple(findings), len(self._looks), self.wanted, self._frame_seconds)
+
+    def _taken(self, before: int | None, at: int) -> PickedFrame:
+        """The frame at a look, with what moved since the one before."""
+        between = [] if before is None else self._looks[before + 1 : at + 1]
+        motion = float(np.nansum([look.motion for look in between]))
+        parallax = float(np.nansum([look.parallax for look in between]))
+        look = self._looks[at]
+        frame = VideoFrame(self._video.path, look.index)
+        return PickedFrame(frame, look.seconds, float(self._sharpness[at]), motion, parallax)
+
+    def _findings(self, frames: Sequence[PickedFrame]) -> list[Finding]:
+        """What is wrong with the video, the longest stretches first."""
+        name, times = self._video.path.name, self._times
+        motion = np.array([look.motion for look in self._looks])
+        found = list[tuple[float, Finding]]()
+
+        def add(stretches: Sequence[tuple[int, int]], kind: str, text: str, advice: str) -> None:
+            for start, end in stretches:
+                if times[end] - times[start] >= _SHORTEST:
+                    where = f"{name}, {times[start]:.1f} to {times[end]:.1f} s"
+                    found.append((times[end] - times[start], Finding(kind, f"{where}: {text}", advice)))
+
+        aside = "step sideways while you turn, or walk around what you film"
+        add(self._turns, "turn", "the camera only turns, which shows no depth", aside)
+        is_blank = np.array([look.corners < 2 * _FEWEST_TRACKS for look in self._looks])
+        is_fast = (np.nan_to_num(motion, nan=1.0) > _FAST) & ~is_blank
+        share = "the camera moves too fast, pictures that follow each other share little"
+        add(_stretches(is_fast), "fast", share, "film more slowly there")
+        add(_stretches(self._sharpness < _BLURRED), "blur", "blurred", "hold still or get more light there")
+        blank = "hardly anything to hold on to (sky, a blank wall, darkness)"
+        add(_stretches(is_blank), "blank", blank, "keep something with texture in view")
+        length = float(times[-1])
+        if not self._turns and self.wanted <= max(1.0, _STILL * length) and not is_blank.all():
+            text = f"{name}: the camera hardly moves in {length:.1f} s"
+            found.append((length, Finding("still", text, "walk around what you film")))
+        far = [frame for frame in frames[1:] if frame.motion > _LONGEST_STEP]
+        if len(far) > 0.1 * len(frames):
+            text = f"{name}: {len(far)} of {len(frames)} frames share little with the one before"
+            more = f"ask for more frames (--frames {self.wanted}), or " if self.wanted > len(frames) else ""
+            found.append((length, Finding("overlap", text, f"{more}film more slowly")))
+        return [finding for _, finding in sorted(found, key=lambda pair: -pair[0])]
+
+
 def pick_frames(path: Path, most: int = 150, progress: Progress | None = None) -> Picked:
     """Frames of a video for structure from motion.
 
     Args:
-        path: The video: mp4, webm, mkv or avi.
+        path: The video: mp4, mov, webm, mkv or avi.
         most: Largest number of frames.
         progress: Called with (frames looked at, all of these).
     Raises:
@@ -108,44 +186,49 @@ def pick_frames(path: Path, most: int = 150, progress: Progress | None = None) -
     """
     if most < 1:
         raise ValueError(f"frames: must be at least 1, got {most}; ask for some")
+    return look_at(path, progress).pick(most)
+
+
+def look_at(path: Path, progress: Progress | None = None) -> Looked:
+    """Sharpness and motion throughout a video, one frame after the other.
+
+    Args:
+        path, progress: The arguments of `pick_frames`.
+    Raises:
+        FileNotFoundError, ValueError: No video, or one that cannot be decoded.
+    """
+    tell = progress or (lambda done, total: None)
     video = read_video(Path(path))
-    looks = _looks(video, progress or (lambda done, total: None))
-    usual = _usual_sharpness(looks)
-    relative = np.array([look.sharpness for look in looks]) / usual
-    wanted = _novelty(looks)
-    asked = max(1, math.ceil(float(wanted[-1])))
-    chosen = _spread(wanted, relative, min(most, asked))
-    frames = [_picked(video, looks, relative, before, at) for before, at in zip([None, *chosen], chosen, strict=False)]
-    return Picked(tuple(frames), tuple(_findings(video.path, looks, relative, frames, asked)), len(looks), asked)
-
-
-def _looks(video: VideoFile, progress: Progress) -> list[_Look]:
-    """All looks at a video, one after the other: one frame is held at a time."""
     times = np.array(video.stamps) / 1000.0 if video.stamps else np.arange(video.count) / 30.0
     times = times - times[0]
     rate = (video.count - 1) / times[-1] if times[-1] > 0 else _LOOKS
     stride = max(1, int(rate / _LOOKS), math.ceil(video.count / _MOST_LOOKS))
-    indices = range(0, video.count, stride)
-    looks = []
+    looks = list[_Look]()
     before: np.ndarray | None = None
-    for done, index in enumerate(indices):
-        progress(done, len(indices))
-        gray = _reduced(VideoFrame(video.path, index).read())
+    for start in range(0, video.count, stride):
+        tell(start, video.count)
+        candidates = range(start, min(start + stride, video.count), math.ceil(stride / _CANDIDATES))
+        sharpness, index, gray = _sharpest(video.path, candidates)
         motion, parallax, corners = (0.0, 0.0, _CORNERS) if before is None else _moved(before, gray)
-        sharpness = float(cv2.Laplacian(gray, cv2.CV_32F).var())
         looks.append(_Look(index, float(times[index]), sharpness, motion, parallax, corners))
         before = gray
-    progress(len(indices), len(indices))
-    return looks
+    tell(video.count, video.count)
+    return Looked(video, looks, 1.0 / rate if video.count > 1 else 0.0)
 
 
-def _reduced(image: np.ndarray) -> np.ndarray:
-    """(h, w) uint8 of (H, W, 3) RGB, at most `_WIDTH` pixels along the longer side."""
-    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+def _sharpest(path: Path, indices: Sequence[int]) -> tuple[float, int, np.ndarray]:
+    """Sharpness and number of the sharpest of some frames, and (h, w) uint8 of it, small."""
+    found = []
+    for index in indices:
+        gray = VideoFrame(path, index).read_gray(_SHARP_AT)
+        # Noise is no sharpness: of single pixels it is a large part of the Laplacian's variance.
+        sharpness = float(cv2.Laplacian(cv2.GaussianBlur(gray, (0, 0), 0.8), cv2.CV_32F).var())
+        found.append((sharpness, index, gray))
+    sharpness, index, gray = max(found, key=lambda one: one[0])
     scale = _WIDTH / max(gray.shape)
-    if scale >= 1:
-        return gray
-    return cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    if scale < 1:
+        gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return sharpness, index, gray
 
 
 def _moved(before: np.ndarray, after: np.ndarray) -> tuple[float, float, int]:
@@ -194,96 +277,73 @@ def _without_turn(places: np.ndarray, flow: np.ndarray) -> np.ndarray:
     return left
 
 
-def _usual_sharpness(looks: Sequence[_Look]) -> np.ndarray:
+def _usual_sharpness(times: np.ndarray, sharpness: np.ndarray) -> np.ndarray:
     """Median sharpness within `_NEAR` seconds of each look."""
-    times = np.array([look.seconds for look in looks])
-    values = np.array([look.sharpness for look in looks])
     starts = np.searchsorted(times, times - _NEAR)
     ends = np.searchsorted(times, times + _NEAR, side="right")
-    usual = np.array([np.median(values[a:b]) for a, b in zip(starts, ends, strict=True)])
+    usual = np.array([np.median(sharpness[a:b]) for a, b in zip(starts, ends, strict=True)])
     return np.maximum(usual, 1e-6)
 
 
-def _novelty(looks: Sequence[_Look]) -> np.ndarray:
-    """How many frames should be taken up to each look."""
-    steps = [
-        1.0 if math.isnan(look.motion) else max(look.parallax / _PARALLAX, look.motion / _MOTION) for look in looks
-    ]
+def _turns(times: np.ndarray, looks: Sequence[_Look]) -> list[tuple[int, int]]:
+    """First and last look of each stretch in which the camera only turns."""
+    if len(looks) < 2:
+        return []
+    # Over a second: single looks are noisy.
+    window = max(1, round(1.0 / max(float(np.median(np.diff(times))), 1e-3)))
+    motion, parallax = (
+        np.convolve(np.nan_to_num([getattr(look, name) for look in looks]), np.ones(window), mode="same")
+        for name in ("motion", "parallax")
+    )
+    found = _stretches((motion > _TURN_MOTION) & (parallax < _TURN * motion))
+    return [(start, end) for start, end in found if times[end] - times[start] >= _TURN_LENGTH]
+
+
+def _novelty(looks: Sequence[_Look], turns: Sequence[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
+    """How many frames should be taken up to each look, and whether it may be taken itself.
+
+    Turns at either end, after or before which nothing comes, are left out, unless there is little else.
+    """
+    steps = np.array(
+        [1.0 if math.isnan(look.motion) else max(look.parallax / _PARALLAX, look.motion / _MOTION) for look in looks]
+    )
+    for start, end in turns:
+        bridging = [1.0 if math.isnan(look.motion) else look.motion / _TURN_STEP for look in looks[start : end + 1]]
+        steps[start : end + 1] = bridging
     steps[0] = 1.0  # the first frame
-    return np.cumsum(np.minimum(steps, 2.0))
+    steps = np.minimum(steps, 2.0)
+    is_open = np.ones(len(looks), bool)
+    for start, end in turns:
+        if start <= 1 or end >= len(looks) - 2:
+            is_open[start : end + 1] = False
+    if steps[is_open].sum() < _FEW:
+        is_open[:] = True
+    return np.cumsum(np.where(is_open, steps, 0.0)), is_open
 
 
-def _spread(wanted: np.ndarray, sharpness: np.ndarray, count: int) -> list[int]:
-    """Indices of looks: the sharpest of each of `count` stretches in which equally much is new."""
-    stretch = np.minimum((wanted - wanted[0]) / max(wanted[-1] - wanted[0], 1e-12) * count, count - 1e-9).astype(int)
+def _spread(wanted: np.ndarray, sharpness: np.ndarray, is_open: np.ndarray, count: int) -> list[int]:
+    """Numbers of looks: the sharpest of each of `count` stretches in which equally much is new."""
+    first = float(wanted[is_open][0])
+    span = max(float(wanted[-1]) - first, 1e-12)
+    stretch = np.clip((wanted - first) / span * count, 0, count - 1e-9).astype(int)
     chosen = []
     for number in range(count):
-        there = np.flatnonzero(stretch == number)
+        there = np.flatnonzero((stretch == number) & is_open)
         if len(there):
             chosen.append(int(there[np.argmax(sharpness[there])]))
     return chosen
 
 
-def _picked(
-    video: VideoFile, looks: Sequence[_Look], sharpness: np.ndarray, before: int | None, at: int
-) -> PickedFrame:
-    """The frame at a look, with what moved since the one before."""
-    between = looks[at : at + 1] if before is None else looks[before + 1 : at + 1]
-    motion = float(np.nansum([look.motion for look in between])) if before is not None else 0.0
-    parallax = float(np.nansum([look.parallax for look in between])) if before is not None else 0.0
-    look = looks[at]
-    return PickedFrame(VideoFrame(video.path, look.index), look.seconds, float(sharpness[at]), motion, parallax)
-
-
-def _findings(
-    path: Path, looks: Sequence[_Look], sharpness: np.ndarray, frames: Sequence[PickedFrame], asked: int
-) -> list[Finding]:
-    """What is wrong with a video, the longest stretches first."""
-    times = np.array([look.seconds for look in looks])
-    motion = np.array([look.motion for look in looks])
-    parallax = np.array([look.parallax for look in looks])
-    found = list[tuple[float, Finding]]()
-
-    def add(is_so: np.ndarray, kind: str, text: str, advice: str, least: float = _SHORTEST) -> None:
-        for start, end in _stretches(is_so):
-            length = times[end] - times[start]
-            if length >= least:
-                where = f"{path.name}, {times[start]:.1f} to {times[end]:.1f} s"
-                found.append((length, Finding(kind, f"{where}: {text}", advice)))
-
-    # Over a second: single looks are noisy.
-    window = max(1, round(1.0 / max(float(np.median(np.diff(times))) if len(times) > 1 else 1.0, 1e-3)))
-    sums = [np.convolve(np.nan_to_num(x), np.ones(window), mode="same") for x in (motion, parallax)]
-    turns = (sums[0] > _TURN_MOTION) & (sums[1] < _TURN * sums[0])
-    add(
-        turns,
-        "turn",
-        "the camera only turns, which shows no depth",
-        "step sideways while you turn, or walk around what you film",
-        least=1.0,
-    )
-    is_blank = np.array([look.corners < 2 * _FEWEST_TRACKS for look in looks])
-    is_fast = (np.nan_to_num(motion, nan=1.0) > _FAST) & ~is_blank
-    add(
-        is_fast,
-        "fast",
-        "the camera moves too fast, pictures that follow each other share little",
-        "film more slowly there",
-    )
-    add(sharpness < _BLURRED, "blur", "blurred", "hold still or get more light there")
-    add(
-        is_blank,
-        "blank",
-        "hardly anything to hold on to (sky, a blank wall, darkness)",
-        "keep something with texture in view",
-    )
-    far = [frame for frame in frames[1:] if frame.motion > _LONGEST_STEP]
-    if len(far) > 0.1 * len(frames):
-        text = f"{path.name}: {len(far)} of {len(frames)} frames share little with the one before"
-        found.append(
-            (times[-1], Finding("overlap", text, f"ask for more frames (--frames {asked}), or film more slowly"))
-        )
-    return [finding for _, finding in sorted(found, key=lambda pair: -pair[0])]
+def _sharp_instead(chosen: Sequence[int], times: np.ndarray, sharpness: np.ndarray, is_open: np.ndarray) -> list[int]:
+    """The same looks, but where one is blurred and another near by is not, that one."""
+    taken = set[int]()
+    for at in chosen:
+        if sharpness[at] < _BLURRED:
+            near = np.flatnonzero((np.abs(times - times[at]) <= _INSTEAD) & is_open & (sharpness >= _BLURRED))
+            if len(near):
+                at = int(near[np.argmin(np.abs(times[near] - times[at]))])
+        taken.add(at)
+    return sorted(taken)
 
 
 def _stretches(is_so: np.ndarray) -> list[tuple[int, int]]:

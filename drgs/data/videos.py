@@ -1,4 +1,4 @@
-"""Videos of synchronous cameras, read a frame at a time by a process of its own (decoding.py)."""
+"""Videos, read a frame at a time by a process of its own (decoding.py)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from drgs.guards.foreign import refuse_foreign
 
 __all__ = ["VIDEO_SUFFIXES", "VideoFile", "VideoFrame", "list_videos", "read_video"]
 
-VIDEO_SUFFIXES = (".mp4", ".webm", ".mkv", ".avi")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi")
 
 _decoder = Child("drgs.data.decoding", "a video that can be decoded", "convert it with ffmpeg, or leave it out")
 
@@ -37,12 +37,25 @@ class VideoFrame:
         Raises:
             FileNotFoundError, ValueError: No video, too short, or one whose frame cannot be decoded.
         """
+        video = self._video()
+        return _decoder.ask("frame", self.path, video.version, video.is_mp4, self.index)
+
+    def read_gray(self, longest: int) -> np.ndarray:
+        """(h, w) uint8, reduced to at most `longest` pixels along the longer side.
+
+        Raises:
+            FileNotFoundError, ValueError: As of `read`.
+        """
+        video = self._video()
+        return _decoder.ask("gray", self.path, video.version, video.is_mp4, self.index, longest)
+
+    def _video(self) -> VideoFile:
         video = read_video(self.path)
         if not 0 <= self.index < video.count:
             raise ValueError(
                 f"{self.path}: frame {self.index} must be there, the video has {video.count}; load the data set again"
             )
-        return _decoder.ask("frame", self.path, video.version, video.is_mp4, self.index)
+        return video
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,4 +119,6 @@ def _check_kind(path: Path) -> bool:
     if head[:4] == b"\x1aE\xdf\xa3" or (head[:4] == b"RIFF" and head[8:12] == b"AVI "):
         return False
     refuse_foreign(path, "a video")
-    raise ValueError(f"{path}: must be a video (mp4, webm, mkv, avi), begins as none of them; convert it with ffmpeg")
+    raise ValueError(
+        f"{path}: must be a video (mp4, mov, webm, mkv, avi), begins as none of them; convert it with ffmpeg"
+    )
