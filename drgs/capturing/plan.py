@@ -30,7 +30,16 @@ from drgs.guards.unfinished import temporary_folder
 if TYPE_CHECKING:
     from drgs.data import Dataset, View
 
-__all__ = ["FitPlan", "PosePlan", "duration", "plan_fit", "plan_poses", "planned_poses", "seconds_of_budget"]
+__all__ = [
+    "FitPlan",
+    "PosePlan",
+    "Stopwatch",
+    "duration",
+    "plan_fit",
+    "plan_poses",
+    "planned_poses",
+    "seconds_of_budget",
+]
 
 _UNITS = {"s": 1.0, "sec": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 _LEAST = 30.0  # seconds: less is not even enough to start all parts
@@ -195,7 +204,9 @@ def _pose_seconds(count: int, features: float, pair: float, scale: float) -> flo
     )
 
 
-def plan_fit(dataset: Dataset, config: FitConfig, left: float, least: int = 1) -> FitPlan:
+def plan_fit(
+    dataset: Dataset, config: FitConfig, left: float, least: int = 1, stopwatch: Stopwatch | None = None
+) -> FitPlan:
     """How large a fit of a data set may be, from timed steps.
 
     Args:
@@ -203,22 +214,24 @@ def plan_fit(dataset: Dataset, config: FitConfig, left: float, least: int = 1) -
         config: What else the fit does; its renderers are those that are timed.
         left: Seconds that are left, for the fit and what follows it.
         least: Gaussians that there are already, of which none are taken away.
+        stopwatch: What times steps; default one of this machine.
     """
+    stopwatch = stopwatch or Stopwatch()
     train, test = dataset.split(config.data.test_every, config.data.test_offset, config.data.test_cameras)
     largest = max(view.camera.width * view.camera.height for view in train)
     best: FitPlan | None = None
-    end = time.perf_counter() + left
+    end = stopwatch.now() + left
     before: float | None = None
     with Bar("how long steps take", len(_SIZES)) as bar:
         for number, (pixels, gaussians, steps) in enumerate(_SIZES):
             bar.update(number)
-            rest = end - time.perf_counter()
+            rest = end - stopwatch.now()
             if best is not None and before is not None and 2 * before * (_FEWER * steps + _TIMED) > rest - best.after:
                 break  # a step takes about twice as long as in the size before
             size = FitPlan(min(pixels, largest), max(gaussians, least), steps, 0.0)
-            each = _seconds_a_step(train, dataset, size.config(config), is_first=number == 0)
+            each = stopwatch.step(train, dataset, size.config(config), is_first=number == 0)
             after = _AFTER + each * (_TRAINING * len(train) + _HELD_OUT * len(test))
-            room = (1 - _END) * (end - time.perf_counter() - after)
+            room = (1 - _END) * (end - stopwatch.now() - after)
             there = math.floor(room / each)
             if best is not None and there < _FEWER * steps:
                 break
@@ -231,15 +244,27 @@ def plan_fit(dataset: Dataset, config: FitConfig, left: float, least: int = 1) -
     return best
 
 
-def _seconds_a_step(train: list[View], dataset: Dataset, config: FitConfig, is_first: bool) -> float:
-    """Seconds that a step takes on average, with as many Gaussians as there are on average.
+class Stopwatch:
+    """Times steps of a fit on this machine."""
 
-    Args:
-        train: Training views.
-        dataset: The data set.
-        config: Configuration with the sizes.
-        is_first: Whether to take all renderers' first steps, which compile, beforehand.
-    """
+    def now(self) -> float:
+        """Seconds of a clock that never goes back."""
+        return time.monotonic()
+
+    def step(self, train: list[View], dataset: Dataset, config: FitConfig, is_first: bool) -> float:
+        """Seconds that a step takes on average, with as many Gaussians as there are on average.
+
+        Args:
+            train: Training views.
+            dataset: The data set.
+            config: Configuration with the sizes.
+            is_first: Whether to take all renderers' first steps, which compile, beforehand.
+        """
+        return _seconds_a_step(train, dataset, config, is_first)
+
+
+def _seconds_a_step(train: list[View], dataset: Dataset, config: FitConfig, is_first: bool) -> float:
+    """`Stopwatch.step`."""
     views = train[:: max(1, len(train) // _TIMED_VIEWS)]
     with quietly(), fewer_torch_threads():
         frames = frames_for(views, config.data)

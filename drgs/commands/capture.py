@@ -86,9 +86,11 @@ def run(args: Capture, config: FitConfig | None = None) -> None:
             "each overlapping the one before by two thirds"
         )
     clock = _Clock(budget)
+    # Not the files: links to them in the folder of the capture may be made anew.
+    folders = {path if path.is_dir() else path.parent for path in args.paths}
     with (
-        claim_run(Run(args.output), "capture", True, args.paths),
-        claim(args.output / FOLDER, "capture", inputs=args.paths),
+        claim_run(Run(args.output), "capture", True, folders),
+        claim(args.output / FOLDER, "capture", inputs=folders),
         _kept(args),
     ):
         if args.add and given:
@@ -419,7 +421,9 @@ class _Capture:
                 plan = FitPlan(**self.batch.plan["fit"])
             rest = plan.after if plan else 0.1 * self.clock.left
             pace = Pacer(self.clock.end - rest, config.max_steps)
-        result = fit(dataset, self.args.output, config, resume=resume, pace=pace, begin=begin)
+        result = fit(
+            dataset, self.args.output, config, resume=resume, progress=not self.args.quiet, pace=pace, begin=begin
+        )
         mean = result.metrics["mean"]
         quality = f", held-out PSNR {mean['psnr']:.2f} dB" if result.metrics["views"] and mean.get("psnr") else ""
         size = config.data.max_pixels
@@ -468,8 +472,9 @@ class _Capture:
             load_dataset(record.data, record.config, lazy=True, points=False, semantics=False)
         )
         page = self.run_folder.path / FILE
-        claim_run(self.run_folder, "report").check([FILE])
-        report_of(self.run_folder, page, dataset)
+        with claim_run(self.run_folder, "report") as held:
+            held.check([FILE])
+            report_of(self.run_folder, page, dataset)
         return str(page), []
 
     def _finish(self) -> None:
