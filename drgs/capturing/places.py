@@ -37,6 +37,8 @@ _MOVES = (
 )
 _NEAR = 0.15  # of the way: a place that near to a photograph, or to another place, tells nothing new
 _BELOW, _ABOVE = 0.25, 0.5  # of the way, beyond the lowest and the highest photograph, that a person reaches
+_CLEAR = 0.1  # of the way: nothing solid is nearer to a place, or than half of it to the path there
+_BEGIN = 0.25  # of the path, that is not asked for
 _STEEPEST = 80.0  # degrees; straight down nobody can tell left from right
 _SMALL = 0.07  # of the way: a part of a move that is not worth a word
 _LEVEL = 5.0  # degrees of tilt that are level
@@ -186,13 +188,13 @@ def _is_free(start: np.ndarray, eye: np.ndarray, way: float, obstacles: np.ndarr
     """Whether nothing solid is near a place, nor on the way there from a photograph."""
     if not len(obstacles):
         return True
-    path = start + np.linspace(0.25, 1.0, 4)[:, None] * (eye - start)
-    clear = 0.1 * way * np.array([0.5, 0.5, 0.5, 1.0])
-    near = obstacles[np.linalg.norm(obstacles - eye, axis=1) < 2 * way]
-    return all(
-        not len(near) or np.linalg.norm(near - point, axis=1).min() > radius
-        for point, radius in zip(path, clear, strict=True)
-    )
+    if np.linalg.norm(obstacles - eye, axis=1).min() <= _CLEAR * way:
+        return False
+    # Beside the photograph itself somebody could stand.
+    start = start + _BEGIN * (eye - start)
+    along = eye - start
+    share = np.clip((obstacles - start) @ along / (along @ along), 0, 1)
+    return bool(np.linalg.norm(start + share[:, None] * along - obstacles, axis=1).min() > _CLEAR / 2 * way)
 
 
 def meters_of(text: str, centers: Mapping[str, np.ndarray]) -> float:

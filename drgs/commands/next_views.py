@@ -38,7 +38,7 @@ __all__ = ["rank_next"]
 _PIXELS = 20_000  # of views whose information is compared
 _SOLID = 0.3  # opacity of Gaussians that one does not walk through
 _MOST_SOLID = 20_000
-_EMPTY = 0.1  # of a picture, that may show nothing; more where photographs do
+_EMPTY = 0.25  # of a picture, that may show nothing beyond what photographs leave empty: a hole is to be looked at
 _LOOK = 2_500  # pixels of a picture that says how much shows nothing
 _MOST_PHOTOGRAPHS = 8  # of those there are, that the gain is compared with
 _SPREAD = 3.0  # times the median distance of cameras and what they see: floaters are beyond
@@ -76,7 +76,7 @@ def rank_next(run: Path, k: int, length: str | None, show: bool = True) -> list[
         places = places_around(list(cameras.values()), up, seen_distance(given.gaussians), obstacles)
         settings = given.settings("fast")
         # What looks past the scene would tell most, of what nobody wants to see.
-        most = max(_EMPTY, *(_empty_share(given.gaussians, camera, settings) for camera in train))
+        most = _EMPTY + max(_empty_share(given.gaussians, camera, settings) for camera in train)
         places = [place for place in places if _empty_share(given.gaussians, place.camera, settings) <= most]
         if not places:
             raise ValueError(f"{run}: there must be a place to stand at, found none that is free; use drgs select")
