@@ -260,10 +260,9 @@ def _stems(videos: Sequence[Path]) -> list[str]:
     """What the names of frames begin with, of each video another: frames of one follow each other by name."""
     found = list[str]()
     for video in videos:
-        names = (video.stem, f"{video.resolve().parent.name}_{video.stem}")
-        found.append(
-            next(name for name in (*names, *(f"{video.stem}_{k}" for k in itertools.count(2))) if name not in found)
-        )
+        numbered = (f"{video.stem}_{k}" for k in itertools.count(2))
+        names = itertools.chain((video.stem, f"{video.resolve().parent.name}_{video.stem}"), numbered)
+        found.append(next(name for name in names if name not in found))
     return found
 
 

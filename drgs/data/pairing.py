@@ -155,6 +155,8 @@ def _features(database: Path, names: list[str]) -> Iterator[np.ndarray]:
 def _centers(features: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """(K, 128) by k-means (Lloyd 1982), begun at random features."""
     count = min(_CENTERS, len(features))
+    if not count:
+        return np.zeros((0, 128), np.float32)
     centers = features[np.sort(rng.choice(len(features), count, replace=False))].copy()
     for _ in range(_ROUNDS):
         sums, sizes = _sums(features, _nearest(features, centers), count)

@@ -108,7 +108,7 @@ def _check(scene: Path, files: list[Path]) -> None:
     ]
     if missing:
         raise FileNotFoundError(
-            f"{scene}: must be a data set that `drgs sfm` made, has no {missing[0]}; run `drgs sfm PHOTOS -o {scene}` first"
+            f"{scene}: must be a data set that `drgs sfm` made, has no {missing[0]}; run it on all photographs"
         )
     if (scene / "masks").exists():
         raise ValueError(

@@ -33,10 +33,11 @@ _SHARP_AT = 960  # pixels of the longer side at which sharpness is measured
 _WIDTH = 480  # the same of motion
 _CORNERS = 400
 _FOCAL = 0.9  # of the longer side: phones have 0.7 to 1.1; a wrong one leaves a turn's motion of second order alone
-_PARALLAX = 0.02  # of the longer side, between two frames that are taken
+_PARALLAX = 0.01  # of the longer side, between two frames that are taken
 _MOTION = 0.12  # the same of all motion, where there is little parallax: such frames connect
 _TURN_STEP = 0.25  # the same within a turn, which is only to be bridged: three quarters are in both
 _FEWEST_TRACKS = 20
+_BLANK = 0.05  # frames a look where there is nothing to be tracked
 _BLURRED = 0.45  # of the sharpness that is usual near by
 _NEAR = 1.5  # seconds that are near by
 _INSTEAD = 0.35  # seconds that a sharp frame may be away from a blurred one whose place it takes
@@ -47,7 +48,8 @@ _FEW = 3  # frames that a video must be worth beside its turns, for these to be 
 _FAST = 0.12  # of the longer side from one look to the next, a tenth of a second or less
 _LONGEST_STEP = 0.3  # of the longer side: motion between two frames that leaves enough in both
 _SHORTEST = 0.4  # seconds: a stretch that is shorter is not worth a sentence
-_STILL = 0.2  # frames a second that are asked for, below which the camera hardly moves
+_STILL = (2, 0.2, 1.0)  # frames and frames a second that a camera at rest asks for at most; seconds of it at least
+_ASIDE = 0.25  # of relative sharpness: what a frame at the edge of its stretch must be sharper than one in the middle
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,7 +162,9 @@ class Looked:
         blank = "hardly anything to hold on to (sky, a blank wall, darkness)"
         add(_stretches(is_blank), "blank", blank, "keep something with texture in view")
         length = float(times[-1])
-        if not self._turns and self.wanted <= max(1.0, _STILL * length) and not is_blank.all():
+        most, rate, shortest = _STILL
+        is_still = not self._turns and self.wanted <= max(most, rate * length) and not is_blank.all()
+        if is_still and length >= shortest:
             text = f"{name}: the camera hardly moves in {length:.1f} s"
             found.append((length, Finding("still", text, "walk around what you film")))
         far = [frame for frame in frames[1:] if frame.motion > _LONGEST_STEP]
@@ -304,12 +308,9 @@ def _novelty(looks: Sequence[_Look], turns: Sequence[tuple[int, int]]) -> tuple[
 
     Turns at either end, after or before which nothing comes, are left out, unless there is little else.
     """
-    steps = np.array(
-        [1.0 if math.isnan(look.motion) else max(look.parallax / _PARALLAX, look.motion / _MOTION) for look in looks]
-    )
+    steps = np.array([_step(look, is_turn=False) for look in looks])
     for start, end in turns:
-        bridging = [1.0 if math.isnan(look.motion) else look.motion / _TURN_STEP for look in looks[start : end + 1]]
-        steps[start : end + 1] = bridging
+        steps[start : end + 1] = [_step(look, is_turn=True) for look in looks[start : end + 1]]
     steps[0] = 1.0  # the first frame
     steps = np.minimum(steps, 2.0)
     is_open = np.ones(len(looks), bool)
@@ -321,16 +322,25 @@ def _novelty(looks: Sequence[_Look], turns: Sequence[tuple[int, int]]) -> tuple[
     return np.cumsum(np.where(is_open, steps, 0.0)), is_open
 
 
+def _step(look: _Look, is_turn: bool) -> float:
+    """How many frames should be taken on the way to a look from the one before."""
+    if math.isnan(look.motion):  # nothing was found again: all is new, or there was nothing
+        return 1.0 if look.corners >= 2 * _FEWEST_TRACKS else _BLANK
+    return look.motion / _TURN_STEP if is_turn else max(look.parallax / _PARALLAX, look.motion / _MOTION)
+
+
 def _spread(wanted: np.ndarray, sharpness: np.ndarray, is_open: np.ndarray, count: int) -> list[int]:
-    """Numbers of looks: the sharpest of each of `count` stretches in which equally much is new."""
+    """Numbers of looks: a sharp one, rather in the middle, of each of `count` stretches with equally much in each."""
     first = float(wanted[is_open][0])
     span = max(float(wanted[-1]) - first, 1e-12)
-    stretch = np.clip((wanted - first) / span * count, 0, count - 1e-9).astype(int)
+    place = np.clip((wanted - first) / span * count, 0, count - 1e-9)
+    stretch = place.astype(int)
+    score = sharpness - _ASIDE * np.abs(2 * (place - stretch) - 1)
     chosen = []
     for number in range(count):
         there = np.flatnonzero((stretch == number) & is_open)
         if len(there):
-            chosen.append(int(there[np.argmax(sharpness[there])]))
+            chosen.append(int(there[np.argmax(score[there])]))
     return chosen
 
 
