@@ -59,6 +59,7 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"metrics"}, "pictures against photographs"),
     ({"train", "evaluation"}, "fits, for users, and what they are worth"),
     ({"report"}, "what a fit looked like, as a page"),
+    ({"capturing"}, "what photographs are worth, what there is time for, and where to stand next"),
     ({"lab"}, "experiments on all of the above"),
     ({"studies"}, "many fits, and what they say together"),
     ({"cluster"}, "all of this in other processes, on one machine or many"),
@@ -74,6 +75,7 @@ FACADE = {"cli": "the program", "runtime": "`__version__`, which the package sta
 
 # Names that more than one module defines: what they share is what the name says.
 SHARED = {
+    "Finding": "what is wrong, with a way to name it: of a shoot, or of a rasterizer",
     "run": "what the program calls of each command",
     "Scene": "the options of the command of that name, beside what is rendered",
     "View": "the options of the command of that name, beside what a data set holds",

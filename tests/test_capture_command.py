@@ -12,6 +12,7 @@ import os
 import shutil
 import types
 
+import json_page
 import numpy as np
 import pytest
 import torch
@@ -20,7 +21,7 @@ from drgs import cli
 from drgs.capturing import plan
 from drgs.capturing.pace import Pacer
 from drgs.capturing.record import CaptureRecord
-from drgs.commands.capture import run
+from drgs.commands.capture import capture_photographs, run
 from drgs.commands.making_options import Capture
 from drgs.data import load
 from drgs.data.held_out import HELD_OUT, write_held_out
@@ -100,18 +101,18 @@ def captured(photographs, tmp_path_factory):
     first = Capture(paths=(photographs / "first",), **options)
     again = Capture(resume=True, **options)
     with stopped_at("sharpness"):
-        run(first, CONFIG)
+        capture_photographs(first, CONFIG)
     assert steps_of(folder) == []
     with stopped_at("features"):
-        run(again, CONFIG)
+        capture_photographs(again, CONFIG)
     assert steps_of(folder) == ["photos"]
     with stopped_at_step(STEPS // 2):
-        run(again, CONFIG)
+        capture_photographs(again, CONFIG)
     assert steps_of(folder) == ["photos", "poses"]
     with stopped_at("maps of information"):
-        run(Capture(paths=(photographs / "first",), resume=True, **options), CONFIG)
+        capture_photographs(Capture(paths=(photographs / "first",), resume=True, **options), CONFIG)
     assert steps_of(folder) == ["photos", "poses", "fit"]
-    run(again, CONFIG)
+    capture_photographs(again, CONFIG)
     return folder
 
 
@@ -193,6 +194,11 @@ def test_further_photographs(joined, captured):
     assert [step.name for step in batches[1].steps] == ["photos", "poses", "fit", "report"]
     assert f"{first:.2f} dB before" in batches[1].steps[2].line
     assert not (folder / "capture/before.safetensors").exists()
+    of_budgets = {"poses", "max_image_size", "fit", "max_gaussians", "max_steps", "after"}
+    record = json.loads((folder / "capture/capture.json").read_text())
+    absent = (*of_budgets, "capture", "kept", "cleared")
+    json_page.check("capture.json", record, elsewhere=("config",), absent=absent)
+    json_page.check("held_out.json", json.loads((folder / "capture/scene" / HELD_OUT).read_text()))
 
 
 def test_further_photographs_end_with_the_same_bits(joined, captured, tmp_path):

@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 import math
 
+import json_page
 import numpy as np
 import pytest
 import torch
@@ -98,6 +99,7 @@ def test_the_first_place_looks_at_the_hole(half_seen, capsys):
     scores = [row["score"] for row in found["candidates"]]
     assert first["score"] == max(scores)
     assert len({pick["name"] for pick in found["picks"]}) == 4
+    json_page.check("next.json", found, maps=("parts",), absent=("capture", "select"))
     assert read_ranking(half_seen / "next.json").picked[0] == first["name"]
 
 

@@ -147,9 +147,11 @@ def test_fisher(place):
 
 
 _WRITERS = {
+    "capturing/record.py": {"capture.json"},
     "commands/crossval.py": {"crossval.json"},
     "commands/demo.py": {"demo.json"},
     "commands/fisher.py": {"fisher.json"},
+    "commands/next_views.py": {"next.json"},
     "commands/query.py": {"query.json"},
     "commands/render.py": {"render.json"},
     "commands/reproduce.py": {"reproduce.json"},  # and data.json, a map
@@ -158,6 +160,7 @@ _WRITERS = {
     "commands/teach.py": {"teach.json", "classes.json"},
     "commands/tradeoff.py": {"tradeoff.json"},
     "data/camera_lists.py": {"cameras.json"},
+    "data/held_out.py": {"held_out.json"},
     "files.py": {"config.json", "env.json", "log.jsonl"},
     "fitting/active.py": {"selection.json"},
     "metrics.py": {"metrics.json"},

@@ -24,7 +24,7 @@ class Pacer:
     what was planned. Schedules of a fit go by the share of its steps that is done, so that they end where they should.
 
     Args:
-        end: When the last step is to be done, as `clock` counts.
+        end: Time at which the last step is to be done, as `clock` counts.
         planned: Steps that were planned.
         clock: Seconds of a clock that never goes back.
     """

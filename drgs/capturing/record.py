@@ -11,7 +11,7 @@ from drgs.data.shooting import Finding
 from drgs.files import SCHEMA, write_json
 from drgs.guards.json_files import check_json, read_json
 
-__all__ = ["FOLDER", "Batch", "CaptureRecord", "Step", "inputs_of"]
+__all__ = ["FOLDER", "Batch", "CaptureRecord", "DoneStep", "inputs_of"]
 
 FOLDER = "capture"
 """Folder in the run: photographs, the data set that is made of them, and `capture.json`."""
@@ -31,7 +31,7 @@ _BATCH = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Step:
+class DoneStep:
     """A step that is done.
 
     Attributes:
@@ -55,21 +55,21 @@ class Batch:
         steps: Steps that are done, in order.
         findings: What is wrong with the photographs, and what to do at the next shoot.
         plan: What the budget is spent on, by step.
-        handover: How far the run of the batch before has made room for the fit that goes on from it: `` not yet,
-            `kept` its checkpoint is in the folder of the capture, `cleared` its other files are gone, too.
+        handover: How far the run of the batch before has made room for the fit that goes on from it: empty not
+            yet, `kept` its checkpoint is in the folder of the capture, `cleared` its other files are gone, too.
         result: Mean PSNR of the held-out views after the fit, in dB (None: there are none), and the pixels of a
             photograph; empty before.
     """
 
     inputs: list[list[Any]]
     options: dict[str, Any]
-    steps: list[Step] = dataclasses.field(default_factory=list)
+    steps: list[DoneStep] = dataclasses.field(default_factory=list)
     findings: list[Finding] = dataclasses.field(default_factory=list)
     plan: dict[str, Any] = dataclasses.field(default_factory=dict)
     handover: str = ""
     result: dict[str, Any] = dataclasses.field(default_factory=dict)
 
-    def step(self, name: str) -> Step | None:
+    def step(self, name: str) -> DoneStep | None:
         """A step that is done; None where it is not."""
         return next((step for step in self.steps if step.name == name), None)
 
@@ -112,7 +112,7 @@ class CaptureRecord:
             Batch(
                 batch["inputs"],
                 batch["options"],
-                [Step(**{key: step[key] for key in _STEP}) for step in batch["steps"]],
+                [DoneStep(**{key: step[key] for key in _STEP}) for step in batch["steps"]],
                 [Finding(**{key: one[key] for key in _FINDING}) for one in batch["findings"]],
                 batch["plan"],
                 batch["handover"],
@@ -133,7 +133,7 @@ class CaptureRecord:
             },
         )
 
-    def done(self, step: Step, findings: Sequence[Finding] = ()) -> None:
+    def done(self, step: DoneStep, findings: Sequence[Finding] = ()) -> None:
         """Add a step to the last batch, with what was found in it, and write."""
         self.batch.steps.append(step)
         self.batch.findings += findings

@@ -23,7 +23,7 @@ from drgs import data
 from drgs.capturing import diagnosis
 from drgs.capturing.pace import Pacer
 from drgs.capturing.plan import FitPlan, duration, plan_fit, plan_poses, planned_poses, seconds_of_budget
-from drgs.capturing.record import FOLDER, Batch, CaptureRecord, Step, inputs_of
+from drgs.capturing.record import FOLDER, Batch, CaptureRecord, DoneStep, inputs_of
 from drgs.commands.next_views import rank_next
 from drgs.commands.report import report_of
 from drgs.data.checks import list_images
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
     Outcome: TypeAlias = tuple[str, list[Finding]]  # of a step: its line, and what is wrong with the capture
 
-__all__ = ["run"]
+__all__ = ["capture_photographs", "run"]
 
 _PHOTOS, _SCENE = "photos", "scene"
 _BEFORE = "before.safetensors"  # checkpoint that a fit to further photographs goes on from
@@ -58,17 +58,24 @@ _SHARE_OF_STEPS = 0.5  # of those of the fit before, that further photographs ge
 _FEWEST = 3  # photographs that a scene needs; two may have poses, but nothing is left to be held out
 
 
-def run(args: Capture, config: FitConfig | None = None) -> None:
-    """`drgs capture PATH... -o RUN`, with `--add` further photographs, and `drgs capture --more -o RUN`.
+def run(args: Capture) -> None:
+    """`drgs capture PATH... -o RUN`, with `--add` further photographs, and `drgs capture --more -o RUN`."""
+    if args.more:
+        _tell_next(args)
+    else:
+        capture_photographs(args, FitConfig.of(exposure="auto"))
+
+
+def capture_photographs(args: Capture, config: FitConfig) -> None:
+    """All steps of a capture that are not done yet.
 
     Args:
         args: Options.
-        config: What the fit of the first photographs does where no budget says so; default that of `drgs fit`, with
-            exposures where photographs differ. The seed is that of the options.
+        config: What the fit of the first photographs does where no budget says so; the seed is that of the options.
+    Raises:
+        FileNotFoundError, ValueError: On bad options, photographs or videos, and a folder that is not to be written.
+        KeyboardInterrupt: On Ctrl-C; the steps that are done are kept.
     """
-    if args.more:
-        _tell_next(args)
-        return
     before = CaptureRecord.read(args.output / FOLDER)
     if not args.paths and args.resume and before is not None:
         named = tuple(Path(row[0]) for row in before.batch.inputs)
@@ -99,8 +106,7 @@ def run(args: Capture, config: FitConfig | None = None) -> None:
             photographs, videos = _new_files(args, before, photographs, videos)
         inputs = inputs_of([*photographs, *videos] or [given.path for given in [given] if given])
         record = _record(args, inputs, given is not None)
-        config = (config or FitConfig.of(exposure="auto")).replace(seed=args.seed)
-        _Capture(args, clock, record, given, config).run(photographs, videos)
+        _Capture(args, clock, record, given, config.replace(seed=args.seed)).run(photographs, videos)
 
 
 def _tell_next(args: Capture) -> None:
@@ -296,7 +302,7 @@ class _Capture:
         began = time.monotonic()
         line, findings = work()
         seconds = time.monotonic() - began
-        self.record.done(Step(name, line, seconds), findings)
+        self.record.done(DoneStep(name, line, seconds), findings)
         self._say(f"{name}: {line} ({duration(seconds)})")
 
     def _photos(self, photographs: list[Path], videos: list[Path]) -> Outcome:
@@ -402,7 +408,7 @@ class _Capture:
         begin = None
         if self.is_added:
             begin = self._make_room()
-            before = recorded_config(self.batch.plan["before"]["fit"])
+            before = recorded_config(self.batch.plan["before"]["config"])
             config = before.replace(max_steps=max(1, round(_SHARE_OF_STEPS * before.max_steps)), seed=self.args.seed)
         resume = is_run(self.args.output)
         if resume:
@@ -450,7 +456,7 @@ class _Capture:
             save_state(kept, tensors, header)
             record = fit_record(self.run_folder)
             self.batch.plan["before"] = {
-                "fit": record.config.to_json(),
+                "config": record.config.to_json(),
                 "gaussians": len(tensors["parameter.means"]),
             }
             self._hand_over("kept")
