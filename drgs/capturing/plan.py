@@ -8,11 +8,13 @@ Nothing is cut off while it runs: learning rates end where they should.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import logging
 import math
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -266,7 +268,7 @@ class Stopwatch:
 def _seconds_a_step(train: list[View], dataset: Dataset, config: FitConfig, is_first: bool) -> float:
     """`Stopwatch.step`."""
     views = train[:: max(1, len(train) // _TIMED_VIEWS)]
-    with quietly(), fewer_torch_threads():
+    with quietly(), _unlogged(), fewer_torch_threads():
         frames = frames_for(views, config.data)
         timed = config.replace(data=dataclasses.replace(config.data, skybox="off", exposure="off", poses="fixed"))
         trainer, *_ = start(_filled(dataset, config), views, frames, timed, None, None, False, 0)
@@ -279,6 +281,18 @@ def _seconds_a_step(train: list[View], dataset: Dataset, config: FitConfig, is_f
         for _ in range(_TIMED):
             trainer.step()
         return (time.perf_counter() - began) / _TIMED
+
+
+@contextlib.contextmanager
+def _unlogged() -> Iterator[None]:
+    """Keep what a fit says at its start off the terminal: this one is no fit to hear of."""
+    log = logging.getLogger("drgs.train")
+    level = log.level
+    log.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
 
 
 def _filled(dataset: Dataset, config: FitConfig) -> Dataset:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import shlex
 import time
 from collections.abc import Callable, Iterator
@@ -216,7 +217,7 @@ def _with_batch(args: Capture, record: CaptureRecord, batch: Batch) -> CaptureRe
             f"{args.output}: --add must have a capture of photographs, this one was of a data set with poses; fit anew "
             "to all of it"
         )
-    if record.batch.step("report") is None:
+    if any(record.batch.step(name) is None for name in ("fit", *_PAGES)):
         raise ValueError(
             f"{args.output}: --add must follow a capture that is done, this one is not; go on with --resume first"
         )
@@ -289,7 +290,10 @@ class _Capture:
             steps["poses"] = self._further_poses if self.is_added else self._poses
         else:
             steps["poses"] = self._given
-        return {**steps, "fit": self._fit, "report": self._report}
+        steps["fit"] = self._fit
+        for name, (file, write) in _PAGES.items():
+            steps[name] = functools.partial(self._page, file, write)
+        return steps
 
     # ------------------------------------------------------------------------------------------ steps
 
@@ -462,7 +466,7 @@ class _Capture:
             self._hand_over("kept")
         if self.batch.handover == "kept":
             with claim_run(self.run_folder, "capture") as held:
-                for name in (*FILES, "renders", NEXT):
+                for name in (*FILES, "renders", NEXT, *(file for file, _ in _PAGES.values())):
                     held.remove(self.run_folder.path / name)
             self._hand_over("cleared")
         return kept
@@ -471,17 +475,12 @@ class _Capture:
         self.batch.handover = state
         self.record.write()
 
-    def _report(self) -> Outcome:
-        """The page of the run."""
-        record = fit_record(self.run_folder)
-        dataset = record.with_refined_poses(
-            load_dataset(record.data, record.config, lazy=True, points=False, semantics=False)
-        )
-        page = self.run_folder.path / FILE
-        with claim_run(self.run_folder, "report") as held:
-            held.check([FILE])
-            report_of(self.run_folder, page, dataset)
-        return str(page), []
+    def _page(self, file: str, write: Callable[[Run], None]) -> Outcome:
+        """A page of the run, at its end."""
+        with claim_run(self.run_folder, "capture") as held:
+            held.check([file])
+            write(self.run_folder)
+        return str(self.run_folder.path / file), []
 
     def _finish(self) -> None:
         """What to know at the next shoot, and what to do now."""
@@ -507,6 +506,17 @@ class _Capture:
         """What is wrong with the capture, one line each."""
         for finding in findings:
             self._say(f"at the next shoot: {finding.line()}")
+
+
+def _write_report(run: Run) -> None:
+    """The report of a run, as `drgs report` writes it."""
+    record = fit_record(run)
+    dataset = load_dataset(record.data, record.config, lazy=True, points=False, semantics=False)
+    report_of(run, run.path / FILE, record.with_refined_poses(dataset))
+
+
+_PAGES: dict[str, tuple[str, Callable[[Run], None]]] = {"report": (FILE, _write_report)}
+"""Steps at the end, in their order: the file in the run that each makes, and how."""
 
 
 def _links_to(folder: Path, files: list[Path]) -> list[Path]:
