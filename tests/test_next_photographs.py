@@ -1,4 +1,4 @@
-"""`drgs capture --more`: where to stand for the next photograph and where to look, by geometry, and in words that say so."""
+"""`drgs capture --more`: where to stand for the next photograph and where to look, by geometry and in words."""
 
 from __future__ import annotations
 
@@ -10,17 +10,23 @@ import numpy as np
 import pytest
 import torch
 from test_data import save, write_image
+from test_view import viewers  # noqa: F401
+from viewing_client import Client
 
 import drgs
 from drgs import cli
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, look_at
 from drgs.capturing.places import Place, level_frame, meters_of, places_around, told_length
 from drgs.commands.next_views import rank_next
+from drgs.commands.options import View
+from drgs.commands.scene_input import SceneInput
+from drgs.commands.viewed import subject_of
 from drgs.data import load
 from drgs.data.capture import upright
 from drgs.fitting.config import FitConfig
 from drgs.train import fit
-from drgs.viewing.placed_views import read_ranking
+from drgs.viewing import panel
+from drgs.viewing.placed_views import placed_views_of, read_ranking
 
 UP = np.array([0.0, 0.0, 1.0])
 SIZE = 48
@@ -99,8 +105,48 @@ def test_the_first_place_looks_at_the_hole(half_seen, capsys):
     scores = [row["score"] for row in found["candidates"]]
     assert first["score"] == max(scores)
     assert len({pick["name"] for pick in found["picks"]}) == 4
-    json_page.check("next.json", found, maps=("parts",), absent=("capture", "select"))
+    json_page.check("next.json", found, maps=("parts",), absent=("capture", "select", "--length"))
     assert read_ranking(half_seen / "next.json").picked[0] == first["name"]
+
+
+def test_the_report_and_the_viewer_lead_there(half_seen):
+    """An arrow for each place on the map of the cameras, with its words; in the viewer with the score, too."""
+    picks = rank_next(half_seen, 3, None, show=False)
+    assert cli.main(["report", str(half_seen), "--quiet"]) == 0
+    page = (half_seen / "report.html").read_text()
+    assert "to be taken next (3)" in page
+    assert all(f"<li>{pick['text']}</li>" in page for pick in picks)
+    ranking = read_ranking(half_seen / "next.json")
+    views = placed_views_of(load(half_seen.parent / "data").views, [], ranking)
+    sights = {placed.best.camera.name: placed for placed in views}
+    for number, pick in enumerate(picks, 1):
+        placed = sights[pick["name"]]
+        assert placed.kind == "candidate"
+        assert placed.best.pick == number
+        assert placed.best.way.origin == pytest.approx(pick["origin"])
+        assert pick["text"] in panel.photograph(placed, placed.best)
+    damaged = json.loads((half_seen / "next.json").read_text())
+    damaged["picks"][0]["origin"] = damaged["candidates"][0]["origin"] = [1.0]
+    (half_seen / "next.json").write_text(json.dumps(damaged))
+    with pytest.raises(ValueError, match="origin must be 3 numbers"):
+        read_ranking(half_seen / "next.json")
+    assert cli.main(["report", str(half_seen), "--quiet"]) == 2
+
+
+def test_arrows_in_the_viewer(half_seen, viewers):  # noqa: F811
+    """One to each place, from where the photograph was taken that it is told from."""
+    picks = rank_next(half_seen, 2, None, show=False)
+    args = View(scene=half_seen, preset="fast")
+    looked = subject_of(args, SceneInput.of(args))
+    viewer = viewers(looked)
+    with Client(viewer.port) as client:
+        client.look(looked.first.pose.wxyz, looked.first.pose.position)
+        drawn = client.wait(lambda m: m.get("name") == "/ways" and "props" in m)["props"]["points"]
+    points = np.frombuffer(drawn, np.float32).reshape(-1, 2, 3) if isinstance(drawn, bytes) else np.asarray(drawn)
+    wanted = {(*pick["origin"], *np.array(pick["camera"]["c2w"])[:3, 3]) for pick in picks}
+    for row in points.reshape(-1, 6):
+        assert min(np.abs(np.array(other) - row).max() for other in wanted) < 1e-4
+    assert len(points) == 2
 
 
 def test_lengths_in_meters(half_seen):
