@@ -9,6 +9,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+from json_page import check
 from made_videos import film, pictures, walk_cameras
 from test_sfm import write_photo
 
@@ -79,6 +80,7 @@ def test_one_folder(shoot, walk, tmp_path):
     assert found.line() == f"3 photographs and {found.frames} frames of videos"
     assert 4 <= found.frames <= 10
     listed = rows_of(folder)
+    check("frames.json", {**listed, "findings": [{"kind": "blur", "text": "blurred", "advice": "hold still"}]})
     assert [row["video"] for row in listed["videos"]] == [str(path) for path in files[1]]
     assert [row["frames"] for row in listed["videos"]] == [
         sum(row["video"] == str(path) for row in listed["frames"]) for path in files[1]

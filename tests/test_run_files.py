@@ -160,6 +160,7 @@ _WRITERS = {
     "commands/teach.py": {"teach.json", "classes.json"},
     "commands/tradeoff.py": {"tradeoff.json"},
     "data/camera_lists.py": {"cameras.json"},
+    "data/gathering.py": {"frames.json"},
     "data/held_out.py": {"held_out.json"},
     "files.py": {"config.json", "env.json", "log.jsonl"},
     "fitting/active.py": {"selection.json"},

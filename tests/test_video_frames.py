@@ -9,7 +9,7 @@ from made_videos import RATE, film, pictures, turn_cameras, walk_cameras
 from test_data_points import HEIGHT, WIDTH
 
 from drgs import cli
-from drgs.data.video_frames import look_at, pick_frames
+from drgs.data.video_frames import examine, pick_frames
 
 
 def kinds(picked) -> list[str]:
@@ -92,7 +92,7 @@ def test_long_blur_is_told(walk, tmp_path):
 def test_a_turn_on_the_spot(tmp_path, focal):
     """Few frames and a finding, whatever the lens."""
     cameras = turn_cameras(walk_cameras(1, focal=focal)[0], 2 * RATE, step=0.06)
-    looked = look_at(film(tmp_path / "turn.mp4", pictures(cameras)))
+    looked = examine(film(tmp_path / "turn.mp4", pictures(cameras)))
     picked = looked.pick(150)
     assert kinds(picked) == ["turn"]
     assert "only turns, which shows no depth; step sideways" in picked.findings[0].line()

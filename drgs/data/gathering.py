@@ -16,7 +16,7 @@ import numpy as np
 
 from drgs.data.checks import IMAGE_SUFFIXES, list_images
 from drgs.data.shooting import Finding
-from drgs.data.video_frames import Picked, look_at
+from drgs.data.video_frames import Picked, examine
 from drgs.data.videos import VIDEO_SUFFIXES, list_videos
 from drgs.files import SCHEMA
 from drgs.guards.foreign import refuse_foreign
@@ -24,7 +24,7 @@ from drgs.guards.json_files import check_json, read_json
 from drgs.guards.outputs import Claim
 from drgs.guards.unfinished import temporary_folder
 
-__all__ = ["FRAMES", "Gathered", "fill", "gather", "joined_frames", "named_files", "recorded_frames"]
+__all__ = ["FRAMES", "Gathered", "fill", "gather", "joined_frames", "named_files", "recorded_frames", "write_frames"]
 
 FRAMES = "frames.json"
 """Beside the pictures: which of them are of which video, and of which moment."""
@@ -181,8 +181,18 @@ def fill(
     }
     listed = joined_frames(listed if videos else None, photographs, names, command)
     if listed is not None:
-        (folder / FRAMES).write_text(json.dumps(listed, indent=1) + "\n")
+        write_frames(folder / FRAMES, listed)
     return Gathered(folder, len(photographs), len(rows), findings)
+
+
+def write_frames(path: Path, listed: dict[str, Any]) -> None:
+    """A frames.json.
+
+    Args:
+        path: The file.
+        listed: The content, as `recorded_frames` and `joined_frames` give it.
+    """
+    path.write_text(json.dumps(listed, indent=1) + "\n")
 
 
 def recorded_frames(folder: Path) -> dict[str, Any] | None:
@@ -247,7 +257,7 @@ def _picked(videos: Sequence[Path], most: int, tell: Callable[[str, int, int], N
         raise ValueError(f"frames: must be at least one of each video, {len(videos)}, got {most}; ask for more")
     found = []
     for video in videos:
-        found.append(look_at(video, lambda done, total, video=video: tell(f"looking at {video.name}", done, total)))
+        found.append(examine(video, lambda done, total, video=video: tell(f"looking at {video.name}", done, total)))
     wanted = [min(one.wanted, most) for one in found]
     shares = wanted
     if sum(wanted) > most:  # one of each, and the rest by what is wanted

@@ -117,7 +117,7 @@ def global_descriptors(database: Path, names: list[str], seed: int = 0) -> np.nd
     Args:
         database: COLMAP's database, with features.
         names: Photographs.
-        seed: Of the sample and the first centers.
+        seed: Seed of the sample and the first centers.
     Reference:
         Jegou et al., "Aggregating local descriptors into a compact image representation", CVPR 2010; Arandjelovic and
         Zisserman, "All about VLAD", CVPR 2013.

@@ -6,7 +6,6 @@ goes on from the model with its frames and its lenses held. What has been fitted
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import time
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drgs.data.checks import IMAGE_SUFFIXES, image_size
-from drgs.data.gathering import FRAMES, joined_frames, recorded_frames
+from drgs.data.gathering import FRAMES, joined_frames, recorded_frames, write_frames
 from drgs.data.mapping import PhotoGroups, map_photos
 from drgs.data.pairing import choose_new_pairs
 from drgs.data.photo_files import check_names, readable_photos
@@ -41,7 +40,7 @@ class Registration:
     """What became of further photographs.
 
     Attributes:
-        summary: Of all photographs of the data set, old and new; `missing` may name old ones, too.
+        summary: What became of all photographs of the data set, old and new; `missing` may name old ones, too.
         added: Names in the data set of the new photographs, in the order in which they were given.
         posed: Those of them that have a pose.
         moved: Largest distance that a camera which was there moved, over the largest distance of such a camera to
@@ -290,7 +289,7 @@ def _install(output: Claim, partial: Path, files: list[Path], names: list[str]) 
     for name in names:
         output.put(partial / "photos" / name, f"images/{name}")
     if frames is not None:
-        (partial / FRAMES).write_text(json.dumps(frames, indent=1) + "\n")
+        write_frames(partial / FRAMES, frames)
         output.remove(images / FRAMES)
         output.put(partial / FRAMES, f"images/{FRAMES}")
     for stale in output.path.glob("database.db*"):

@@ -286,7 +286,7 @@ def _reconstruct(
         raise ValueError(
             f"{image_dir}: the photos must overlap and show texture, no two of {len(names)} could be connected; take "
             f"more photos with smaller steps, {'' if is_masked else 'name masks of what was turned (--masks), '}or try "
-            "--camera-model OPENCV"
+            "`drgs sfm --camera-model OPENCV`"
         )
     best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
     best.update_point_3d_errors()

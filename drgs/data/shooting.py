@@ -14,7 +14,7 @@ class Finding:
     Attributes:
         kind: Name of what it is: `turn`, `still`, `fast`, `blur`, `blank`, `overlap`, `poses`, `exposure` or
             `view`.
-        text: Where it is and what it is, a sentence without a full stop.
+        text: A sentence without a full stop that says where it is and what it is.
         advice: What to do about it, in the imperative.
     """
 

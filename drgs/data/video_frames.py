@@ -22,9 +22,7 @@ import numpy as np
 from drgs.data.shooting import Finding
 from drgs.data.videos import VideoFile, VideoFrame, read_video
 
-__all__ = ["Looked", "Picked", "PickedFrame", "look_at", "pick_frames"]
-
-Progress = Callable[[int, int], None]
+__all__ = ["ExaminedVideo", "Picked", "PickedFrame", "examine", "pick_frames"]
 
 _LOOKS = 10.0  # a second
 _MOST_LOOKS = 6_000  # ten minutes; of longer videos they are further apart
@@ -58,7 +56,7 @@ class PickedFrame:
 
     Attributes:
         frame: The frame, which decodes itself.
-        seconds: When it is shown, from the start of the video.
+        seconds: Time at which it is shown, from the start of the video.
         sharpness: Variance of the Laplacian, over what is usual within a second and a half; 1 is as sharp as its
             neighbors.
         motion: Median motion of what is seen since the frame taken before, over the longer side of the picture.
@@ -105,7 +103,7 @@ class _Look:
     corners: int
 
 
-class Looked:
+class ExaminedVideo:
     """A video that was looked at, from which frames can be picked.
 
     Attributes:
@@ -175,7 +173,7 @@ class Looked:
         return [finding for _, finding in sorted(found, key=lambda pair: -pair[0])]
 
 
-def pick_frames(path: Path, most: int = 150, progress: Progress | None = None) -> Picked:
+def pick_frames(path: Path, most: int = 150, progress: Callable[[int, int], None] | None = None) -> Picked:
     """Frames of a video for structure from motion.
 
     Args:
@@ -190,10 +188,10 @@ def pick_frames(path: Path, most: int = 150, progress: Progress | None = None) -
     """
     if most < 1:
         raise ValueError(f"frames: must be at least 1, got {most}; ask for some")
-    return look_at(path, progress).pick(most)
+    return examine(path, progress).pick(most)
 
 
-def look_at(path: Path, progress: Progress | None = None) -> Looked:
+def examine(path: Path, progress: Callable[[int, int], None] | None = None) -> ExaminedVideo:
     """Sharpness and motion throughout a video, one frame after the other.
 
     Args:
@@ -217,7 +215,7 @@ def look_at(path: Path, progress: Progress | None = None) -> Looked:
         looks.append(_Look(index, float(times[index]), sharpness, motion, parallax, corners))
         before = gray
     tell(video.count, video.count)
-    return Looked(video, looks, 1.0 / rate if video.count > 1 else 0.0)
+    return ExaminedVideo(video, looks, 1.0 / rate if video.count > 1 else 0.0)
 
 
 def _sharpest(path: Path, indices: Sequence[int]) -> tuple[float, int, np.ndarray]:
