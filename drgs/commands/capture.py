@@ -242,8 +242,8 @@ class _Clock:
     """Time of a capture.
 
     Attributes:
-        began: When it began, as `time.monotonic` counts.
-        end: When it is to be done; None without a budget.
+        began: Time of its beginning, as `time.monotonic` counts.
+        end: Time at which it is to be done; None without a budget.
     """
 
     def __init__(self, budget: float | None) -> None:

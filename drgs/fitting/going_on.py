@@ -29,7 +29,7 @@ class Beginning:
 
     Attributes:
         rows: The Gaussians, without moments of an optimizer.
-        source: Where they come from, in words.
+        source: Origin of the Gaussians, in words.
     """
 
     rows: GaussianRows

@@ -173,9 +173,9 @@ def _unknowns(
     known of both.
 
     Args:
-        dataset, frames, config, extent, strict: As in `start`.
+        dataset, frames, config, extent, strict: Arguments of `start`, and the extent of the scene.
         made: Parts without.
-        points: (P, 3) by which photographs are compared.
+        points: Points (P, 3) by which photographs are compared.
         shown: (V, P) bool, which photograph shows which point; None where all may.
     """
     found = evidence = None
