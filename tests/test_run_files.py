@@ -32,12 +32,13 @@ from drgs.testing import random_scene
 from drgs.train import SelectionConfig, fit
 
 _SOMETIMES = {
-    "config.json": {"frames", "absent", "semantics", "times", "poses", "exposure", "estimated", "lenses"},
+    "config.json": {"begin", "frames", "absent", "semantics", "times", "poses", "exposure", "estimated", "lenses"},
     "metrics.json": {"segmentation", "motion", "transients", "poses", "skybox", "scale"},
     "fisher.json": {"nuisances"},
 }
 """Fields of data sets that the tests here do not make, videos, missing images, lenses, a teacher, several times; and of
-what is not asked for: exposure, poses, a skybox, transients, larger pictures, eliminated unknowns.
+what is not asked for: exposure, poses, a skybox, transients, larger pictures, eliminated unknowns;
+of a fit that begins with the Gaussians of another one.
 """
 
 
