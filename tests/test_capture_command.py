@@ -417,6 +417,19 @@ def test_poses_are_planned(photographs):
     assert found.max_image_size == 320  # the photographs' own
 
 
+def test_frames_are_planned(tmp_path):
+    """As many as there is time for, at least twenty, at most what is asked for."""
+    video = tmp_path / "walk.mp4"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"mp4v"), 10, (96, 64))
+    image = np.random.default_rng(0).integers(0, 255, (64, 300, 3), np.uint8)
+    for index in range(30):
+        writer.write(np.ascontiguousarray(image[:, index : index + 96]))
+    writer.release()
+    assert plan.plan_frames(video, 0, 150, 1e7) == 150
+    assert plan.plan_frames(video, 0, 150, 1e-3) == 20
+    assert plan.plan_frames(video, 0, 8, 1e-3) == 8
+
+
 @pytest.mark.parametrize(("text", "seconds"), [("90s", 90), ("10min", 600), ("1.5h", 5400), (" 2 m ", 120)])
 def test_budgets(text, seconds):
     assert plan.seconds_of_budget(text) == seconds

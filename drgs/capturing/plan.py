@@ -22,6 +22,8 @@ import numpy as np
 
 from drgs.data.checks import image_size, read_image
 from drgs.data.matching import extract, match, quiet
+from drgs.data.pairing import MAX_EXHAUSTIVE
+from drgs.data.videos import VideoFrame, read_video
 from drgs.display.progress import Bar, quietly
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import frames_for
@@ -38,6 +40,7 @@ __all__ = [
     "Stopwatch",
     "duration",
     "plan_fit",
+    "plan_frames",
     "plan_poses",
     "planned_poses",
     "seconds_of_budget",
@@ -51,8 +54,8 @@ _POSES_SHARE = 0.4  # of the budget, that poses should not exceed
 # Mapping of 16 photographs (`banana`) took 3.6 s, of 292 (`bonsai`) 2,280 s, where one photograph's features of 1,600
 # pixels took 3.2 s: what features take tells how fast the machine is.
 _MAPPING = (3.6 / 3.2 / 16**2.22, 2.22)
-_EXHAUSTIVE = 60  # photographs up to which all pairs are matched, as in `drgs.data.sfm`
-_NEIGHBORS = 14  # pairs of each photograph where neighbors are matched
+_NEIGHBORS = 18  # pairs of each photograph where those near by name and by appearance are matched
+_FEWEST_FRAMES = 20  # however little time there is
 # (pixels of a photograph, Gaussians, steps) of fits, each about three times as long as the one before.
 _SIZES = (
     (12_000, 8_000, 400),
@@ -149,23 +152,52 @@ def plan_poses(folder: Path, names: Sequence[str], budget: float) -> PosePlan:
     """
     largest = max(image_size(folder / names[0]))
     chosen = [names[len(names) // 3], names[min(len(names) // 3 + 1, len(names) - 1)]]
-    with temporary_folder("plan") as made, Bar("how long poses will take"):
-        database = made / "database.db"
-        for name in chosen:
-            _write_small(folder / name, made / f"{name}.png")
-        two = [f"{name}.png" for name in chosen]
-        began = time.perf_counter()
-        with quiet():
-            extract(database, made, two, camera_model="SIMPLE_RADIAL", shared_camera=False, wide_baseline=True)
-            features = (time.perf_counter() - began) / len(two)
-            began = time.perf_counter()
-            match(database, [(two[0], two[1])])
-            pair = time.perf_counter() - began
+    with Bar("how long poses will take"):
+        features, pair = _timed_pair([read_image(folder / name) for name in chosen])
     measured = min(_FIRST_SIZE, largest)
     sizes = [size for size in _IMAGE_SIZES if size < largest]
     sizes = [*sizes[: len(_IMAGE_SIZES)], *([largest] if largest <= _IMAGE_SIZES[0] else [])]
     plans = [PosePlan(size, _pose_seconds(len(names), features, pair, size / measured)) for size in sorted(sizes)[::-1]]
     return next((plan for plan in plans if plan.seconds <= _POSES_SHARE * budget), plans[-1])
+
+
+def plan_frames(video: Path, photographs: int, most: int, budget: float) -> int:
+    """How many frames of videos there may be at most, so that poses, at the smallest size, leave time for the fit.
+
+    Args:
+        video: One of the videos; two of its frames are timed.
+        photographs: Number of photographs beside them.
+        most: Number of frames that is asked for.
+        budget: Seconds of the whole capture.
+    """
+    found = read_video(video)
+    first = found.count // 3
+    with Bar("how long poses will take"):
+        features, pair = _timed_pair([VideoFrame(video, min(first + k, found.count - 1)).read() for k in (0, 10)])
+    largest = max(found.width, found.height)
+    scale = min(_IMAGE_SIZES[-1], largest) / min(_FIRST_SIZE, largest)
+    allowed = _POSES_SHARE * budget
+    for count in range(most, _FEWEST_FRAMES, -1):
+        if _pose_seconds(photographs + count, features, pair, scale) <= allowed:
+            return count
+    return min(most, _FEWEST_FRAMES)
+
+
+def _timed_pair(images: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Seconds that features of a photograph take, and to match two of them, at `_FIRST_SIZE` pixels."""
+    with temporary_folder("plan") as made:
+        database = made / "database.db"
+        names = [f"{number}.png" for number in range(len(images))]
+        for name, image in zip(names, images, strict=True):
+            _write_small(image, made / name)
+        began = time.perf_counter()
+        with quiet():
+            extract(database, made, names, camera_model="SIMPLE_RADIAL", shared_camera=False, wide_baseline=True)
+            features = (time.perf_counter() - began) / len(names)
+            began = time.perf_counter()
+            match(database, [(names[0], names[1])])
+            pair = time.perf_counter() - began
+    return features, pair
 
 
 def planned_poses(plan: PosePlan, count: int, left: float) -> str:
@@ -183,11 +215,10 @@ def planned_poses(plan: PosePlan, count: int, left: float) -> str:
     )
 
 
-def _write_small(path: Path, target: Path) -> None:
-    """A photograph, of whatever format, as PNG of at most `_FIRST_SIZE` pixels along the longer side."""
+def _write_small(image: np.ndarray, target: Path) -> None:
+    """A photograph as PNG of at most `_FIRST_SIZE` pixels along the longer side."""
     import cv2
 
-    image = read_image(path)
     image = image[..., 2::-1] if image.ndim == 3 else image
     scale = min(1.0, _FIRST_SIZE / max(image.shape[:2]))
     small = cv2.resize(np.ascontiguousarray(image), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -196,7 +227,7 @@ def _write_small(path: Path, target: Path) -> None:
 
 def _pose_seconds(count: int, features: float, pair: float, scale: float) -> float:
     """Seconds of poses of `count` photographs at `scale` times the size at which `features` and `pair` were taken."""
-    pairs = count * (count - 1) / 2 if count <= _EXHAUSTIVE else count * _NEIGHBORS
+    pairs = count * (count - 1) / 2 if count <= MAX_EXHAUSTIVE else count * _NEIGHBORS
     factor, power = _MAPPING
     # Features are found by their number of pixels, and compared all to all.
     return (

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from drgs import data
 from drgs.capturing import diagnosis
 from drgs.capturing.pace import Pacer
-from drgs.capturing.plan import FitPlan, duration, plan_fit, plan_poses, planned_poses, seconds_of_budget
+from drgs.capturing.plan import FitPlan, duration, plan_fit, plan_frames, plan_poses, planned_poses, seconds_of_budget
 from drgs.capturing.record import FOLDER, Batch, CaptureRecord, DoneStep, inputs_of
 from drgs.commands.next_views import rank_next
 from drgs.commands.report import report_of
@@ -311,9 +311,14 @@ class _Capture:
 
     def _photos(self, photographs: list[Path], videos: list[Path]) -> Outcome:
         """All pictures in one folder."""
+        frames = self.args.frames
+        if videos and self.clock.budget is not None:
+            frames = plan_frames(videos[0], len(photographs), frames, self.clock.budget)
+            if frames < self.args.frames:
+                self._say(f"plan for {duration(self.clock.budget)}: at most {frames} frames of videos, for their poses")
         with claim(self.folder, "capture") as held, Bar("photos") as bar:
             held.remove(self.photos)  # of a command that ended before it could say so
-            gathered = gather(photographs, videos, held, self.photos.name, self.args.frames, bar.stage)
+            gathered = gather(photographs, videos, held, self.photos.name, frames, bar.stage)
         names = [path.name for path in list_images(gathered.folder)]
         if len(names) < _FEWEST and not self.is_added:
             raise ValueError(

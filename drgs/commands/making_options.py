@@ -57,7 +57,7 @@ class Capture(Common):
     more: bool = False
     """Say which photographs to take next: where to stand, where to look, and what that is worth."""
     k: Annotated[int, arg(aliases=["-k"])] = 5
-    """How many of these."""
+    """How many photographs --more suggests."""
     length: str | None = None
     """A distance you know, 'IMG_0001 IMG_0004 1.5 m': places are then told in meters."""
     seed: int = 0
