@@ -185,6 +185,7 @@ def test_further_photographs(joined, captured):
     assert config["test"] == Run(captured).config()["test"] == ["IMG_0"]
     assert config["train"] == [f"IMG_{index}" for index in range(1, 8)]
     assert config["points"].startswith("400 Gaussians of an earlier fit")
+    assert "It began with the Gaussians of another fit" in (folder / "report.html").read_text()
     first = json.loads((captured / "metrics.json").read_text())["mean"]["psnr"]
     second = json.loads((folder / "metrics.json").read_text())
     assert second["step"] == STEPS // 2
