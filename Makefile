@@ -51,6 +51,9 @@ smoke: setup
 	$(BIN)/drgs report out/smoke/run -o out/smoke/report.html
 	$(BIN)/drgs cite out/smoke/run
 	$(BIN)/drgs render out/smoke/run --frames 3 --width 64 --format png,exr,webm --depth -o out/smoke/render
+	echo '{"keyframes": [{"position": [0, 0, -3], "wxyz": [1, 0, 0, 0], "fov": 50, "seconds": 0}, {"position": [1, 0, -3], "wxyz": [1, 0, 0, 0], "fov": 40, "seconds": 0.2}]}' > out/smoke/flight.json
+	$(BIN)/drgs render out/smoke/run --path out/smoke/flight.json --width 64 -o out/smoke/flight.mp4
+	$(BIN)/drgs render out/smoke/run --panorama --width 64 -o out/smoke/panorama.jpg
 	rm -rf out/smoke/active
 	$(BIN)/drgs fit out/smoke/still_life -o out/smoke/active --views active --add 2 --every 10 --max-steps 40
 	$(BIN)/drgs select out/smoke/run --candidates dome --count 6 -k 2 -o out/smoke/selection.json
@@ -69,6 +72,7 @@ smoke: setup
 	$(BIN)/drgs teach --help
 	$(BIN)/drgs convert out/smoke/semantic out/smoke/labelled.ply --labels
 	$(BIN)/drgs convert out/smoke/run out/smoke/run.spz
+	$(BIN)/drgs convert out/smoke/run out/smoke/run.sog
 	$(BIN)/drgs scene kitchen -o out/smoke/kitchen --size 64x48 --cameras 3 --times 3 --spp 2
 	rm -rf out/smoke/moving
 	$(BIN)/drgs fit out/smoke/kitchen -o out/smoke/moving --max-steps 40 --max-gaussians 2000 --feature-width 8

@@ -126,6 +126,11 @@ def elsewhere(command: list[str]) -> str | None:
 
 def smaller(command: list[str]) -> list[str]:
     """The same command on little."""
+    if "--duration" in command:  # which says the same as the --frames of few
+        at = command.index("--duration")
+        command = command[:at] + command[at + 2 :]
+    if "--panorama" in command:
+        return [*command, "--frames", "2", "--width", "24", "--height", "12"]
     return [*command, *_SMALLER.get(command[0], []), *(["--add", "2", "--every", "2"] if "active" in command else [])]
 
 
@@ -146,8 +151,9 @@ def make_folder(folder: Path) -> Path:
     """Fill a folder with what pages speak of.
 
     `scene`, nine posed pictures of a few Gaussians; `data/room`, the same with a teacher's maps; `point_cloud.ply`
-    and `scene.ply`, the Gaussians; `cameras.json`, poses alone; `phone.mp4`, seconds of video, and `photos`, an empty
-    folder; `my_package/rasterizer.py`, a rasterizer in plain torch.
+    and `scene.ply`, the Gaussians; `cameras.json`, poses alone; `flight.json`, a flight through three of them;
+    `phone.mp4`, seconds of video, and `photos`, an empty folder; `my_package/rasterizer.py`, a rasterizer in plain
+    torch.
     """
     import cv2
     import numpy as np
@@ -190,6 +196,8 @@ def make_folder(folder: Path) -> Path:
     transforms = {"camera_model": "OPENCV", **lens, "depth_unit_scale_factor": 1e-3, "frames": frames}
     (folder / "scene/transforms.json").write_text(json.dumps(transforms))
     save_cameras_json(folder / "cameras.json", cameras[:6])
+    keys = [{"w2c": camera.w2c.tolist(), "fov": 50, "seconds": k} for k, camera in enumerate(cameras[:3])]
+    (folder / "flight.json").write_text(json.dumps({"keyframes": keys}))
     room = folder / "data/room"  # in place of the made one: the same views, with maps of chairs left and walls right
     shutil.copytree(folder / "scene", room)
     (room / "rgb_feature_langseg").mkdir()

@@ -327,11 +327,15 @@ def test_activations_beyond_what_a_format_holds(tmp_path):
 
 
 def test_scenes_of_no_gaussians(tmp_path):
-    """What PLY can hold, the others can."""
+    """What PLY can hold, most others can; those that cannot say so, and write nothing."""
     g = drgs.Gaussians(*(torch.zeros(shape) for shape in ((0, 3), (0, 4), (0, 3), (0,), (0, 4, 3))))
-    for suffix in ("ply", "spz", "glb"):
+    for suffix in ("ply", "spz", "glb", "compressed.ply"):
         save_gaussians(g, tmp_path / f"a.{suffix}")
         assert len(load_gaussians(tmp_path / f"a.{suffix}")) == 0
+    for suffix in ("sog", "splat"):
+        with pytest.raises(ValueError, match=rf"\.{suffix} must hold .*1.* got (0|none); write a PLY|one Gaussian"):
+            save_gaussians(g, tmp_path / f"a.{suffix}")
+        assert not (tmp_path / f"a.{suffix}").exists()
 
 
 def load_rows(path):
@@ -352,7 +356,7 @@ def test_a_codec_of_a_script(tmp_path, rng, capsys):
     write_sample(tmp_path / "a.splat", "a.splat", rng)
     rows, ply = tmp_path / "a.rows", tmp_path / "b.ply"
     assert drgs.cli.main(["convert", str(tmp_path / "a.splat"), str(rows), "--quiet"]) == 2
-    assert "a.rows must end with .ply, .spz, .glb, got .rows; choose one of these" in capsys.readouterr().err
+    assert "a.rows must end with .ply, .compressed.ply, .spz, .splat, .sog, .glb, got .rows" in capsys.readouterr().err
     CODECS["rows"] = Codec(".rows", load_rows, lambda path, head: head.startswith(b"ROWS"), encode=encode_rows)
     try:
         assert drgs.cli.main(["convert", str(tmp_path / "a.splat"), str(rows), "--quiet"]) == 0

@@ -409,6 +409,37 @@ def test_times_that_cannot_be_drawn(dataset, run, tmp_path, monkeypatch, capsys,
     assert "--time must have a scene that moves, this one stands still; drop it" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("stated", "options", "times"),
+    [
+        ((0.0, 1.0), "", [0.0, 0.5, 1.0]),
+        ((1.0, 0.5), "", [1.0, 0.75, 0.5]),
+        ((None, None), "", [0.0, 0.5, 1.0]),
+        ((None, None), "--time 0.5", [0.5, 0.5, 0.5]),
+        ((None, None), "--time 1..0", [1.0, 0.5, 0.0]),
+        ((0.0, 1.0), "--time 0", "--time must be left out, the keyframes of --path have times; drop it"),
+        ((0.0, 2.0), "", "keyframes[1]: time must be in 0..1, the times of the run, got 2; correct it"),
+    ],
+    ids=["own times", "backwards", "all times", "one time", "given times", "twice", "outside"],
+)
+def test_times_of_a_flight(dataset, run, tmp_path, monkeypatch, capsys, stated, options, times):
+    """Those of its keyframes, or of --time; a camera that stands still has a frame for each time."""
+    monkeypatch.setattr("drgs.data.load", lambda *_, **__: dataset)
+    key = {"position": [0, 0, -4], "wxyz": [1, 0, 0, 0], "fov": 40}
+    keys = [key | {"seconds": k} | ({} if x is None else {"time": x}) for k, x in enumerate(stated)]
+    (tmp_path / "flight.json").write_text(json.dumps({"keyframes": keys}))
+    line = f"render {run.path} --path {tmp_path / 'flight.json'} --frames 3 {options} --preset fast --width 20 --quiet"
+    code = cli.main([*line.split(), "-o", str(tmp_path / "out")])
+    if isinstance(times, str):
+        error = capsys.readouterr().err
+        assert (code, error.count("\n")) == (2, 1)
+        assert times in error
+    else:
+        assert code == 0
+        assert [camera["time"] for camera in cameras_of(tmp_path / "out")] == times
+        assert len(list((tmp_path / "out").glob("*.png"))) == 3
+
+
 def test_psnr_of_moving_pixels(dataset):
     """It is that of the pixels whose label moves, in the mean of the views that show one."""
     frames = load_frames(dataset.views[:2], 10**6)

@@ -124,6 +124,43 @@ def test_step_is_finished_and_the_same_signal_twice_is_one(start):
     assert (process.returncode, out, error) == (143, "saved\n", "Terminated\n")
 
 
+@pytest.mark.parametrize("wait", ["", "time.sleep(0.5)"])
+def test_the_same_signal_again_once_the_command_has_ended(wait):
+    """While the process says its line, and while Python shuts down; a second later it is one more, which ends it."""
+    code = f"""
+import atexit, os, signal, time
+from drgs.guards import interrupts
+atexit.register(lambda: (os.kill(os.getpid(), signal.SIGTERM), print("still here", flush=True)))
+try:
+    with interrupts.handled(lambda: None, str):
+        signal.raise_signal(signal.SIGTERM)
+except interrupts.Terminated:
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(0.01)
+    print("ended", flush=True)
+{wait}
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "ended\nstill here\n", "")
+
+
+def test_another_signal_later_is_no_repetition():
+    """A program that goes on after a command was ended has its own handlers back after that second."""
+    code = """
+import signal, time
+from drgs.guards import interrupts
+try:
+    with interrupts.handled(lambda: None, str):
+        signal.raise_signal(signal.SIGTERM)
+except interrupts.Terminated:
+    print("ended", flush=True)
+time.sleep(1.1)
+signal.raise_signal(signal.SIGTERM)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGTERM, "ended\n", "")
+
+
 def test_second_signal_ends_a_long_step(start, tmp_path):
     """The first one waits for its end, the next one does not."""
     process = start("long step")

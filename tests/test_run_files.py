@@ -171,8 +171,10 @@ _WRITERS = {
 """Module that writes JSON for users -> the sections of the page that tell its fields."""
 _OTHERS = {
     "codecs/gltf.py",  # the header of a .glb
+    "codecs/sog.py",  # the index in a .sog
     "commands/info.py",  # stdout
     "commands/repeat.py",  # options on a line of a report
+    "data/flight_files.py",  # flight.json: docs/view.md
     "data/reader_process.py",  # between processes
     "guards/json_files.py",  # a message
     "guards/locks.py",  # .drgs.lock
@@ -221,7 +223,21 @@ def test_render_and_query(place):
     cameras = ["--cameras", str(place / "cameras.json"), "--limit", "1", "--quiet"]
     made = ["--format", "png,webm,ply", "--depth", "-o", str(place / "rendered")]
     assert cli.main(["render", str(place / "all"), *cameras, *made]) == 0
-    check("render.json", _read(place / "rendered/render.json"))
+    flown = [
+        "--path",
+        str(place / "flight.json"),
+        "--frames",
+        "2",
+        "--width",
+        "24",
+        "-o",
+        str(place / "flown"),
+        "--quiet",
+    ]
+    key = {"position": [0, 0, -3], "wxyz": [1, 0, 0, 0], "fov": 50, "seconds": 0}
+    (place / "flight.json").write_text(json.dumps({"keyframes": [key, key | {"seconds": 1}]}))
+    assert cli.main(["render", str(place / "all"), *flown]) == 0
+    check("render.json", *(_read(place / name / "render.json") for name in ("rendered", "flown")))
     check("cameras.json", _read(place / "rendered/cameras.json"), absent=("time",))
     save_ply(labelled(), place / "labelled.ply")
     save_decoder(decoder(), place / "decoder.pth")

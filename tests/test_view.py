@@ -33,6 +33,7 @@ from drgs.commands.options import View
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewed import subject_of, watched_files
 from drgs.data import load
+from drgs.data.flight_files import read_flight
 from drgs.display.pictures import map_colors
 from drgs.files import load_state, save_state
 from drgs.viewing import panel
@@ -674,6 +675,57 @@ def test_a_slider_moves_what_moves(viewers):
         client.picture()
         assert "time" not in client.labels()
         assert "show" in client.labels()
+
+
+@pytest.mark.parametrize("times", [(), (0.0, 0.5, 1.0)])
+def test_a_flight_is_made_in_the_browser(viewers, tmp_path, times):
+    """Keyframes where the camera is, with the time that is shown; a preview ends at the last one; what is saved is read
+    by `drgs render --path`."""
+
+    class Moving:
+        def at(self, time):
+            return blobs(torch.tensor([[float(time), 0.0, 0.0]]))
+
+        def parameters(self):
+            return {}
+
+    fields = {"scene": Moving(), "times": times} if times else {}
+    looked = subject(torch.zeros(1, 3), origin=np.array([10.0, 0, 0]), **fields)
+    viewer = viewers(looked)
+    identity = np.array([1.0, 0, 0, 0])
+    with Client(viewer.port) as client:
+        client.look(identity, (0, 0, -3))
+        client.picture()
+        client.choose("add keyframe", True)
+        html(client, "1 keyframe")
+        client.choose("seconds to the next", 0.5)
+        if times:
+            client.choose("time", 1.0)
+        client.look(identity, (1, 0, -4), fov=0.5)
+        client.choose("add keyframe", True)
+        html(client, "2 keyframes, 0.5 s")
+        client.look(identity, (5, 5, -4))
+        at = len(client.heard)
+        client.choose("add keyframe", True)
+        html(client, "3 keyframes, 1.0 s", after=at)
+        client.choose("drop the last", True)
+        at = len(client.heard)
+        html(client, "2 keyframes, 0.5 s", after=at)
+        client.choose("fly", True)
+
+        def has_arrived(m):
+            return m["type"] == "SetCameraPositionMessage" and np.allclose(m["position"], (1, 0, -4))
+
+        client.wait(has_arrived, after=at)
+        client.choose("save flight.json", True)
+        part = client.wait(lambda m: m["type"] == "FileTransferPart")
+    path = tmp_path / "flight.json"
+    path.write_bytes(part["content"])
+    flight = read_flight(path)
+    np.testing.assert_allclose([key.position for key in flight.keyframes], [[10, 0, -3], [11, 0, -4]], atol=1e-12)
+    np.testing.assert_allclose([key.fov for key in flight.keyframes], np.degrees([0.8, 0.5]))
+    assert [key.seconds for key in flight.keyframes] == [0.0, 0.5]
+    assert [key.time for key in flight.keyframes] == ([0.0, 1.0] if times else [None, None])
 
 
 def test_a_run_that_goes_on_is_shown(place, tmp_path, viewers):  # noqa: F811

@@ -28,6 +28,8 @@ from drgs.commands import view
 from drgs.commands.options import View
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewed import subject_of, watched_files
+from drgs.data.flight import rotation_of
+from drgs.data.flight_files import read_flight
 from drgs.files import load_state, save_state
 from drgs.viewing.poses import camera_of, pose_of
 from drgs.viewing.server import Viewer
@@ -317,6 +319,26 @@ def test_a_click_on_a_camera_shows_it(shown, place):  # noqa: F811
         stop.set()
         thread.join()
         save_state(state, tensors, header)
+
+
+@once_more
+def test_a_flight_is_downloaded(shown, tmp_path):
+    """Two keyframes of where the page looks, saved by the browser as a file that `drgs render --path` reads."""
+    looked = subject(torch.zeros(1, 3))
+    viewer, page = shown(looked)
+    page.get_by_text("flight", exact=True).click()
+    for _ in range(2):
+        page.get_by_role("button", name="add keyframe").click()
+    page.wait_for_function("document.body.innerText.includes('2 keyframes, 2.0 s')")
+    with page.expect_download() as download:
+        page.get_by_role("button", name="save flight.json").click()
+    download.value.save_as(tmp_path / "flight.json")
+    assert download.value.suggested_filename == "flight.json"
+    keys = read_flight(tmp_path / "flight.json").keyframes
+    assert [key.seconds for key in keys] == [0.0, 2.0]
+    for key in keys:
+        np.testing.assert_allclose(key.position, looked.first.pose.position, atol=1e-5)
+        np.testing.assert_allclose(rotation_of(key.wxyz), rotation_of(looked.first.pose.wxyz), atol=1e-5)
 
 
 @once_more

@@ -3,11 +3,11 @@
 | format | read | write |
 |---|---|---|
 | PLY of 3DGS (INRIA, Nerfstudio's splatfacto, gsplat, Feature 3DGS) | yes | yes |
-| PLY as SuperSplat compresses it | yes | no |
+| PLY as SuperSplat compresses it (.compressed.ply) | yes | yes |
 | SPZ (Niantic), versions 2 and 3; 4 with the extra `spz` | yes | version 3 |
-| .splat (antimatter15) | yes | no |
+| .splat (antimatter15) | yes | yes |
 | .ksplat (mkkellogg), levels 0 to 2 | yes | no |
-| SOG (PlayCanvas), versions 1 and 2, as an archive or a folder | yes | no |
+| SOG (PlayCanvas), versions 1 and 2, as an archive or a folder | yes | version 2, an archive |
 | GLB with KHR_gaussian_splatting | yes | yes |
 
 docs/files.md says what each of them loses.
@@ -118,13 +118,15 @@ def save_gaussians(
     extra: Mapping[str, np.ndarray] | None = None,
     comments: tuple[str, ...] = (),
 ) -> None:
-    """Write Gaussians in the format of a suffix: .ply, .spz (version 3) or .glb (KHR_gaussian_splatting); atomically.
+    """Write Gaussians in the format of a suffix, atomically: .ply, .spz (version 3), .sog (version 2), .splat,
+    .compressed.ply (SuperSplat's) or .glb (KHR_gaussian_splatting). docs/files.md says what each of them loses.
 
         drgs.save_gaussians(g, "scene.spz")
 
     Args:
         g: Gaussians in the axes of 3DGS PLY files; SPZ and glTF get theirs.
-        path: The file.
+        path: The file. The Gaussians in .sog and .compressed.ply are in another order (Morton's), in .splat those that
+            show most come first.
         extra, comments: Columns and lines that only a PLY has room for; see `save_ply`.
     Raises:
         ValueError: If the suffix is another one, a parameter is not finite (the first index is named), or the format
@@ -168,11 +170,9 @@ def check_suffix(where: str, path: Path) -> str:
         return codec.suffix
     got = (codec.suffix if codec else path.suffix.lower()) or "no suffix"
     known = f"{where}: {path.name} must end with {', '.join(written)}, got {got}"
-    if name == "meta.json":
-        codec = CODECS["sog"]  # the index of the same, in a folder
     if codec is None or not codec.made_by:
         raise ValueError(f"{known}; choose one of these")
-    ply = path.with_name(("scene" if name == "meta.json" else path.name[: -len(codec.suffix)]) + ".ply")
+    ply = path.with_name(path.name[: -len(codec.suffix)] + ".ply")
     raise ValueError(
         f"{known}, a format that drgs reads and does not write; write {ply}, and make it of that: "
         f"{codec.made_by.format(ply=ply, path=path)}"

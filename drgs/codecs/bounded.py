@@ -13,7 +13,7 @@ import numpy as np
 
 from drgs.guards.foreign import is_file
 
-__all__ = ["Archive", "GzipReader", "pixels_of_webp", "unzstd"]
+__all__ = ["Archive", "GzipReader", "pixels_of_webp", "unzstd", "webp_of_pixels"]
 
 _DAMAGED = "it is truncated or damaged, copy it again"
 # characters of names, and of what libraries say
@@ -194,6 +194,22 @@ def pixels_of_webp(where: str, data: bytes, least: int, most: int) -> np.ndarray
         # OpenCV has blue first; an image without alpha is opaque.
         return np.dstack([image[..., ::-1], np.full((height, width), 255, np.uint8)])
     return np.ascontiguousarray(image[..., [2, 1, 0, 3]])
+
+
+def webp_of_pixels(pixels: np.ndarray) -> bytes:
+    """A lossless WebP image of (H, W, 4) uint8 RGBA.
+
+    Colors behind an alpha of 0 are kept where OpenCV can say so (from 4.13 on), else they are forgotten.
+    """
+    import cv2
+
+    how = [cv2.IMWRITE_WEBP_QUALITY, 101]  # above 100: without loss
+    if hasattr(cv2, "IMWRITE_WEBP_LOSSLESS_PRESERVE_COLOR"):
+        how = [cv2.IMWRITE_WEBP_LOSSLESS_MODE, cv2.IMWRITE_WEBP_LOSSLESS_PRESERVE_COLOR]
+    done, data = cv2.imencode(".webp", np.ascontiguousarray(pixels[..., [2, 1, 0, 3]]), how)
+    if not done:
+        raise ValueError(f"save_gaussians: a WebP image must be at most 16,383 pixels wide, is {pixels.shape[1]}")
+    return data.tobytes()
 
 
 def _webp_size(where: str, data: bytes) -> tuple[int, int]:

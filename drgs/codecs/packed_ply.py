@@ -8,13 +8,16 @@ newer files) colors; a Gaussian has 11, 10 and 11 bits for its mean and for its 
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.codecs.clustering import morton_order
 from drgs.codecs.codec import Codec
 from drgs.codecs.values import assembled, check_count, dc_of_colors, logits_of_bytes, quats_of_smallest
+from drgs.ellipsoids import Y_00
 from drgs.files import note_antialiased
 from drgs.guards.ply_headers import is_antialiased, ply_source, read_ply_header
 
@@ -22,9 +25,12 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.guards.ply_headers import PlyElement
 
-__all__ = ["PACKED_PLY", "load_packed_ply"]
+__all__ = ["PACKED_PLY", "encode_packed_ply", "load_packed_ply"]
+
+_log = logging.getLogger(__name__)
 
 _CHUNK = 256
+_LARGEST_SCALE = 20.0
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _ADVICE = "export it again from SuperSplat (superspl.at/editor)"
 
@@ -135,10 +141,81 @@ def _is_packed(path: Path, head: bytes) -> bool:
     return head.startswith((b"ply\n", b"ply\r")) and b" packed_position" in head.partition(b"\nend_header")[0]
 
 
-PACKED_PLY = Codec(
-    ".compressed.ply",
-    load_packed_ply,
-    _is_packed,
-    by_suffix=False,
-    made_by="`npx @playcanvas/splat-transform {ply} {path}`, or SuperSplat (superspl.at/editor)",
-)
+def encode_packed_ply(g: Gaussians) -> bytes:
+    """A compressed PLY of Gaussians in the axes of PLY files; their features are left out.
+
+    Gaussians are in Morton order, so that those of a chunk are close and its range is small. Log scales are kept
+    between -20 and 20, as SuperSplat keeps them, SH above degree 0 between -4 and 4.
+    """
+    order = morton_order(g.means.numpy()) if len(g) else np.zeros(0, np.int64)
+    sh = g.sh.numpy()[order].astype(np.float64)
+    log_scales = g.log_scales.numpy()[order].astype(np.float64)
+    outside = {
+        "log scales": int((np.abs(log_scales) > _LARGEST_SCALE).sum()),
+        "SH coefficients": int((np.abs(sh[:, 1:]) > 4 + 1 / 64).sum()),
+    }
+    for name, count in outside.items():
+        if count:
+            _log.warning("compressed PLY: %d %s were out of its range and went to its end", count, name)
+    fields = {
+        "xyz": g.means.numpy()[order].astype(np.float64),
+        "scale": np.clip(log_scales, -_LARGEST_SCALE, _LARGEST_SCALE),
+        "rgb": sh[:, 0] * Y_00 + 0.5,
+    }
+    starts = np.arange(0, len(g), _CHUNK)
+    ranges, parts = list[np.ndarray](), dict[str, np.ndarray]()
+    for name, values in fields.items():
+        if not len(g):
+            ranges += [np.zeros((0, 3), np.float32)] * 2
+            parts[name] = values
+            continue
+        low, high = (how.reduceat(values, starts, axis=0).astype(np.float32) for how in (np.minimum, np.maximum))
+        ranges += [low, high]
+        first, last = (np.repeat(x, _CHUNK, axis=0)[: len(g)].astype(np.float64) for x in (low, high))
+        parts[name] = np.clip((values - first) / np.where(last > first, last - first, 1), 0, 1)
+    # float64: a logit that was read from a byte must go back to that byte.
+    opacities = g.logit_opacities.double().sigmoid().numpy()[order]
+    colors = np.concatenate([parts["rgb"], opacities[:, None]], axis=1)
+    vertices = [
+        _packed(parts["xyz"], (11, 10, 11)),
+        _packed_quats(g.quats.numpy().astype(np.float64)[order]),
+        _packed(parts["scale"], (11, 10, 11)),
+        _packed(colors, (8, 8, 8, 8)),
+    ]
+    names = [f"{end}_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
+    names += [f"{end}_scale_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
+    names += [f"{end}_{axis}" for end in ("min", "max") for axis in ("r", "g", "b")]
+    lines = ["ply", "format binary_little_endian 1.0", f"element chunk {len(starts)}"]
+    lines += [f"property float {name}" for name in names]
+    lines += [f"element vertex {len(g)}", *(f"property uint {name}" for name in _PACKED)]
+    body = [
+        np.concatenate(ranges, axis=1).astype("<f4").tobytes(),
+        np.stack(vertices, axis=1).astype("<u4").tobytes(),
+    ]
+    if g.sh_degree:
+        # Ours are coefficient by coefficient, stored channel by channel.
+        rest = sh[:, 1:].transpose(0, 2, 1).reshape(len(g), 3 * (sh.shape[1] - 1))
+        lines += [f"element sh {len(g)}", *(f"property uchar f_rest_{i}" for i in range(rest.shape[1]))]
+        body.append(np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8).tobytes())
+    return "\n".join([*lines, "end_header", ""]).encode() + b"".join(body)
+
+
+def _packed(part: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
+    """(N,) uint32 of fractions (N, K), each in so many bits, the first one highest."""
+    packed = np.zeros(len(part), np.uint32)
+    for k, width in enumerate(bits):
+        packed = packed << np.uint32(width) | np.rint(part[:, k] * ((1 << width) - 1)).astype(np.uint32)
+    return packed
+
+
+def _packed_quats(quats: np.ndarray) -> np.ndarray:
+    """(N,) uint32: 2 bits for the place of the largest component, 10 for each of the others."""
+    q = quats / np.abs(quats).max(axis=1, keepdims=True, initial=0.0)  # first, so that no square under- or overflows
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    largest = np.abs(q).argmax(1)
+    q *= np.where(np.take_along_axis(q, largest[:, None], 1) < 0, -1, 1)
+    others = q[np.arange(4)[None, :] != largest[:, None]].reshape(-1, 3)
+    return _packed(np.clip(others / 2**0.5 + 0.5, 0, 1), (10, 10, 10)) | largest.astype(np.uint32) << np.uint32(30)
+
+
+PACKED_PLY = Codec(".compressed.ply", load_packed_ply, _is_packed, by_suffix=False, encode=encode_packed_ply)

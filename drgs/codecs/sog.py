@@ -15,12 +15,18 @@ splat-transform writes and reads it (the specification calls them x right, y up,
 
 from __future__ import annotations
 
+import io
+import json
+import logging
+import math
+import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drgs.codecs.bounded import Archive, pixels_of_webp
+from drgs.codecs.bounded import Archive, pixels_of_webp, webp_of_pixels
+from drgs.codecs.clustering import codebook, morton_order, palette
 from drgs.codecs.codec import Codec
 from drgs.codecs.folders import is_checkpoint, names_in_archive
 from drgs.codecs.values import SH_COUNTS, assembled, check_count, logits_of_bytes, quats_of_smallest
@@ -31,7 +37,11 @@ if TYPE_CHECKING:
 
 __all__ = ["SOG", "load_sog"]
 
+_log = logging.getLogger(__name__)
 _META = 4 << 20  # bytes
+_THIN = 8.0  # of log scales below the largest: fits make disks whose thickness is 1e-9, and 256 entries are few
+_EACH = 3  # Gaussians a row of the palette, which has as many as its indices reach at most
+_FEWEST_ROWS, _MOST_ROWS = 64, 1 << 16
 _PALETTE = 64  # rows of SH side by side
 _ADVICE = "export it again with splat-transform or SuperSplat"
 _FILES = {"files": [str]}
@@ -208,9 +218,101 @@ def _is_sog(path: Path, head: bytes) -> bool:
     return path.name == "meta.json" and b'"means"' in head
 
 
-SOG = Codec(
-    ".sog",
-    load_sog,
-    _is_sog,
-    made_by="`npx @playcanvas/splat-transform -g cpu {ply} {path}`, or SuperSplat (superspl.at/editor)",
-)
+def encode_sog(g: Gaussians) -> bytes:
+    """A SOG archive of version 2 of Gaussians in the axes of PLY files; their features are left out.
+
+    Gaussians are in Morton order, in which images of neighbors pack best.
+
+    Raises:
+        ValueError: If there are more than 2^28 Gaussians, or none.
+    """
+    if not 0 < len(g) <= 1 << 28:
+        raise ValueError(f"save_gaussians: .sog must hold 1 to 2^28 Gaussians, got {len(g)}; write a PLY")
+    order = morton_order(g.means.numpy())
+    width = 4 * -(-(math.isqrt(len(g) - 1) + 1) // 4)  # about square
+
+    def image(*channels: np.ndarray) -> bytes:
+        """A lossless WebP with a pixel a Gaussian, of bytes (N, C); alpha is 255 where there are three channels."""
+        values = np.concatenate([x.reshape(len(g), -1) for x in channels], axis=1).astype(np.uint8)
+        pixels = np.zeros((-(-len(g) // width) * width, 4), np.uint8)
+        pixels[:, 3] = 255
+        pixels[: len(g), : values.shape[1]] = values
+        return webp_of_pixels(pixels.reshape(-1, width, 4))
+
+    means = g.means.numpy().astype(np.float64)[order]
+    wide = np.copysign(np.log1p(np.abs(means)), means)
+    low, high = wide.min(0), wide.max(0)
+    codes = np.rint((wide - low) / np.where(high > low, high - low, 1) * 65535).astype(np.int64)
+    log_scales = g.log_scales.numpy()[order]
+    thin = log_scales < log_scales.max(1, keepdims=True) - _THIN
+    if thin.any():
+        _log.info("SOG: %d scales were below 1/3000 of the largest of their Gaussian and went there", int(thin.sum()))
+    weights = _weights(g)[order]
+    scale_book, scales = codebook(np.maximum(log_scales, log_scales.max(1, keepdims=True) - _THIN), weights)
+    sh = g.sh.numpy()[order]
+    color_book, colors = codebook(sh[:, 0], weights)
+    # float64: a logit that was read from a byte must go back to that byte.
+    opacities = np.rint(255 * g.logit_opacities.double().sigmoid().numpy()[order])
+    files = {
+        "means_l.webp": image(codes & 255),
+        "means_u.webp": image(codes >> 8),
+        "scales.webp": image(scales),
+        "quats.webp": image(_bytes_of_quats(g.quats.numpy().astype(np.float64)[order])),
+        "sh0.webp": image(colors, opacities),
+    }
+    meta: dict[str, Any] = {
+        "version": 2,
+        "asset": {"generator": "drgs"},
+        "count": len(g),
+        "antialias": False,
+        "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
+        "scales": {"codebook": scale_book.tolist(), "files": ["scales.webp"]},
+        "quats": {"files": ["quats.webp"]},
+        "sh0": {"codebook": color_book.tolist(), "files": ["sh0.webp"]},
+    }
+    if g.sh_degree:
+        size = min(_MOST_ROWS, max(_FEWEST_ROWS, len(g) // _EACH))
+        rows, labels = palette(sh[:, 1:].reshape(len(g), -1), weights, size)
+        book, entries = codebook(rows)
+        each = sh.shape[1] - 1
+        pixels = np.full((-(-len(rows) // _PALETTE) * _PALETTE, each, 4), 255, np.uint8)
+        pixels[..., :3] = 0
+        pixels[: len(rows), :, :3] = entries.reshape(-1, each, 3)
+        files["shN_centroids.webp"] = webp_of_pixels(pixels.reshape(-1, _PALETTE * each, 4))
+        files["shN_labels.webp"] = image(np.stack([labels & 255, labels >> 8, 0 * labels], axis=1))
+        meta["shN"] = {
+            "count": len(rows),
+            "bands": g.sh_degree,
+            "codebook": book.tolist(),
+            "files": ["shN_centroids.webp", "shN_labels.webp"],
+        }
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_STORED) as archive:
+        for name, data in {"meta.json": json.dumps(meta).encode(), **files}.items():
+            archive.writestr(zipfile.ZipInfo(name), data)  # without a time: same Gaussians, same bytes
+    return packed.getvalue()
+
+
+def _weights(g: Gaussians) -> np.ndarray:
+    """(N,) how much errors of each Gaussian count: the root of its opacity times the area that it covers.
+
+    Between the thousandth part and a thousand times the median, so that none is given up.
+    """
+    area = np.sort(g.log_scales.numpy().astype(np.float64), axis=1)[:, 1:].sum(1)
+    opacities = g.logit_opacities.double().sigmoid().numpy()
+    shown = area + np.log(np.maximum(opacities, np.finfo(np.float64).tiny))
+    return np.exp(0.5 * np.clip(shown - np.median(shown), -np.log(1e3), np.log(1e3)))
+
+
+def _bytes_of_quats(quats: np.ndarray) -> np.ndarray:
+    """(N, 4) bytes that `_Reader._quats` reads: the three smaller components, and the place of the largest."""
+    q = quats / np.abs(quats).max(axis=1, keepdims=True)  # first, so that no square under- or overflows
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    largest = np.abs(q).argmax(1)
+    q *= np.where(np.take_along_axis(q, largest[:, None], 1) < 0, -1, 1)
+    others = q[np.arange(4)[None, :] != largest[:, None]].reshape(-1, 3)
+    codes = np.clip(np.rint((others * 2**0.5 + 1) * 127.5), 0, 255)
+    return np.concatenate([codes, 252 + largest[:, None]], axis=1)
+
+
+SOG = Codec(".sog", load_sog, _is_sog, encode=encode_sog)

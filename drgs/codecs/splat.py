@@ -6,6 +6,7 @@ as float32, color and opacity as bytes, and a quaternion wxyz in bytes, (byte - 
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,11 +14,14 @@ import numpy as np
 
 from drgs.codecs.codec import Codec
 from drgs.codecs.values import assembled, check_count, dc_of_colors, log_of_scales, logits_of_bytes
+from drgs.ellipsoids import Y_00
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["LEAST_FLOAT", "SPLAT", "load_splat"]
+__all__ = ["LEAST_FLOAT", "SPLAT", "encode_splat", "load_splat"]
+
+_log = logging.getLogger(__name__)
 
 LEAST_FLOAT = float(np.finfo(np.float32).tiny)
 """What a float32 scale of 0 is taken for: the least normal number, a log scale of -87.3."""
@@ -48,9 +52,41 @@ def load_splat(path: Path) -> Gaussians:
     )
 
 
-SPLAT = Codec(
-    ".splat",
-    load_splat,
-    made_by="`python convert.py {ply} --output {path}` of github.com/antimatter15/splat, or SuperSplat "
-    "(superspl.at/editor)",
-)
+def encode_splat(g: Gaussians) -> bytes:
+    """A .splat file of Gaussians in the axes of PLY files; SH above degree 0 and features are left out.
+
+    The Gaussians that show most come first, by volume times opacity, as viewers that draw while they load want it.
+    Values round to the nearest byte (antimatter15's own writer cuts digits off).
+
+    Raises:
+        ValueError: If there are none, which no reader tells from a file that is cut, or a scale is no float32.
+    """
+    if not len(g):
+        raise ValueError("save_gaussians: .splat must hold at least one Gaussian, got none; write a PLY")
+    if g.sh_degree:
+        _log.warning("SPLAT: left out SH above degree 0, there is no room")
+    log_scales = g.log_scales.numpy().astype(np.float64)
+    # float64: a logit that was read from a byte must go back to that byte.
+    opacities = g.logit_opacities.double().sigmoid().numpy()
+    order = np.argsort(-(log_scales.sum(1) + np.log(np.maximum(opacities, 1e-300))), kind="stable")
+    with np.errstate(over="ignore", under="ignore"):
+        scales = np.exp(log_scales).astype(np.float32)
+    if not np.isfinite(scales).all():
+        raise ValueError("save_gaussians: .splat must have scales up to 3.4e38, got larger ones; write a PLY")
+    colors = g.sh.numpy()[:, 0].astype(np.float64) * Y_00 + 0.5
+    outside = int(((colors < -0.5 / 255) | (colors > 255.5 / 255)).sum())
+    if outside:
+        _log.warning("SPLAT: %d colors were out of its range and went to its end", outside)
+    q = g.quats.numpy().astype(np.float64)
+    q = q / np.abs(q).max(axis=1, keepdims=True)  # first, so that no square under- or overflows
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    rows = np.empty(len(g), _ROW)
+    rows["mean"] = g.means.numpy()
+    rows["scale"] = scales
+    rows["color"] = np.clip(np.rint(255 * colors), 0, 255)
+    rows["opacity"] = np.rint(255 * opacities)
+    rows["quat"] = np.clip(np.rint(128 * q + 128), 0, 255)
+    return rows[order].tobytes()
+
+
+SPLAT = Codec(".splat", load_splat, encode=encode_splat)

@@ -27,7 +27,7 @@ class Sfm(Common):
     camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"] = (
         "SIMPLE_RADIAL"
     )
-    """COLMAP's name of the lens; photographs of one size share one camera."""
+    """COLMAP's name of the lens; photographs of one size and focal length share one camera."""
     matcher: Literal["auto", "exhaustive", "sequential", "retrieval"] = "auto"
     """Match all pairs, neighbors by name (video), or those and the nearest by appearance; auto: all of up to 60."""
     masks: str | None = None

@@ -36,7 +36,9 @@ def named_view(cameras: list[Camera], name: str | None, where: str) -> list[Came
     return found[:1]
 
 
-def at_times(cameras: list[Camera], text: str | None, frames: int, given: SceneInput) -> list[Camera]:
+def at_times(
+    cameras: list[Camera], text: str | None, frames: int, given: SceneInput, is_film: bool = False
+) -> list[Camera]:
     """The cameras with the times that they are drawn at.
 
     Args:
@@ -44,6 +46,7 @@ def at_times(cameras: list[Camera], text: str | None, frames: int, given: SceneI
         text: What `--time` says; None: their own times or, where they have none, all times of the run, evenly.
         frames: How many of one camera, if the time alone moves.
         given: What is drawn; where it stands still, times mean nothing, and cameras stay as they are.
+        is_film: Whether they are the frames of a film, each of which has its time; else equal poses count once.
     Returns:
         With one time, each pose once. With a range, the cameras in their order at times from its begin to its end; or
         `frames` times one camera, named by their numbers.
@@ -64,11 +67,12 @@ def at_times(cameras: list[Camera], text: str | None, frames: int, given: SceneI
         begin, end = _range(text)
         if not (first <= begin <= last and first <= end <= last):
             raise ValueError(f"--time must be in {first:g}..{last:g}, the times of the run, got {text!r}; correct it")
-    poses = {(camera.w2c.tobytes(), camera.K.tobytes()): camera for camera in reversed(cameras)}
-    cameras = list(reversed(poses.values()))  # synchronous cameras have a view for every time
+    if not is_film:
+        poses = {(camera.w2c.tobytes(), camera.K.tobytes()): camera for camera in reversed(cameras)}
+        cameras = list(reversed(poses.values()))  # synchronous cameras have a view for every time
     if begin == end:
         return [dataclasses.replace(camera, time=begin) for camera in cameras]
-    if len(cameras) == 1:
+    if len(cameras) == 1 and not is_film:
         name = cameras[0].name or "view"
         cameras = [dataclasses.replace(cameras[0], name=f"{name}_{k:04d}") for k in range(frames)]
     moments = np.linspace(begin, end, len(cameras)) if len(cameras) > 1 else [begin]

@@ -72,17 +72,23 @@ class Render(Settings, Around, Views, Moments, Lenses):
     cameras: str | None = None
     """A data set, a run, a cameras.json or selection.json, or orbit; default orbit, or with --view the run."""
     output: OutputPath = Path("out/render")
-    """Folder for the pictures."""
+    """Folder for the pictures; or a file: NAME.mp4 or .webm for the film alone, NAME.png, .jpg or .exr for one view."""
     width: int | None = None
-    """Image width in pixels; default the camera's, of an orbit 640."""
+    """Image width in pixels; default the camera's, of an orbit or a flight 640, of a panorama 2048."""
     height: int | None = None
     """Image height in pixels; default the camera's."""
-    frames: int = 60
-    """Views of an orbit, or of one camera over a range of --time."""
-    format: str = "png"
-    """Comma-separated list of png, exr, webm, and ply: all Gaussians as they are at each time."""
-    fps: float = 24.0
-    """Frames a second of the video."""
+    path: Path | None = None
+    """A flight through keyframes, as drgs view saves it, or a camera path of Nerfstudio's viewer (docs/view.md)."""
+    panorama: bool = False
+    """All-round pictures (360 by 180 degrees, upright) from where the cameras are; default the middle photograph's."""
+    frames: int | None = None
+    """Views of an orbit, a flight, or one camera over a range of --time; default 60, of a flight as it lasts."""
+    duration: float | None = None
+    """Seconds that the film of an orbit, a flight or a range of --time lasts, instead of --frames."""
+    format: str | None = None
+    """List of png, jpg, exr, webm, mp4 and ply (all Gaussians at each time), by commas; default png, or as -o ends."""
+    fps: float | None = None
+    """Frames a second of the video; default 24, of a flight what its file says."""
     depth: bool = False
     """Write color-mapped depth too; exr files hold it anyway."""
     features: bool = False
@@ -283,7 +289,7 @@ class Query(Settings, Around, Views, Lenses):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Convert(Common):
-    """Write Gaussians in another format: .ply of 3DGS, .spz, or .glb (KHR_gaussian_splatting)."""
+    """Write Gaussians in another format: .ply, .spz, .sog, .splat, .compressed.ply or .glb (KHR_gaussian_splatting)."""
 
     scene: SceneFile
     out: Positional[Path]

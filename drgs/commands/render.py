@@ -8,24 +8,37 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
+import math
 import statistics
 import time
 import types
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from drgs import runtime
+from drgs.commands.flown import (
+    check_flight_options,
+    check_panorama,
+    film_of,
+    flight_cameras,
+    level_panorama,
+    middle_camera,
+    panorama_size,
+    up_of,
+)
 from drgs.commands.forecast import forecast
+from drgs.commands.lone_file import lone_file
 from drgs.commands.moments import at_times, named_view, ply_names, write_plys
 from drgs.commands.orbits import Wish
 from drgs.commands.painters import PAINTINGS, painters
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewpoints import MAX_SIDE, check_lenses, drawn_views
+from drgs.commands.viewpoints import MAX_SIDE, captured_cameras, check_lenses, drawn_views
 from drgs.data.camera_lists import described, save_cameras_json
 from drgs.display import pictures
+from drgs.display.mp4 import Mp4, need_mp4
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
 from drgs.files import SCHEMA, write_json
@@ -46,38 +59,65 @@ _log = logging.getLogger(__name__)
 
 _MANY_PIXELS = 500_000  # of all views; below, finding out would take as long as doing it
 _LONG = 10.0  # seconds that are worth a word
-_FORMATS = ("png", "exr", "webm", "ply")
+_FORMATS = ("png", "jpg", "exr", "webm", "mp4", "ply")
+_FILMS: Mapping[str, Any] = {"webm": pictures.Video, "mp4": Mp4}
 
 
 def run(args: Render) -> None:
     """`drgs render SCENE`."""
     settings = args.settings()  # refuses what cannot be, before anything is read
-    formats = _formats(args.format)
+    alone = lone_file(args)
+    if alone is not None:
+        args = dataclasses.replace(args, output=alone.folder, format=alone.format)
+    formats = _formats("png" if args.format is None else args.format)
     _check_numbers(args)
     if args.moving and "ply" not in formats:
         raise ValueError("render: --moving must have ply among --format, which only it means; add it or drop --moving")
-    views = args.cameras or (str(args.scene) if args.view and args.scene.is_dir() else "orbit")
-    movie = "turntable.webm" if views == "orbit" else "video.webm"
+    if args.panorama:
+        check_panorama(settings)
+    if "mp4" in formats:
+        need_mp4("render: --format mp4")
+    film = film_of(args)
+    is_alone = args.panorama and not (args.cameras or args.view or args.orbit)  # one place, of the photographs'
+    views = args.cameras or (str(args.scene) if (args.view or is_alone) and args.scene.is_dir() else "orbit")
+    if is_alone and views == "orbit" and args.path is None:
+        raise ValueError("render: --panorama must have a place, a file of Gaussians has none; add --path or --cameras")
+    movie = "flight" if args.path is not None else "turntable" if views == "orbit" else "video"
+    if alone is not None:
+        movie = alone.stem
     kinds = [kind for kind in PAINTINGS if getattr(args, kind)]
-    movies = [movie, *(_movie_of(movie, kind) for kind in kinds)] if "webm" in formats else []
-    fixed = ["render.json", "cameras.json", *movies]
-    output = claim(args.output, "render", fixed, inputs=[args.scene, views])
+    movies = [_movie_of(movie, kind, end) for end in _FILMS if end in formats for kind in ("", *kinds)]
+    fixed = ["render.json", "cameras.json", *movies] if alone is None else [alone.name]
+    output = claim(args.output, "render", fixed, inputs=[args.scene, views, *([args.path] if args.path else [])])
     given = SceneInput.of(args)
     paint = painters(kinds, given, args.scene)
     gaussians = given.gaussians if paint else given.colors
     settings = given.over_background(settings)
     size = args.width, args.height
-    cameras, source = drawn_views(args, views, given, args.frames, size, returns=True)
-    cameras = at_times(named_view(cameras, args.view, source)[: args.limit], args.time, args.frames, given)
-    cameras = [_resized(camera, args.width, args.height) for camera in cameras]
+    photographs = captured_cameras(given) if args.panorama or film.flight is not None else []
+    if film.flight is not None:
+        shape = photographs[0].height / photographs[0].width if photographs else 0.75
+        cameras, source = flight_cameras(args, film, given, shape)
+    else:
+        cameras, source = drawn_views(args, views, given, film.frames, size, returns=True)
+        cameras = [middle_camera(cameras)] if is_alone else named_view(cameras, args.view, source)
+    placed = photographs or cameras
+    cameras = at_times(cameras[: args.limit], args.time, film.frames, given, is_film=film.flight is not None)
+    if args.panorama:
+        up, across = up_of(placed, Wish.of(args).up), panorama_size(args)
+        cameras = [level_panorama(camera, up, *across) for camera in cameras]
+    else:
+        cameras = [_resized(camera, args.width, args.height) for camera in cameras]
     follows = args.undistort == "auto" and settings.traversal == "bvh"
     bent = sum(camera.is_distorted for camera in cameras)
-    if bent and not (follows or given.keeps_lenses(args.undistort)):
+    if bent and not args.panorama and not (follows or given.keeps_lenses(args.undistort)):
         cameras = [camera.undistorted() for camera in cameras]
         _say(args, f"{bent} cameras have a lens: drawn without it; --undistort off draws through it")
     check_lenses("render", settings, cameras)
+    if alone is not None:
+        cameras = alone.named(cameras)
     _check_memory(cameras, settings, formats, 0 if gaussians.features is None else gaussians.features.shape[1])
-    ends = [*(kind for kind in formats if kind not in ("webm", "ply")), *(["depth.png"] * args.depth)]
+    ends = [*(kind for kind in formats if kind not in (*_FILMS, "ply")), *(["depth.png"] * args.depth)]
     ends += [f"{kind}.png" for kind in kinds]
     output.check(f"{name}.{end}" for name in pictures.file_names([x.name for x in cameras]) for end in ends)
     if "ply" in formats:
@@ -92,12 +132,22 @@ def run(args: Render) -> None:
             args.output,
             formats=formats,
             depth=args.depth,
-            fps=args.fps,
+            fps=film.fps,
             video=movie,
             paint=paint,
             advance=bar.advance,
         )
     report = {"scene": str(args.scene), "cameras": source, "gaussians": len(gaussians)} | report
+    if alone is not None:
+        _say(args, _summary(report, alone.path))
+        return
+    if film.flight is not None:
+        report["flight"] = {
+            "path": str(args.path),
+            "keyframes": len(film.flight.keyframes),
+            "loop": film.flight.loop,
+            "seconds": film.flight.seconds,
+        }
     if "ply" in formats:
         report["ply"] = write_plys(given.scene, cameras, args.output, args.moving, args.features)
     if all(not camera.is_distorted and camera.K[0, 1] == 0 for camera in cameras):
@@ -120,7 +170,7 @@ def render_views(
     formats: tuple[str, ...] = ("png",),
     depth: bool = False,
     fps: float = 24.0,
-    video: str = "video.webm",
+    video: str = "video",
     paint: Mapping[str, Painter] = types.MappingProxyType({}),
     advance: Callable[[], None] | None = None,
 ) -> dict:
@@ -130,12 +180,12 @@ def render_views(
         scene, cameras, settings: Arguments of `drgs.render`, with a list of cameras; without `paint`, features are left
             out.
         out_dir: Folder of the files; made if absent.
-        formats: Any of png (8 bits, clamped, no transfer function), exr (float32; R G B, A, and Z, the distance along
-            the ray) and webm (one video); others are left to the caller.
+        formats: Any of png (8 bits, clamped, no transfer function), jpg (quality 95), exr (float32; R G B, A, and Z,
+            the distance along the ray), webm and mp4 (one video each); others are left to the caller.
         depth: A color-mapped `NAME.depth.png` for each view, too.
         fps: Frames a second of the video.
-        video: File name of the video.
-        paint: Kind -> what draws it, a `NAME.KIND.png` for each view, and `VIDEO.KIND.webm` beside the video.
+        video: Name of the video without its suffix.
+        paint: Kind -> what draws it, a `NAME.KIND.png` for each view, and `VIDEO.KIND.webm` or `.mp4` beside the video.
         advance: Called after each view.
     Returns:
         JSON-serializable: settings, backend, seconds (first, median of the others, total), rays and
@@ -145,9 +195,15 @@ def render_views(
     outputs = ("depth",) if depth or "exr" in formats else ()
     views = []
     seen = False
-    wanted = {"": video, **{kind: _movie_of(video, kind) for kind in paint}} if "webm" in formats else {}
     with contextlib.ExitStack() as stack:
-        movies = {kind: stack.enter_context(pictures.Video(out_dir / name, fps)) for kind, name in wanted.items()}
+        movies: dict[str, list] = {
+            kind: [
+                stack.enter_context(film(out_dir / _movie_of(video, kind, end), fps))
+                for end, film in _FILMS.items()
+                if end in formats
+            ]
+            for kind in ("", *paint)
+        }
         for camera, name in zip(cameras, pictures.file_names([camera.name for camera in cameras]), strict=True):
             began = time.perf_counter()
             with torch.no_grad():  # a picture
@@ -158,6 +214,9 @@ def render_views(
             if "png" in formats:
                 pictures.write_png(out_dir / f"{name}.png", rgb)
                 files.append(f"{name}.png")
+            if "jpg" in formats:
+                pictures.write_jpg(out_dir / f"{name}.jpg", rgb, is_panorama=_is_whole(camera))
+                files.append(f"{name}.jpg")
             if outputs:
                 distance = out.depth.cpu().numpy()
             if "exr" in formats:
@@ -170,10 +229,10 @@ def render_views(
                 painted = painter(out)
                 pictures.write_png(out_dir / f"{name}.{kind}.png", painted)
                 files.append(f"{name}.{kind}.png")
-                if kind in movies:
-                    movies[kind].write(painted)
-            if movies:
-                movies[""].write(rgb)
+                for movie in movies[kind]:
+                    movie.write(painted)
+            for movie in movies[""]:
+                movie.write(rgb)
             seen = seen or bool(alpha.any())
             made = {key: _number(out.certificate.get(key)) for key in ("rays", "redone")}
             views.append({"camera": described(camera), "files": files, "seconds": seconds, **made})
@@ -194,7 +253,9 @@ def render_views(
         "threads": runtime.backend().threads,
         "seconds": {"first": times[0], "median": statistics.median(times[1:] or times), "total": sum(times)},
         **total,
-        "video": video if wanted else None,
+        "video": movies[""][0].path.name if movies[""] else None,
+        "videos": [movie.path.name for some in movies.values() for movie in some],
+        "fps": fps if movies[""] else None,
         "views": views,
     }
 
@@ -221,14 +282,24 @@ def _check_numbers(args: Render) -> None:
     ):
         if value is not None and not 1 <= value <= high:
             raise ValueError(f"render: {option} must be in [1, {high}], got {value}")
-    if not 0 < args.fps <= 240:
+    if args.fps is not None and not 0 < args.fps <= 240:
         raise ValueError(f"render: --fps must be in (0, 240], got {args.fps}")
     Wish.of(args)
+    check_flight_options(args)
 
 
-def _movie_of(video: str, kind: str) -> str:
-    """File name of the video of a kind of picture."""
-    return f"{Path(video).stem}.{kind}.webm"
+def _movie_of(video: str, kind: str, end: str) -> str:
+    """File name of the video of a kind of picture, "" of the colors."""
+    return f"{video}.{kind}.{end}" if kind else f"{video}.{end}"
+
+
+def _is_whole(camera: Camera) -> bool:
+    """Whether a camera sees all round, 360 by 180 degrees."""
+    if camera.model != "equirectangular":
+        return False
+    return math.isclose(camera.K[0, 0] * math.tau, camera.width) and math.isclose(
+        camera.K[1, 1] * math.pi, camera.height
+    )
 
 
 def _resized(camera: Camera, width: int | None, height: int | None) -> Camera:

@@ -43,10 +43,12 @@ __all__ = [
     "MAX_SIDE",
     "Known",
     "Source",
+    "captured_cameras",
     "check_counts",
     "check_lenses",
     "drawn_views",
     "evenly",
+    "frame_size",
     "known_views",
     "other_views",
     "seen_views",
@@ -218,9 +220,9 @@ def _drawn_orbit(
     returns: bool,
 ) -> tuple[list[Camera], str]:
     """An orbit as the photographs of the run were taken, else around the Gaussians; and what it does in words."""
-    captured = _captured(given)
+    captured = captured_cameras(given)
     shape = captured[0].height / captured[0].width if captured else 0.75
-    width, height = _size(*size, shape)
+    width, height = frame_size(*size, shape)
     wish = Wish.of(args)
     how = {"width": width, "height": height, "wish": wish, "returns": returns}
     cameras, source = capture_orbit(captured, frames, distance_of=seen_distance(given.gaussians), **how)
@@ -233,7 +235,7 @@ def _drawn_orbit(
     return scene_orbit(given.gaussians, frames, **how), f"orbit, up {up}"
 
 
-def _captured(given: SceneInput) -> list[Camera]:
+def captured_cameras(given: SceneInput) -> list[Camera]:
     """Cameras of the photographs that a run was fitted to, in their order; none if they are no longer there."""
     if given.run is None:
         return []
@@ -246,7 +248,7 @@ def _captured(given: SceneInput) -> list[Camera]:
     return [view.camera.undistorted() for view in views if view.name in names]
 
 
-def _size(width: int | None, height: int | None, shape: float) -> tuple[int, int]:
+def frame_size(width: int | None, height: int | None, shape: float) -> tuple[int, int]:
     """Width and height of an orbit's frames, the missing ones by their shape (height / width)."""
     if width is None:
         width = 640 if height is None else max(1, min(MAX_SIDE, round(height / shape)))

@@ -327,11 +327,11 @@ def _lenses(image_dir: Path, readable: Path, names: list[str], report: Progress)
     groups = dict[tuple, list[str]]()
     report("features", 0, len(names))
     for name in names:
-        focal = ""
+        size, focal = image_size(image_dir / name), ""
         if name not in videos:
             stated = pycolmap.infer_camera_from_image(readable / name)
             focal = f"{stated.mean_focal_length():.3g}" if stated.has_prior_focal_length else ""
-        groups.setdefault((videos.get(name), image_size(image_dir / name), focal), []).append(name)
+        groups.setdefault((videos.get(name), size, focal), []).append(name)
     return list(groups.values())
 
 

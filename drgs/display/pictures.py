@@ -1,4 +1,4 @@
-"""Pictures and videos from float arrays: PNG, OpenEXR, WebM, color-mapped depth, captions.
+"""Pictures and videos from float arrays: PNG, JPEG, OpenEXR, WebM, color-mapped depth, captions.
 
 Images are NumPy (H, W, 3), RGB. Colors of Gaussians are display-referred: they are fitted to the
 8-bit values of photographs. They are therefore written as they are, clamped to [0, 1], without a
@@ -32,6 +32,7 @@ __all__ = [
     "png_bytes",
     "to_bytes",
     "write_exr",
+    "write_jpg",
     "write_png",
 ]
 
@@ -42,6 +43,17 @@ _DECADES = 3.0  # decades that are told apart by color, at most
 _WEBM_SEGMENT = bytes.fromhex("18538067")  # id of what holds all of a WebM file
 _WEBM_HEAD = 1024  # bytes of the file within which that begins
 _NAME = 100  # bytes of a view's name in the name of a file
+_JPEG_QUALITY = 95
+_XMP = b"http://ns.adobe.com/xap/1.0/\0"
+_PANORAMA = (
+    '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+    '<rdf:Description rdf:about="" xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" '
+    'GPano:UsePanoramaViewer="True" GPano:ProjectionType="equirectangular" '
+    'GPano:CroppedAreaLeftPixels="0" GPano:CroppedAreaTopPixels="0" '
+    'GPano:CroppedAreaImageWidthPixels="{width}" GPano:CroppedAreaImageHeightPixels="{height}" '
+    'GPano:FullPanoWidthPixels="{width}" GPano:FullPanoHeightPixels="{height}" '
+    'GPano:PosePitchDegrees="0" GPano:PoseRollDegrees="0"/></rdf:RDF></x:xmpmeta>'
+)
 _OPAQUE = 0.5  # depth is shown where at least this much of the light stops
 
 
@@ -79,6 +91,30 @@ def png_bytes(image: np.ndarray) -> bytes:
     pixels = image if image.dtype == np.uint8 else to_bytes(image)
     _, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels[..., ::-1]))  # as BGR, which OpenCV writes
     return encoded.tobytes()
+
+
+def write_jpg(path: str | os.PathLike, image: np.ndarray, is_panorama: bool = False) -> None:
+    """Write an (H, W, 3) RGB image, uint8 or float in [0, 1], as JPEG.
+
+    Args:
+        path: File to write.
+        image: The picture.
+        is_panorama: Whether it is equirectangular, 360 by 180 degrees: then XMP of Google's Photo Sphere says so, by
+            which viewers know one.
+    """
+    import cv2
+
+    pixels = image if image.dtype == np.uint8 else to_bytes(image)
+    how = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+    _, encoded = cv2.imencode(".jpg", np.ascontiguousarray(pixels[..., ::-1]), how)
+    data = encoded.tobytes()
+    if is_panorama:
+        height, width = pixels.shape[:2]
+        xmp = _XMP + _PANORAMA.format(width=width, height=height).encode()
+        # A segment APP1 behind the mark that begins the file; its length counts itself.
+        data = data[:2] + b"\xff\xe1" + (len(xmp) + 2).to_bytes(2, "big") + xmp + data[2:]
+    with atomic_write(path) as file:
+        file.write(data)
 
 
 def write_exr(path: str | os.PathLike, rgb: np.ndarray, **channels: np.ndarray) -> None:

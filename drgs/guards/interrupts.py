@@ -2,11 +2,12 @@
 
 Python runs the handler of a signal once the main thread is back from native code, which may be minutes later. A second
 thread hears of signals at once, and ends the process if the main thread does not answer. Timeouts and shells send the
-same signal twice: one that comes within a second is no second one.
+same signal twice: one that comes within a second is no second one, not even while the process ends by the first.
 """
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import os
 import signal
@@ -229,4 +230,32 @@ def _installed(leave: Callable[[int], None] | None) -> Iterator[_Handlers | None
         for signum, handler in before.items():
             if handler is not None:
                 signal.signal(signum, handler)
+        if leave is not None and _active.first is not None:
+            _ignore_again(_active.first)
         _active = outer
+
+
+def _ignore_again(first: float) -> None:
+    """A command has ended by a signal: the same one, sent twice, is not to kill what is left of its process.
+
+    Python's own handlers are gone once it shuts down, where large libraries take long: there the signals are ignored.
+
+    Args:
+        first: Time at which the signal came, in seconds of `time.monotonic`.
+    """
+
+    def again(signum: int, _frame: object) -> None:
+        if time.monotonic() - first >= _SAME:
+            signal.signal(signum, before[signum])
+            signal.raise_signal(signum)
+
+    def ignore() -> None:
+        for signum in before:
+            if signal.getsignal(signum) is again:
+                signal.signal(signum, signal.SIG_IGN)
+
+    before = {s: signal.getsignal(s) for s in _SIGNALS}
+    before = {s: handler for s, handler in before.items() if handler not in (signal.SIG_IGN, None)}
+    for signum in before:
+        signal.signal(signum, again)
+    atexit.register(ignore)

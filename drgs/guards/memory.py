@@ -20,7 +20,7 @@ _TILES = 60
 _BVH = 155
 _GRADIENT = 50
 _FEATURE = 8
-PICTURES = {"png": 12, "exr": 28, "webm": 90}
+PICTURES = {"png": 12, "jpg": 12, "exr": 28, "webm": 90, "mp4": 90}
 """Bytes a pixel that writing a file of a format adds, measured in the same way."""
 TANGENT = 70
 """Bytes a pixel that each column of forward mode adds (measured with six: 73)."""

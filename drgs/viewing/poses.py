@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera, intrinsics
+from drgs.data.flight import quaternion_of, rotation_of
 
 __all__ = ["Pose", "camera_of", "looking", "pose_of"]
 
@@ -92,7 +93,7 @@ def camera_of(pose: Pose, width: int, height: int, origin: np.ndarray, time: flo
     focal = 0.5 * height / math.tan(0.5 * min(pose.fov, _WIDEST))  # at 180 degrees the tangent is infinite
     K = intrinsics(focal * width / (height * pose.aspect), focal, width / 2, height / 2)
     w2c = np.eye(4)
-    w2c[:3, :3] = _rotation(pose.wxyz).T
+    w2c[:3, :3] = rotation_of(pose.wxyz).T
     w2c[:3, 3] = -w2c[:3, :3] @ (np.asarray(pose.position, np.float64) + origin)
     return Camera(K=K, w2c=w2c, width=width, height=height, name="view", time=time)
 
@@ -107,37 +108,10 @@ def pose_of(camera: Camera, origin: np.ndarray) -> Pose:
     c2w = camera.c2w
     fov = 2 * math.atan(0.5 * camera.height / camera.K[1, 1])
     aspect = camera.width * camera.K[1, 1] / (camera.height * camera.K[0, 0])
-    return Pose(_quaternion(c2w[:3, :3]), c2w[:3, 3] - origin, fov, float(aspect))
+    return Pose(quaternion_of(c2w[:3, :3]), c2w[:3, 3] - origin, fov, float(aspect))
 
 
 def looking(pose: Pose, aspect: float) -> float:
     """The vertical field of view in radians in which a window of another shape shows all that a camera sees."""
     tangent = math.tan(0.5 * pose.fov)
     return min(2 * math.atan(tangent * max(1.0, pose.aspect / aspect)), _WIDEST)
-
-
-def _rotation(wxyz: np.ndarray) -> np.ndarray:
-    """(3,3) of a quaternion of any length but 0."""
-    w, x, y, z = np.asarray(wxyz, np.float64) / np.linalg.norm(wxyz)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def _quaternion(R: np.ndarray) -> np.ndarray:
-    """(4,) wxyz of a rotation: the eigenvector of the matrix whose form is largest at it, which no angle spoils."""
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = R.reshape(-1)
-    form = np.array(
-        [
-            [xx + yy + zz, zy - yz, xz - zx, yx - xy],
-            [zy - yz, xx - yy - zz, yx + xy, xz + zx],
-            [xz - zx, yx + xy, yy - xx - zz, zy + yz],
-            [yx - xy, xz + zx, zy + yz, zz - xx - yy],
-        ]
-    )
-    found = np.linalg.eigh(form)[1][:, -1]
-    return found if found[0] >= 0 else -found

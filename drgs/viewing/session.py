@@ -18,9 +18,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from drgs.data.flight import Keyframe
 from drgs.display.pictures import to_bytes
 from drgs.viewing import panel
 from drgs.viewing.drawing import stages
+from drgs.viewing.keyframes import KeyframeFolder
 from drgs.viewing.layers import UNCERTAINTY, Layer, tinted
 from drgs.viewing.placed_views import PlacedView, score_colors
 from drgs.viewing.poses import Pose, camera_of, looking, pose_of
@@ -46,6 +48,7 @@ _FRUSTUM = 0.05  # size of a camera's frustum, of its distance to what is looked
 _COVERS = 0.5  # share of half a view's narrower side: a frustum that reaches farther is hidden
 _NARROW = 576  # pixels of a window that viser lays its panel over, as over a phone's
 _MOMENTS = 48  # times in a round of playing, at most
+_FOVS = 1.0, 150.0  # degrees of a keyframe: such as files have, and no wider than our pictures
 _UNKNOWN = 640, 480  # pixels of a window that has not said how large it is
 _PAUSE = 0.08  # seconds between two of them, at least
 
@@ -144,6 +147,7 @@ class Session:
         with gui.add_folder("view", visible=False) as self._view:
             self._about = gui.add_html("")
             self._photograph = gui.add_image(np.zeros((2, 2, 3), np.uint8), visible=False)
+        self._flight = KeyframeFolder(self.client, self._keyframe, self._fly_to, subject.origin)
         for handle in (self._layer, self._preset, self._ours):
             handle.on_update(self._choice_made)
         self._are_shown.on_update(self._placed_views_toggled)
@@ -177,6 +181,7 @@ class Session:
         else:
             self._hide()
         self.time = subject.moment(self.time)
+        self._flight.forget(len(subject.times) > 0)
         if subject.times != before.times:
             self._build_times()
         self._send_gaussians()
@@ -200,6 +205,7 @@ class Session:
             self._timer.cancel()
         if self._playing:
             self._playing.cancel()
+        self._flight.close()
         with self._lock:
             self._wanted += 1
             self._is_closed = True
@@ -371,6 +377,28 @@ class Session:
         self._photograph.visible = False
         if sight.photograph is not None:
             self._worker.put((self, "photograph"), self._read_photograph(sight.photograph))
+
+    def _keyframe(self) -> Keyframe:
+        """Where the camera is, as a keyframe of a flight."""
+        pose = self.pose
+        wxyz = pose.wxyz / np.linalg.norm(pose.wxyz)
+        fov = float(np.clip(math.degrees(pose.fov), *_FOVS))
+        return Keyframe(pose.position + self.subject.origin, wxyz, fov, 0.0, self.time)
+
+    def _fly_to(self, key: Keyframe, is_last: bool) -> None:
+        """Move the camera to a moment of a flight; what moves goes along as fast as it can be sent."""
+        camera = self.client.camera
+        with self.client.atomic():
+            camera.position = key.position - self.subject.origin
+            camera.wxyz = key.wxyz
+            camera.fov = math.radians(key.fov)
+        self.pose, self.size = self._seen_pose() or (self.pose, self.size)
+        self._hide()
+        if self._slider is not None and key.time is not None:
+            self._stop_playing()
+            if is_last or not self._worker.has((self, "gaussians")):
+                self._slider.value = self.subject.moment(key.time)
+        self._ask_later()
 
     def _read_photograph(self, read: Callable[[int], np.ndarray]) -> Iterator[None]:
         """Job: a photograph into the panel."""

@@ -1,0 +1,192 @@
+"""`drgs render --path`, `--duration` and `--panorama`: frames of a flight, how many there are, and all-round views."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drgs.cameras import Camera, intrinsics
+from drgs.commands.viewpoints import frame_size
+from drgs.data.capture import upright
+from drgs.data.flight_files import read_flight
+
+if TYPE_CHECKING:
+    from drgs.commands.options import Render
+    from drgs.commands.scene_input import SceneInput
+    from drgs.data.flight import Flight
+    from drgs.settings import RenderSettings
+
+__all__ = [
+    "Film",
+    "check_flight_options",
+    "check_panorama",
+    "film_of",
+    "flight_cameras",
+    "level_panorama",
+    "middle_camera",
+    "panorama_size",
+    "up_of",
+]
+
+_FRAMES = 60
+_FPS = 24.0
+_MOST = 100_000  # frames
+_WIDE = 2048  # pixels of a panorama
+_STEEP = 0.999  # cosine between up and the axis of a camera that looks up or down: its image's up says where to look
+
+
+@dataclasses.dataclass(frozen=True)
+class Film:
+    """How many frames there are, and how fast they are shown.
+
+    Attributes:
+        frames: Number of frames.
+        fps: Frames a second.
+        flight: The flight of --path, with the duration that is asked for, else None.
+    """
+
+    frames: int
+    fps: float
+    flight: Flight | None = None
+
+
+def check_flight_options(args: Render) -> None:
+    """Raise ValueError for options that say the same twice, or that a flight, or a panorama, has no meaning for."""
+    if args.duration is not None and args.frames is not None:
+        raise ValueError(
+            "render: --duration must be alone, --frames and --fps say how long a film is; drop one of both"
+        )
+    if args.duration is not None and not 0 < args.duration <= 86400:
+        raise ValueError(f"render: --duration must be in (0, 86400] seconds, got {args.duration:g}; correct it")
+    if args.path is not None:
+        for option, value in (("--cameras", args.cameras), ("--view", args.view), ("--orbit", args.orbit)):
+            if value:
+                raise ValueError(f"render: --path must be alone, {option} names other cameras; drop one of both")
+        if args.split != "all":
+            raise ValueError("render: --path must be alone, --split is of the views of a data set; drop it")
+    if args.panorama and args.width is not None and args.height is not None and args.width != 2 * args.height:
+        raise ValueError(
+            f"render: --panorama must be twice as wide as high, got {args.width}x{args.height}; drop one of the sides"
+        )
+
+
+def film_of(args: Render) -> Film:
+    """What --path, --frames, --duration and --fps say together.
+
+    Raises:
+        FileNotFoundError, ValueError: If there is no such flight, or there would be too many frames.
+    """
+    flight = None if args.path is None else read_flight(args.path)
+    told = flight.fps if flight is not None else None
+    fps = args.fps if args.fps is not None else told or _FPS
+    if flight is not None and args.duration is not None:
+        flight = dataclasses.replace(flight, duration=args.duration)
+    if args.frames is not None:
+        frames = args.frames
+    elif flight is not None:
+        frames = flight.frame_count(fps)
+    else:
+        frames = _FRAMES if args.duration is None else max(1, round(args.duration * fps))
+    if frames > _MOST:
+        raise ValueError(f"render: there must be at most {_MOST} frames, got {frames}; lower --duration or --fps")
+    return Film(frames, fps, flight)
+
+
+def flight_cameras(args: Render, film: Film, given: SceneInput, shape: float) -> tuple[list[Camera], str]:
+    """Cameras of a flight's frames, and where they come from in words.
+
+    Args:
+        args: Options of the command, of which `path`, `width`, `height` and `time` apply.
+        film: What they say of frames.
+        given: What is drawn: only of what moves do times matter.
+        shape: Height over width of frames, where neither the options nor the file say both.
+    Raises:
+        ValueError: If the flight has times, and `--time` says others, or they lie outside of the run's.
+    """
+    flight = film.flight
+    assert flight is not None
+    if flight.width is not None and flight.height is not None:
+        shape = flight.height / flight.width
+    is_sized = args.width is not None or args.height is not None
+    size = (args.width, args.height) if is_sized else (flight.width, flight.height)
+    cameras = flight.cameras(film.frames, *frame_size(*size, shape))
+    if given.moving is None:
+        return [dataclasses.replace(camera, time=None) for camera in cameras], f"flight {args.path}"
+    if flight.keyframes[0].time is not None:
+        if args.time is not None:
+            raise ValueError("render: --time must be left out, the keyframes of --path have times; drop it")
+        times = given.record.times if given.record else ()
+        first, last = (times[0], times[-1]) if times else (-math.inf, math.inf)
+        for k, key in enumerate(flight.keyframes):
+            if key.time is not None and not first <= key.time <= last:
+                raise ValueError(
+                    f"{args.path}: keyframes[{k}]: time must be in {first:g}..{last:g}, the times of the run, got "
+                    f"{key.time:g}; correct it"
+                )
+    return cameras, f"flight {args.path}"
+
+
+# ------------------------------------------------------------------------------------------ panoramas
+
+
+def check_panorama(settings: RenderSettings) -> None:
+    """Raise ValueError for settings that draw pinholes alone, or leave out what is behind the camera."""
+    if settings.planar:
+        raise ValueError(
+            f"render: --panorama must have settings that follow rays, response {settings.response!r} is a model of a "
+            "pinhole's image plane; use --preset exact or fast"
+        )
+    if settings.near > 0:
+        raise ValueError(
+            f"render: --panorama must have near 0, got {settings.near:g}, which leaves out all behind the camera; use "
+            "--preset exact or fast"
+        )
+    if settings.culling == "ut":
+        raise ValueError(
+            "render: --panorama must have culling by extent, the points of 'ut' do not reach around the poles; use "
+            "--preset exact or fast"
+        )
+
+
+def middle_camera(cameras: list[Camera]) -> Camera:
+    """The camera whose place is nearest to the middle of all, coordinate by coordinate."""
+    centers = np.stack([camera.center for camera in cameras])
+    return cameras[int(np.linalg.norm(centers - np.median(centers, axis=0), axis=1).argmin())]
+
+
+def panorama_size(args: Render) -> tuple[int, int]:
+    """Width and height in pixels, 2:1."""
+    width = args.width or (2 * args.height if args.height else _WIDE)
+    return width, args.height or max(1, width // 2)
+
+
+def level_panorama(camera: Camera, up: np.ndarray, width: int, height: int) -> Camera:
+    """The camera that sees all round from a camera's place: upright, in its middle where the camera looks, leveled.
+
+    Args:
+        camera: Any camera.
+        up: (3,) world direction of length 1 that is up.
+        width, height: Pixels of the picture, 360 by 180 degrees.
+    """
+    c2w = camera.c2w
+    ahead = c2w[:3, 2]
+    if abs(float(ahead @ up)) > _STEEP:  # straight up or down: the upper edge of the image, or the lower one, is ahead
+        ahead = c2w[:3, 1] * np.sign(ahead @ up)
+    ahead = ahead - (ahead @ up) * up
+    ahead /= np.linalg.norm(ahead)
+    rotation = np.stack([np.cross(ahead, up), -up, ahead])
+    w2c = np.eye(4)
+    w2c[:3, :3] = rotation
+    w2c[:3, 3] = -rotation @ camera.center
+    K = intrinsics(width / (2 * math.pi), height / math.pi, width / 2, height / 2)
+    return Camera(K=K, w2c=w2c, width=width, height=height, model="equirectangular", name=camera.name, time=camera.time)
+
+
+def up_of(cameras: list[Camera], wished: tuple[float, float, float] | None) -> np.ndarray:
+    """(3,) up: what --orbit up= says, else that of the cameras, the photographs' where there are some."""
+    if wished is not None:
+        return np.asarray(wished, np.float64) / np.linalg.norm(wished)
+    return upright(cameras)
