@@ -49,6 +49,9 @@ smoke: setup
 	$(BIN)/drgs demo --quick -o out/smoke
 	$(BIN)/drgs eval out/smoke/run
 	$(BIN)/drgs report out/smoke/run -o out/smoke/report.html
+	if $(BIN)/python -c 'from drgs.sharing.npm import viewer_files; viewer_files()'; then \
+	  $(BIN)/drgs share out/smoke/run -o out/smoke/scene.html; \
+	else echo "no page: the viewer's code could not be fetched from npm"; fi
 	$(BIN)/drgs cite out/smoke/run
 	$(BIN)/drgs render out/smoke/run --frames 3 --width 64 --format png,exr,webm --depth -o out/smoke/render
 	echo '{"keyframes": [{"position": [0, 0, -3], "wxyz": [1, 0, 0, 0], "fov": 50, "seconds": 0}, {"position": [1, 0, -3], "wxyz": [1, 0, 0, 0], "fov": 40, "seconds": 0.2}]}' > out/smoke/flight.json

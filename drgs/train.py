@@ -144,7 +144,7 @@ def fit(
             to have. Where that is another number, schedules go on from the share that is then done, and config.json
             says so. Only where nothing moves and all views are fitted to.
         begin: Checkpoint of another fit (`state.safetensors`), in the same world, whose Gaussians this one begins with
-            instead of points; where new photographs show what these leave empty, points of the data set are added.
+            instead of points; points of the data set that new photographs show are added, as far as there is room.
             Only where nothing moves, all views are fitted to, and there are no features.
     Raises:
         ValueError: On a bad config, data set or run folder, when another process writes there, and when losses stay

@@ -51,6 +51,7 @@ _COMMANDS_ELSEWHERE = {
     "scene": "path tracing takes ten seconds: tests/test_room.py, tests/test_kitchen.py",
     "teach": "needs a model: tests/test_teach.py",
     "reproduce": "takes minutes: tests/test_reproduce.py, and `make smoke`",
+    "share": "may fetch its viewer from npm: tests/test_share.py, tests/test_share_browser.py",
     "view": "ends by Ctrl-C alone: tests/test_view.py",
 }
 _ARGUMENTS_ELSEWHERE = {

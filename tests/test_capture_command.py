@@ -7,6 +7,7 @@ The photographs are of three textured walls that meet in a corner, small ones; f
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import os
 import shutil
@@ -205,16 +206,16 @@ def test_further_photographs(joined, captured):
 def test_further_photographs_end_with_the_same_bits(joined, captured, tmp_path):
     """As a fit that was never stopped, from the checkpoint that the first photographs left."""
     folder, _ = joined
-    record = CaptureRecord.read(folder / "capture").batch
-    assert record.plan["before"]["gaussians"] == 400
-    config = CONFIG.replace(max_steps=STEPS // 2)
+    assert CaptureRecord.read(folder / "capture").batch.plan["before"]["views"] == 5
+    density = dataclasses.replace(CONFIG.density, max_gaussians=560)  # as 7 photographs to 5
+    config = CONFIG.replace(max_steps=STEPS // 2, density=density)
     fit(load(folder / "capture/scene"), tmp_path / "run", config, progress=False, begin=Run(captured).state)
     found, wanted = (load_state(Run(x).state)[0] for x in (folder, tmp_path / "run"))
     assert all(torch.equal(x, wanted[name]) for name, x in found.items())
 
 
 def test_new_places_get_points(captured, tmp_path):
-    """Where a photograph that joins shows what no Gaussian covers, points of the data set are added."""
+    """Points of the data set that photographs which join show are added, as far as there is room."""
     scene = load(captured / "capture/scene")
     write = Run(captured).config()
     left = [view for view in scene.views if view.name in write["train"][:2]]

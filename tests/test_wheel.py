@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from drgs.sharing import npm
+
 ROOT = Path(__file__).resolve().parent.parent
 
 
@@ -43,3 +45,14 @@ def test_it_is_whole(wheel):
         if path.is_file() and "__pycache__" not in path.parts
     }
     assert wanted <= set(wheel)
+
+
+def test_it_has_the_viewer_of_shared_pages(wheel):
+    """The packages of npm that a page is drawn by, each with its license."""
+    try:
+        npm.viewer_files()
+    except OSError as error:
+        pytest.skip(str(error))
+    wanted = {f"drgs/sharing/npm/{package.folder}/{name}" for package in npm.PACKAGES for name in package.files}
+    assert wanted <= set(wheel)
+    assert sum(name.endswith("/LICENSE") for name in wanted) == len(npm.PACKAGES) == 2

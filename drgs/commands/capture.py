@@ -25,7 +25,9 @@ from drgs.capturing import diagnosis
 from drgs.capturing.pace import Pacer
 from drgs.capturing.plan import FitPlan, duration, plan_fit, plan_frames, plan_poses, planned_poses, seconds_of_budget
 from drgs.capturing.record import FOLDER, Batch, CaptureRecord, DoneStep, inputs_of
+from drgs.commands import share
 from drgs.commands.next_views import rank_next
+from drgs.commands.options import Share
 from drgs.commands.report import report_of
 from drgs.data.checks import list_images
 from drgs.data.gathering import gather, named_files
@@ -217,7 +219,7 @@ def _with_batch(args: Capture, record: CaptureRecord, batch: Batch) -> CaptureRe
             f"{args.output}: --add must have a capture of photographs, this one was of a data set with poses; fit anew "
             "to all of it"
         )
-    if any(record.batch.step(name) is None for name in ("fit", *_PAGES)):
+    if any(record.batch.step(name) is None for name in ("fit", "report")):
         raise ValueError(
             f"{args.output}: --add must follow a capture that is done, this one is not; go on with --resume first"
         )
@@ -279,7 +281,13 @@ class _Capture:
         """All steps that are not done yet."""
         with Bar("capture", show=not self.args.quiet, lines_only=True):
             for name, work in self._steps(photographs, videos).items():
-                self._step(name, work)
+                try:
+                    self._step(name, work)
+                except OSError as error:  # the viewer's code is out of reach: all else is done
+                    if name != "share":
+                        raise
+                    run = shlex.quote(str(self.args.output))
+                    self._say(f"share: not written, {error}; then drgs share {run}")
             self._finish()
 
     def _steps(self, photographs: list[Path], videos: list[Path]) -> dict[str, Callable[[], Outcome]]:
@@ -417,8 +425,7 @@ class _Capture:
         begin = None
         if self.is_added:
             begin = self._make_room()
-            before = recorded_config(self.batch.plan["before"]["config"])
-            config = before.replace(max_steps=max(1, round(_SHARE_OF_STEPS * before.max_steps)), seed=self.args.seed)
+            config = self._further_config()
         resume = is_run(self.args.output)
         if resume:
             config = _config_of(self.run_folder)
@@ -426,7 +433,7 @@ class _Capture:
         pace, plan = None, None
         if self.clock.end is not None and not dataset.is_dynamic:
             if not resume:
-                plan = plan_fit(dataset, config, self.clock.left, self.batch.plan.get("before", {}).get("gaussians", 1))
+                plan = plan_fit(dataset, config, self.clock.left, config.density.max_gaussians if begin else 1)
                 config = plan.config(config)
                 self.batch.plan["fit"] = dataclasses.asdict(plan)
                 self.record.write()
@@ -466,7 +473,7 @@ class _Capture:
             record = fit_record(self.run_folder)
             self.batch.plan["before"] = {
                 "config": record.config.to_json(),
-                "gaussians": len(tensors["parameter.means"]),
+                "views": len(record.train),
             }
             self._hand_over("kept")
         if self.batch.handover == "kept":
@@ -475,6 +482,19 @@ class _Capture:
                     held.remove(self.run_folder.path / name)
             self._hand_over("cleared")
         return kept
+
+    def _further_config(self) -> FitConfig:
+        """That of the fit before, with more Gaussians where there are more photographs."""
+        told = self.batch.plan["before"]
+        before = recorded_config(told["config"])
+        views = load_dataset(self.folder / _SCENE, before, lazy=True, points=False, semantics=False)
+        train, _ = views.split(before.data.test_every, before.data.test_offset, before.data.test_cameras)
+        most = round(before.density.max_gaussians * max(1.0, len(train) / told["views"]))
+        return before.replace(
+            max_steps=max(1, round(_SHARE_OF_STEPS * before.max_steps)),
+            seed=self.args.seed,
+            density=dataclasses.replace(before.density, max_gaussians=most),
+        )
 
     def _hand_over(self, state: str) -> None:
         self.batch.handover = state
@@ -520,7 +540,15 @@ def _write_report(run: Run) -> None:
     report_of(run, run.path / FILE, record.with_refined_poses(dataset))
 
 
-_PAGES: dict[str, tuple[str, Callable[[Run], None]]] = {"report": (FILE, _write_report)}
+def _write_scene(run: Run) -> None:
+    """The page to send, as `drgs share` writes it."""
+    share.run(Share(scene=run.path, quiet=True))
+
+
+_PAGES: dict[str, tuple[str, Callable[[Run], None]]] = {
+    "report": (FILE, _write_report),
+    "share": (share.FILE, _write_scene),
+}
 """Steps at the end, in their order: the file in the run that each makes, and how."""
 
 

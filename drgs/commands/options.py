@@ -50,6 +50,7 @@ __all__ = [
     "Render",
     "Report",
     "Select",
+    "Share",
     "Stress",
     "Tradeoff",
     "View",
@@ -340,6 +341,21 @@ class Report(Common):
     """A run folder; the fit may still be going on, or have been stopped."""
     output: Annotated[Path | None, arg(aliases=["-o"])] = None
     """The HTML file; default report.html in the run folder. While a fit writes there, name another place."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Share(Common):
+    """Write a run or a file of Gaussians as one HTML page that opens from disk, on a phone too."""
+
+    scene: SceneFile
+    output: Annotated[Path | None, arg(aliases=["-o"])] = None
+    """The HTML file; default scene.html in the run folder, of a file the same name with .html."""
+    selection: Path | None = None
+    """Photographs to take next, as drgs select writes them; default those of the run, if it chose its views."""
+    uncertainty: bool = True
+    """With a layer of what the photographs leave uncertain, unless --no-uncertainty, which saves the time."""
+    moments: int = 12
+    """Of a scene that moves: at so many times it is written, the page draws those between on straight lines."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -14,11 +14,8 @@ from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import Frame
 from drgs.fitting.records import check_checkpoint
 from drgs.fitting.rows import GaussianRows
-from drgs.integrator import render
 
 __all__ = ["Beginning", "begin_with"]
-
-_OPEN = 0.5  # opacity of a pixel below which nothing is taken to be there yet
 
 _log = logging.getLogger("drgs.train")
 
@@ -43,7 +40,11 @@ def begin_with(
     colors: np.ndarray | None,
     config: FitConfig,
 ) -> Beginning:
-    """The Gaussians of a checkpoint, and one at each point that new photographs show where these leave them empty.
+    """The Gaussians of a checkpoint, and as many of the points that new photographs show as there is room for.
+
+    Points where Gaussians are, too, are not left out: what was fitted to few photographs may be in the wrong place, and
+    nothing else would bring it to the right one. On `banana`, six photographs that joined eight, 200 steps: 27.9 dB with
+    the points, 27.3 dB with copies of Gaussians instead.
 
     Args:
         checkpoint: File of a fit to what stands still.
@@ -68,7 +69,7 @@ def begin_with(
     new = [frame for frame in frames if frame.name not in header["views"]]
     room = config.density.max_gaussians - before
     if points is not None and colors is not None and new and room > 0:
-        shown = _open_points(rows, new, points, config)
+        shown = _shown_points(new, points)
         shown = np.sort(np.random.default_rng(config.seed).permutation(shown)[:room])
         if len(shown):
             chosen = torch.from_numpy(points[shown]), torch.from_numpy(colors[shown])
@@ -80,16 +81,11 @@ def begin_with(
     return Beginning(rows, source)
 
 
-def _open_points(rows: GaussianRows, frames: list[Frame], points: np.ndarray, config: FitConfig) -> np.ndarray:
-    """Indices of points that are in photographs where Gaussians leave them more than half transparent."""
+def _shown_points(frames: list[Frame], points: np.ndarray) -> np.ndarray:
+    """Indices of points that lie in at least one of the photographs."""
     found = np.zeros(len(points), bool)
-    with torch.no_grad():  # looked at only
-        gaussians = rows.gaussians()
-        for frame in frames:
-            alpha = render(gaussians, frame.camera, config.settings, outputs=()).alpha.cpu().numpy()
-            pixels, depth = frame.camera.project(points)
-            size = frame.camera.width, frame.camera.height
-            inside = np.flatnonzero((depth > 0) & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1))
-            columns, lines = pixels[inside].astype(int).T
-            found[inside[alpha[lines, columns] < _OPEN]] = True
+    for frame in frames:
+        pixels, depth = frame.camera.project(points)
+        size = frame.camera.width, frame.camera.height
+        found |= (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)
     return np.flatnonzero(found)

@@ -1,0 +1,108 @@
+"""How the page of `drgs share` agrees with our `gsplat`, at cameras of photographs, and how large it is.
+
+    python benchmarks/share.py runs/scene [runs/other ...] [--views 3] [--pixels 250000]
+
+Three numbers a view, in dB: `page` is a screenshot in headless Chromium beside `gsplat` of the run's own Gaussians; it
+is made of `archive`, what SOG loses (our `gsplat` of what the page holds beside that of the run's), and `rules`, how
+Spark draws (the screenshot beside our `gsplat` of what the page holds). Needs playwright and Chromium.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import re
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from drgs.cameras import Camera
+from drgs.codecs import load_gaussians
+from drgs.codecs.sog import encode_sog
+from drgs.commands.options import Share
+from drgs.commands.share import shared_of
+from drgs.ellipsoids import Gaussians
+from drgs.integrator import render
+from drgs.settings import RenderSettings
+from drgs.sharing.write import write_page
+from drgs.sizes import reduced_size
+
+_FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+_PATIENCE = 300_000  # ms
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("runs", nargs="+", type=Path)
+    parser.add_argument("--views", type=int, default=3, help="views of each, evenly over its photographs")
+    parser.add_argument("--pixels", type=int, default=250_000, help="of a picture, at most")
+    parser.add_argument("--chromium", default="/usr/bin/chromium")
+    parser.add_argument("--pictures", type=Path, default=None, help="folder for pictures: run, page, ten times apart")
+    args = parser.parse_args()
+    from playwright import sync_api
+
+    print("| run | Gaussians | bytes each | page (MB) | view | page | archive | rules |")
+    print("|---|---|---|---|---|---|---|---|")
+    with sync_api.sync_playwright() as driver, tempfile.TemporaryDirectory() as folder:
+        browser = driver.chromium.launch(executable_path=args.chromium, args=_FLAGS)
+        for run in args.runs:
+            _measure(browser, run, Path(folder), args)
+
+
+def _measure(browser, run: Path, folder: Path, args: argparse.Namespace) -> None:
+    shared = shared_of(Share(scene=run, uncertainty=False))
+    page = folder / "scene.html"
+    write_page(shared, page)
+    archive = folder / "scene.sog"
+    archive.write_bytes(encode_sog(shared.gaussians))
+    held = load_gaussians(archive).replace(origin=shared.gaussians.origin)
+    settings = RenderSettings.preset("gsplat", background=shared.background)
+    count = len(shared.gaussians)
+    begin = f"| {run.name} | {count:,} | {archive.stat().st_size / count:.1f} | {page.stat().st_size / 1e6:.1f} |"
+    fitted = [camera for kind, camera in shared.cameras if kind == "fitted"]
+    for index in np.unique(np.linspace(0, len(fitted) - 1, args.views).round().astype(int)):
+        camera = _in_window(fitted[index], *reduced_size(fitted[index], args.pixels))
+        shot = _screenshot(browser, page, camera)
+        own, kept = (_drawn(g, camera, settings) for g in (shared.gaussians, held))
+        values = " | ".join(f"{_psnr(a, b):.1f}" for a, b in ((shot, own), (kept, own), (shot, kept)))
+        print(f"{begin} {camera.name} | {values} |", flush=True)
+        if args.pictures is not None:
+            args.pictures.mkdir(parents=True, exist_ok=True)
+            row = np.concatenate([own, shot, np.clip(10 * np.abs(shot - own), 0, 1)], 1)
+            name = re.sub(r"\W", "_", f"{run.name}_{camera.name}")
+            cv2.imwrite(str(args.pictures / f"{name}.png"), (255 * row[..., ::-1]).round().astype(np.uint8))
+
+
+def _in_window(camera: Camera, width: int, height: int) -> Camera:
+    """The camera of a page whose window has this size: all of the photograph in its middle, no side stretched."""
+    scale = min(width / camera.width, height / camera.height)
+    K = np.array(camera.K) * [[scale], [scale], [1]]
+    K[:2, 2] += 0.5 * (np.array([width, height]) - scale * np.array([camera.width, camera.height]))
+    return dataclasses.replace(camera, K=K, width=width, height=height)
+
+
+def _screenshot(browser, page: Path, camera: Camera) -> np.ndarray:
+    """(H, W, 3) of the page at a photograph's camera, once nothing is left to be sorted."""
+    opened = browser.new_page(viewport={"width": camera.width, "height": camera.height})
+    opened.goto(f"{page.as_uri()}#bare&photo={camera.name}")
+    done = "body[data-state=settled], body[data-state=failed]"
+    opened.wait_for_selector(done, state="attached", timeout=_PATIENCE)
+    data = np.frombuffer(opened.screenshot(), np.uint8)
+    opened.close()
+    return cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1] / 255.0
+
+
+def _drawn(gaussians: Gaussians, camera: Camera, settings: RenderSettings) -> np.ndarray:
+    with torch.no_grad():  # a picture
+        return render(gaussians, camera, settings).rgb.clamp(0, 1).cpu().numpy()
+
+
+def _psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return float(-10 * np.log10(np.square(a - b).mean()))
+
+
+if __name__ == "__main__":
+    main()

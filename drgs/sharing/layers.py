@@ -1,0 +1,135 @@
+"""What a page knows of each Gaussian beside its looks: its class, how uncertain it is, where it is at other times."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from drgs.display.pictures import inferno
+from drgs.display.progress import Bar
+from drgs.gain import variances
+from drgs.information.blocks import MAP_PRIOR, SceneBlocks, add, together
+from drgs.information.scoring import Scoring
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.deform import DynamicGaussians
+    from drgs.ellipsoids import Gaussians, Scene
+    from drgs.features.decoder import Decoder
+    from drgs.features.segmentation import Classes
+    from drgs.information.nuisances import Nuisances
+    from drgs.settings import RenderSettings
+
+__all__ = ["classes_layer", "moments_of", "uncertainty_layer", "uncertainty_of"]
+
+_LEVELS = 256
+_DECADES = 3.0  # of the scale of uncertainty at most, as in the report's maps
+_STILL = 1e-3  # what moves less, as a part of the scene's extent (or of a turn, or of a log scale), stands still
+
+
+def classes_layer(
+    features: torch.Tensor, classes: Classes, decoder: Decoder | None
+) -> tuple[dict[str, Any], np.ndarray]:
+    """Names and colors of classes, and the class of each Gaussian: (N,) from 1 on.
+
+    Args:
+        features: (N, C) of the Gaussians.
+        classes: Classes with embeddings.
+        decoder: What makes a teacher's features of these.
+    """
+    from drgs.features.pictures import label_colors
+    from drgs.features.segmentation import classify
+
+    labels = classify(features, classes, decoder).numpy()
+    known = {"names": list(classes.names), "colors": label_colors(len(classes)).tolist()}
+    return known, labels
+
+
+def uncertainty_of(
+    scene: Scene, cameras: Sequence[Camera], settings: RenderSettings, nuisances: Nuisances
+) -> np.ndarray:
+    """(N,) what the photographs leave uncertain of where each Gaussian is.
+
+    The standard deviation of its center for unit noise of the photographs' colors, in scene units: the square root of
+    the sum over its three coordinates of 1 / (H + lambda), as `drgs convert --uncertainty` writes it.
+
+    Args:
+        scene: What was fitted.
+        cameras: Cameras of the photographs, as large as they are to be asked.
+        settings: How it is drawn.
+        nuisances: Unknowns of the photographs, eliminated from what they say.
+    """
+    scoring = Scoring(settings=settings, blocks=("geometry",), nuisances=nuisances)
+    blocks = SceneBlocks.of(scene, scoring, cameras, "share")
+    total: dict[str, torch.Tensor] = {}
+    with Bar("uncertainty", len(cameras)) as bar:
+        for camera in cameras:
+            add(total, together(blocks.information(camera)))
+            bar.advance()
+    return variances(total, MAP_PRIOR)["means"].sum(1).sqrt().cpu().numpy()
+
+
+def uncertainty_layer(values: np.ndarray) -> tuple[dict[str, Any], bytes]:
+    """Ends, colors and meaning of a logarithmic scale, and the level of each Gaussian on it: uint8.
+
+    The scale covers the values between the 1st and the 99th percentile, at most three decades; what is beyond has the
+    color of its end.
+
+    Args:
+        values: (N,) > 0.
+    """
+    values = np.log10(values)
+    least, high = np.percentile(values, [1, 99])
+    low = max(least, high - _DECADES)
+    high = max(high, low + 1e-3)  # of one value, too, the scale has a length to divide by
+    shares = (np.clip(values, low, high) - low) / (high - low)
+    known = {
+        "low": float(10.0**low),
+        "high": float(10.0**high),
+        "text": "standard deviation of a center for noise of 1, in scene units",
+        "colors": inferno(np.linspace(0, 1, _LEVELS)[None])[0].tolist(),
+    }
+    return known, np.rint((_LEVELS - 1) * shares).astype(np.uint8).tobytes()
+
+
+def moments_of(moving: DynamicGaussians, times: Sequence[float], rest: Gaussians, order: np.ndarray) -> tuple:
+    """Where the Gaussians that move are at each of some times, in 16 bits a number.
+
+    Args:
+        moving: The Gaussians and what moves them.
+        times: Ascending.
+        rest: Those that the page's archive holds.
+        order: (N,) the archive's order of them.
+    Returns:
+        What a page is told of it; indices of what moves in the archive's order, uint32; and (T, 10, M) uint16 means,
+        log scales and quaternions (wxyz) of these, each within its own range.
+    """
+    numbers = []
+    with torch.no_grad(), Bar("moments", len(times)) as bar:  # values, to be written
+        for time in times:
+            numbers.append(_numbers(moving.at(time))[:, order])
+            bar.advance()
+    found = np.stack(numbers)  # (T, 10, N)
+    quats = found[:, 6:]
+    quats *= np.where((quats * quats[:1]).sum(1, keepdims=True) < 0, -1, 1)  # q and -q are one turn: the nearer one
+    still = _numbers(rest)[:, order]
+    extent = np.ptp(still[:3], axis=1).max()
+    scale = np.array([extent] * 3 + [1.0] * 7)[:, None]
+    moves = ((np.ptp(found, axis=0) / scale).max(0) > _STILL) | ((np.abs(found[0] - still) / scale).max(0) > _STILL)
+    places = np.flatnonzero(moves)
+    found = found[:, :, places]
+    low = found.min((0, 2)) if len(places) else np.zeros(10)
+    high = found.max((0, 2)) if len(places) else np.zeros(10)
+    span = np.where(high > low, high - low, 1.0)[:, None]
+    codes = np.rint((found - low[:, None]) / span * 65535)
+    known = {"times": [float(x) for x in times], "count": len(places), "low": low.tolist(), "high": high.tolist()}
+    return known, places.astype("<u4").tobytes(), codes.astype("<u2").tobytes()
+
+
+def _numbers(g: Gaussians) -> np.ndarray:
+    """(10, N) means, log scales and quaternions of length 1."""
+    quats = torch.nn.functional.normalize(g.quats.detach().double(), dim=1)
+    return torch.cat([g.means.detach().double(), g.log_scales.detach().double(), quats], 1).T.cpu().numpy()

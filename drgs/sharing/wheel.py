@@ -1,0 +1,47 @@
+"""Build step of setuptools: the viewer's code from npm goes into the wheel, with its licenses, so that `drgs share`
+needs no network. Runs where nothing of drgs can be imported.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+import sys
+from pathlib import Path
+from types import ModuleType
+
+from setuptools.command.build_py import build_py
+
+__all__ = ["BuildWithViewer"]
+
+
+class BuildWithViewer(build_py):
+    """`build_py`, and the packages of `drgs.sharing.npm` beside the modules."""
+
+    def run(self) -> None:
+        """Without a network a wheel goes without it, which is said: `drgs share` then fetches it at first use."""
+        super().run()
+        if self.editable_mode:
+            return
+        try:
+            found = _npm().viewer_files()
+        except OSError as error:
+            self.warn(f"the wheel goes without the viewer of `drgs share`: {error}")
+            return
+        for package in _npm().PACKAGES:
+            for name in package.files:
+                target = Path(self.build_lib) / "drgs" / "sharing" / "npm" / package.folder / name
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(found / package.folder / name, target)
+
+
+def _npm() -> ModuleType:
+    """The module beside this one, which imports nothing of drgs."""
+    name = "_drgs_sharing_npm"
+    if name not in sys.modules:
+        spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name("npm.py"))
+        assert spec is not None
+        assert spec.loader is not None
+        sys.modules[name] = module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+    return sys.modules[name]

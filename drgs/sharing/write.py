@@ -1,0 +1,110 @@
+"""The page of a scene: what it shows, gathered and written."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from drgs.codecs.clustering import morton_order
+from drgs.display.progress import Bar
+from drgs.files import atomic_write
+from drgs.sharing.gaussians import archive_of
+from drgs.sharing.layers import moments_of, uncertainty_layer
+from drgs.sharing.npm import viewer_files
+from drgs.sharing.page import page_html
+from drgs.sharing.placing import Kind, columns, median_camera, photo, upright_matrix
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.deform import DynamicGaussians
+    from drgs.ellipsoids import Gaussians
+
+__all__ = ["Shared", "write_page"]
+
+_NEAR = 0.01  # scene units: the near plane of gsplat
+_BEYOND = 10.0  # times the distance of the farthest Gaussian: the far plane
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Shared:
+    """What a page shows.
+
+    Attributes:
+        title: Name of the scene.
+        lines: Sentences about it.
+        gaussians: Gaussians, at least one; of a scene that moves, as they are at the first of `times`.
+        cameras: Cameras with what they are of; at least one, pinholes.
+        target: (3,) point of the world that is looked at.
+        up: (3,) direction of the world that is up, of length 1.
+        background: RGB in [0, 1].
+        uncertainty: (N,) standard deviation of each Gaussian's center; None: no such layer.
+        classes: Names and colors of classes, and the class of each Gaussian (`layers.classes_layer`); None: none.
+        moving: The Gaussians and what moves them; None where nothing does.
+        times: Times at which it is written, ascending.
+    """
+
+    title: str
+    lines: Sequence[str]
+    gaussians: Gaussians
+    cameras: Sequence[tuple[Kind, Camera]]
+    target: np.ndarray
+    up: np.ndarray
+    background: tuple[float, float, float]
+    uncertainty: np.ndarray | None = None
+    classes: tuple[dict[str, Any], np.ndarray] | None = None
+    moving: DynamicGaussians | None = None
+    times: Sequence[float] = ()
+
+
+def write_page(shared: Shared, path: str | os.PathLike) -> dict[str, int]:
+    """Write the page, atomically.
+
+    Args:
+        shared: What it shows.
+        path: HTML file to write.
+    Returns:
+        Bytes of its parts, as they are in the page: `gaussians`, each layer's, `viewer` with the viewer's code and
+        ours.
+    Raises:
+        OSError: If the viewer's code is not there and cannot be fetched, or the file not be written.
+    """
+    viewer = viewer_files()  # first: without it there is no page
+    # The archive is in this order already, and what else is known of each Gaussian goes into it, too.
+    order = morton_order(shared.gaussians.means.numpy())
+    origin = np.array(shared.gaussians.origin, np.float64)
+    with Bar("packing"):
+        archive, harmonics = archive_of(shared.gaussians)
+    first = [camera for _, camera in shared.cameras]
+    fitted = [camera for kind, camera in shared.cameras if kind == "fitted"] or first
+    begin = fitted[median_camera(fitted)]
+    distances = np.linalg.norm(shared.gaussians.means.numpy() + origin - begin.center, axis=1)
+    reach = float(np.linalg.norm(shared.target - begin.center))
+    scene: dict[str, Any] = {
+        "background": list(shared.background),
+        "near": _NEAR,
+        "far": _BEYOND * max(float(distances.max()), reach),
+        "reach": reach,
+        "target": (shared.target - origin).tolist(),
+        "upright": columns(upright_matrix(shared.up)),
+        "photos": [photo(camera, kind, origin) for kind, camera in shared.cameras],
+        "first": next(i for i, camera in enumerate(first) if camera is begin),
+        "harmonics": harmonics,
+    }
+    parts = {"gaussians": archive}
+    if shared.uncertainty is not None:
+        scene["uncertainty"], parts["uncertainty"] = uncertainty_layer(shared.uncertainty[order])
+    if shared.classes is not None:
+        scene["classes"], labels = shared.classes
+        parts["classes"] = labels[order].astype("<u2").tobytes()
+    if shared.moving is not None:
+        scene["moments"], parts["moving"], parts["moments"] = moments_of(
+            shared.moving, shared.times, shared.gaussians, order
+        )
+    page, sizes = page_html(shared.title, shared.lines, scene, parts, viewer)
+    with atomic_write(path) as file:
+        file.write(page.encode())
+    return sizes
