@@ -42,7 +42,7 @@ numerics: setup
 browser:
 	command -v chromium || command -v google-chrome || { apt-get update && apt-get install -y --no-install-recommends chromium; }
 
-# The commands of the README on a scene that is made in seconds; about a minute on two cores.
+# The commands of the README on a scene that is made in seconds; about two minutes on two cores.
 smoke: setup
 	$(BIN)/drgs --help
 	$(BIN)/drgs info
@@ -61,6 +61,9 @@ smoke: setup
 	$(BIN)/drgs fit out/smoke/still_life -o out/smoke/active --views active --add 2 --every 10 --max-steps 40
 	$(BIN)/drgs select out/smoke/run --candidates dome --count 6 -k 2 -o out/smoke/selection.json
 	$(BIN)/drgs fisher out/smoke/run --limit 2 --pose -o out/smoke/fisher
+	rm -rf out/smoke/capture
+	$(BIN)/drgs capture out/smoke/still_life -o out/smoke/capture --budget 30s
+	$(BIN)/drgs capture --more -k 2 -o out/smoke/capture
 	$(BIN)/drgs crossval out/smoke/run --limit 1 --max-pixels 768 --no-ladder -o out/smoke/crossval
 	$(BIN)/drgs tradeoff out/smoke/run --limit 1 --max-pixels 768 --repeats 1 -o out/smoke/tradeoff
 	$(BIN)/drgs reproduce static --scale tiny --seeds 1 --policy random --policy fisherrf -o out/smoke/reproduce

@@ -26,7 +26,7 @@ from tyro.conf import FlagCreatePairsOff, subcommand
 import drgs
 from drgs.cluster.options import check_options
 from drgs.commands.config_file import config_fields, default_of, named_config
-from drgs.commands.making_options import Demo, Mesh, Reproduce, Scene, Sfm, Teach
+from drgs.commands.making_options import Capture, Demo, Mesh, Reproduce, Scene, Sfm, Teach
 from drgs.commands.option_groups import Clustered
 from drgs.commands.option_help import help_page
 from drgs.commands.options import (
@@ -70,6 +70,7 @@ _OPTIONS = {
     "crossval": Crossval,
     "tradeoff": Tradeoff,
     "stress": Stress,
+    "capture": Capture,
     "sfm": Sfm,
     "teach": Teach,
     "scene": Scene,

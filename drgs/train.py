@@ -76,6 +76,7 @@ __all__ = [
     "FitResult",
     "LossConfig",
     "MotionConfig",
+    "Pace",
     "RateConfig",
     "SavingConfig",
     "SelectionConfig",
@@ -84,6 +85,9 @@ __all__ = [
 ]
 
 _log = logging.getLogger(__name__)
+
+Pace = Callable[[int, int], int]
+"""Steps done, steps of the whole fit -> steps that the whole fit is to have."""
 
 _PREVIEWS = 10
 _LOG_EVERY = 20  # steps whose loss and PSNR are averaged in one event
@@ -116,6 +120,8 @@ def fit(
     progress: bool = True,
     workers: Workers | None = None,
     active: SelectionConfig | None = None,
+    pace: Pace | None = None,
+    begin: str | Path | None = None,
 ) -> FitResult:
     """Fit Gaussians to a data set and write a run folder.
 
@@ -134,6 +140,12 @@ def fit(
         progress: Show it on stderr: a bar on a terminal, lines elsewhere.
         workers: Processes that compute what candidates of an active fit tell, as `drgs.select` takes them.
         active: The config's `selection`, where it stood before; for one release.
+        pace: Called after every step with the steps done and those of the whole fit; returns how many the whole fit is
+            to have. Where that is another number, schedules go on from the share that is then done, and config.json
+            says so. Only where nothing moves and all views are fitted to.
+        begin: Checkpoint of another fit (`state.safetensors`), in the same world, whose Gaussians this one begins with
+            instead of points; points of the data set that new photographs show are added, as far as there is room.
+            Only where nothing moves, all views are fitted to, and there are no features.
     Raises:
         ValueError: On a bad config, data set or run folder, when another process writes there, and when losses stay
             not finite.
@@ -149,7 +161,7 @@ def fit(
     threads = one_thread() if config.deterministic else contextlib.nullcontext()
     with claim_run(Run(out_dir), "fit", resume, [dataset.path]), threads, Bar("fit", show=progress):
         try:
-            return _fit(dataset, out_dir, config, parts, resume, workers)
+            return _fit(dataset, out_dir, config, parts, resume, workers, pace, None if begin is None else Path(begin))
         except (MemoryError, RuntimeError) as error:
             if not is_out_of_memory(error):
                 raise
@@ -166,6 +178,8 @@ def _fit(
     parts: Parts | None,
     resume: bool,
     workers: Workers | None,
+    pace: Pace | None = None,
+    begin: Path | None = None,
 ) -> FitResult:
     """`fit` in a run folder that is claimed: what there is to fit or to go on from, all steps, and the metrics."""
     train, test = dataset.split(config.data.test_every, config.data.test_offset, config.data.test_cameras)
@@ -182,6 +196,13 @@ def _fit(
     run = Run(out_dir)
     motion = motion_of(config, train, test) if parts is None else None
     selection = config.selection
+    if pace is not None and (selection or motion is not None):
+        raise ValueError("fit: pace must be None where views are chosen on the way or things move; leave it out")
+    if begin is not None and (selection or motion is not None or parts is not None):
+        raise ValueError(
+            "fit: begin must be None where views are chosen on the way, things move or parts are a caller's own; "
+            "leave it out"
+        )
     check_photographs(config, motion is not None)
     plan = ActiveViews(train, config, motion is not None, workers) if selection else None
     if selection and selection.measure and not test:
@@ -194,6 +215,8 @@ def _fit(
     tensors, header = _checkpoint(run, plan, taught) if resume else (None, None)
     frames = plan.frames() if plan else frames_for(train, config.data)
     held_out = frames_for(test, config.data)
+    if begin is not None and taught is not None:
+        raise ValueError("fit: begin must be None where features are fitted, too; ignore semantics, or fit anew")
     if taught and taught.embeddings:
         from drgs.fitting.segments import check_references
 
@@ -214,13 +237,14 @@ def _fit(
         looks = plan is not None and parts is None and config.data.exposure != "off"
         compared = plan.compared_points(dataset.points) if plan and looks else None
         trainer, source, exposure, evidence, choice = start(
-            dataset, views, frames, config, parts, taught, plan is not None, room, motion, compared
+            dataset, views, frames, config, parts, taught, plan is not None, room, motion, compared, begin
         )
         if plan and exposure is not None:
             plan.exposure = exposure.to_json(plan.names)
         seconds = 0.0
     recorded = config_record(dataset, config, plan, taught, frames, held_out, source, motion.times if motion else ())
     recorded |= photographs_record(run, trainer, exposure, evidence, choice)
+    recorded |= {"begin": str(begin)} if begin is not None else {}
     recorded |= {"exposure": plan.exposure} if plan and plan.exposure else {}
     recorded |= {"lenses": lenses.to_json()} if lenses and lenses.lost else {}
     poses = trainer.parts.poses
@@ -241,6 +265,10 @@ def _fit(
 
     joins = _Joins(dataset.points, recorded, parts is None) if plan else None
     loop = _Loop(run, trainer, held_out, source, seconds, plan, taught, measured, joins)
+    if pace is not None:
+        loop.keep_pace(pace, recorded)
+    if begin is not None and trainer.step_index == 0:
+        loop.save()  # the run shows from now on what it begins with
     with fewer_torch_threads(), Bar("fit", config.max_steps, done=trainer.step_index) as bar:
         if len(named := [settings.nearest_preset()[0] for settings in trainer.renderers.all_settings]) > 1:
             bar.note(f"every step has one of the renderers {', '.join(named)}; --for fast fits for one alone")
@@ -382,10 +410,32 @@ class _Loop:
         self.taught = taught
         self._measured = measured
         self._joins = joins
+        self._pace: Pace | None = None
+        self._recorded: dict[str, Any] = {}
         self._recent: list[StepResult] = []
         self._psnr: float | None = None  # of the last steps
         self._saved: tuple[int, int] | None = None  # steps and views of the last checkpoint
         self._saved_at = time.monotonic()
+
+    def keep_pace(self, pace: Pace, recorded: dict[str, Any]) -> None:
+        """Ask after every step how many the fit is to have; `recorded`, contents of config.json, change with them."""
+        self._pace = pace
+        self._recorded = recorded
+
+    def _follow_pace(self, pace: Pace, bar: Bar) -> None:
+        """Have as many steps as asked for, and record it."""
+        trainer = self.trainer
+        done, before = trainer.step_index, trainer.config.max_steps
+        wanted = max(done, pace(done, before))
+        if wanted == before or done >= before:
+            return
+        if wanted == done:
+            wanted = done + 1  # schedules have an end that is not behind them
+        trainer.reschedule(wanted)
+        self._recorded["fit"] = trainer.config.to_json()
+        self.run_folder.record(self._recorded)
+        self.run_folder.log("rescheduled", step=done, before=before, max_steps=wanted)
+        bar.update(done, wanted)
 
     def run(self, bar: Bar) -> None:
         """All steps that are left, or as many as there are until the fit is interrupted."""
@@ -395,7 +445,7 @@ class _Loop:
             trainer.reserved = self.plan.reserved
         # In the middle of a step the Gaussians may be half-way through density control: not a state to save.
         with interrupts.between_steps() as is_interrupted:
-            while trainer.step_index < config.max_steps:
+            while trainer.step_index < trainer.config.max_steps:
                 if is_interrupted():
                     self.run_folder.log("interrupted", step=trainer.step_index)
                     if not trainer.is_sound:
@@ -424,12 +474,14 @@ class _Loop:
                     self._psnr = 0.98 * (self._psnr or step.psnr) + 0.02 * step.psnr
                 shown = "" if self._psnr is None else f"{self._psnr:.2f} dB, "
                 bar.update(done, text=f"{shown}{len(trainer.rows)} Gaussians")
+                if self._pace is not None:
+                    self._follow_pace(self._pace, bar)
                 if done % preview_every == 0:
                     self._preview(bar, is_interrupted)
                 # What a step has spoiled shows in the next one: good checkpoints stay until losses are finite again.
                 late = time.monotonic() - self._saved_at > 60 * config.saving.save_minutes
                 is_due = late or done % config.saving.save_every == 0
-                if is_due and done < config.max_steps and trainer.is_sound:
+                if is_due and done < trainer.config.max_steps and trainer.is_sound:
                     self.save()
             self.save()
 

@@ -45,6 +45,7 @@ _SMALLER = {
 
 # Why a command of a page is parsed and not run, and what runs it: by the command's name, or by one of its arguments.
 _COMMANDS_ELSEWHERE = {
+    "capture": "structure from motion needs real texture: tests/test_capture_command.py",
     "sfm": "structure from motion needs real texture: tests/test_sfm.py",
     "demo": "takes half a minute: tests/test_demo.py",
     "scene": "path tracing takes ten seconds: tests/test_room.py, tests/test_kitchen.py",
@@ -56,6 +57,7 @@ _COMMANDS_ELSEWHERE = {
 _ARGUMENTS_ELSEWHERE = {
     r"(.*/)?kitchen": "is of what moves: tests/test_dynamic_fit.py, and `make smoke`",
     r"\$DRGS_DATA/.*": "is of real data: `benchmarks/real.py`, and the tests marked real_data",
+    r"runs/phone": "is of a capture: tests/test_capture_command.py",
     r"runs/td/.*": "is of a run of the demo: tests/test_tradeoff.py",
     r"scene\.sog": "is written by other programs: tests/test_codecs.py",
     r"examples\..*": "is an example: tests/test_examples.py",

@@ -60,6 +60,7 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"metrics"}, "pictures against photographs"),
     ({"train", "evaluation"}, "fits, for users, and what they are worth"),
     ({"report"}, "what a fit looked like, as a page"),
+    ({"capturing"}, "what photographs are worth, what there is time for, and where to stand next"),
     ({"sharing"}, "a scene as a page that is sent"),
     ({"lab"}, "experiments on all of the above"),
     ({"studies"}, "many fits, and what they say together"),

@@ -20,6 +20,7 @@ from drgs.cameras import orbit
 
 # What is no room of a user's: tables of a machine, math of lenses, and options in, files out.
 _INSIDE = {
+    "capturing",
     "commands",
     "covariances",
     "gsplat_options",

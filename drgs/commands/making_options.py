@@ -13,7 +13,7 @@ from drgs.commands.record_options import options_of
 from drgs.meshing.options import MeshOptions
 from drgs.studies.choices import ExperimentName, ProtocolName, StudyScale
 
-__all__ = ["Demo", "Mesh", "Reproduce", "Scene", "Sfm", "Teach"]
+__all__ = ["Capture", "Demo", "Mesh", "Reproduce", "Scene", "Sfm", "Teach"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -36,6 +36,34 @@ class Sfm(Common):
     """Masks of an object that was turned or moved: a folder (NAME.png, white is kept), or alpha, the photos' own."""
     seed: int = 0
     """Seed of all random sampling."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Capture(Common):
+    """Make a run of photographs or videos in one go: frames, poses, fit, report; each step can be resumed."""
+
+    paths: Annotated[Positional[tuple[Path, ...]], arg(metavar="PATH")] = ()
+    """Photographs, videos, folders of both, or one data set that has poses; none with --more."""
+    output: OutputPath
+    """The run folder; photographs and poses are in its folder capture."""
+    budget: str | None = None
+    """Time for all of it on this machine (90s, 10min, 2h): sizes and steps are chosen for it; default those of fit."""
+    frames: int = 150
+    """At most this many frames of all videos together."""
+    masks: str | None = None
+    """Masks of an object that was turned or moved: a folder (NAME.png, white is kept), or alpha, the photos' own."""
+    resume: bool = False
+    """Go on where an earlier command was stopped: with the same options, and the same files or none."""
+    add: bool = False
+    """Further photographs of what RUN shows: they join its data set, and the fit goes on from its Gaussians."""
+    more: bool = False
+    """Say which photographs to take next: where to stand, where to look, and what that is worth."""
+    k: Annotated[int, arg(aliases=["-k"])] = 5
+    """How many photographs --more suggests."""
+    length: str | None = None
+    """A distance you know, 'IMG_0001 IMG_0004 1.5 m': places are then told in meters."""
+    seed: int = 0
+    """Seed of everything random."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

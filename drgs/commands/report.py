@@ -60,6 +60,10 @@ def report_of(run: Run, path: Path, dataset: Dataset | None) -> None:
     text = "The command that repeats this fit, in another folder:"
     if beyond:
         text = f"What no option says ({', '.join(beyond)}) needs a file of --config; this command says the rest:"
+    if "begin" in run.config():
+        text = (
+            f"It began with the Gaussians of another fit, which no option says; this command begins with points. {text}"
+        )
     write_report(run, path, command, text, dataset)
 
 

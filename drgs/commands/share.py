@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import logging
 from pathlib import Path
@@ -26,7 +27,7 @@ from drgs.sharing.layers import classes_layer, uncertainty_of
 from drgs.sharing.page import SHARED_BY
 from drgs.sharing.write import Shared, write_page
 from drgs.sizes import at_most
-from drgs.viewing.placed_views import Ranking, placed_views_of, read_ranking
+from drgs.viewing.placed_views import NEXT, Ranking, placed_views_of, read_ranking
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -34,9 +35,9 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.sharing.placing import PhotoKind
 
-__all__ = ["is_page", "run", "shared_of"]
+__all__ = ["SHARED_FILE", "is_page", "run", "shared_of"]
 
-_FILE = "scene.html"
+SHARED_FILE = "scene.html"
 _COUNTED = 24  # photographs whose information is added up; of more, these stand for all, as in the report
 _INFO_PIXELS = 30_000  # of each of them
 _VIEW = 960, 640  # pixels of a view of what has no photographs
@@ -50,20 +51,22 @@ def run(args: Share) -> None:
     if not 2 <= args.moments <= _MOST_MOMENTS:
         raise ValueError(f"share: --moments must be in [2, {_MOST_MOMENTS}], got {args.moments}; correct it")
     path = _output(args)
-    shared = shared_of(args)
-    sizes = write_page(shared, path)
+    is_inside = args.output is None and is_run(args.scene)
+    with claim_run(Run(args.scene), "share") if is_inside else contextlib.nullcontext() as held:
+        if held is not None:
+            held.check([SHARED_FILE])
+        shared = shared_of(args)
+        sizes = write_page(shared, path)
     if not args.quiet:
         told = ", ".join(f"{name} {size / 1e6:.2f} MB" for name, size in sizes.items())
         print(f"{len(shared.gaussians)} Gaussians: {path} ({path.stat().st_size / 1e6:.2f} MB: {told})")
 
 
 def _output(args: Share) -> Path:
-    """The file to write, which is free or a page that this command wrote."""
+    """The file to write, which outside of a run is free or a page that this command wrote."""
     path = args.output
     if path is None and is_run(args.scene):
-        path = args.scene / _FILE
-        claim_run(Run(args.scene), "share").check([_FILE])
-        return path
+        return args.scene / SHARED_FILE
     path = path or args.scene.with_suffix(".html")
     if path.suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"{path}: must be named *.html, which is what is written; choose another (-o)")
@@ -159,13 +162,13 @@ def _cameras(args: Share, given: SceneInput) -> list[tuple[PhotoKind, Camera]]:
 
 
 def _ranking(args: Share, given: SceneInput) -> Ranking | None:
-    """Picks of --selection, else those of a run that chose its views."""
+    """Picks of --selection, else those of a run that chose its views, or places for next photographs of any other."""
     if args.selection is not None:
         refuse_foreign(args.selection, "a selection")
         return read_ranking(args.selection)
-    if given.run is None or given.record is None or not given.record.is_active:
+    if given.run is None or given.record is None:
         return None
-    path = given.run.path / "selection.json"
+    path = given.run.path / ("selection.json" if given.record.is_active else NEXT)
     return read_ranking(path) if path.is_file() else None
 
 

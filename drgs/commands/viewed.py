@@ -20,7 +20,7 @@ from drgs.fitting.records import fitted_views
 from drgs.guards.foreign import refuse_foreign
 from drgs.information.blocks import MAP_PRIOR, together
 from drgs.viewing.layers import layers_of
-from drgs.viewing.placed_views import PlacedView, Ranking, placed_views_of, read_ranking
+from drgs.viewing.placed_views import NEXT, PlacedView, Ranking, placed_views_of, read_ranking
 from drgs.viewing.poses import pose_of
 from drgs.viewing.subject import FirstView, Subject
 from drgs.viewing.uncertainty import Uncertainty
@@ -43,7 +43,7 @@ def watched_files(args: View) -> list[Path]:
     if not args.scene.is_dir():
         return [args.scene, *named]
     run = Run(args.scene)
-    return [run.state, run.point_cloud, *(named or [run.path / _SELECTION])]
+    return [run.state, run.point_cloud, *(named or [run.path / _SELECTION, run.path / NEXT])]
 
 
 def subject_of(args: View, given: SceneInput, before: Subject | None = None) -> Subject:
@@ -151,13 +151,13 @@ def _placed_views(args: View, given: SceneInput, ranking: Ranking | None, notes:
 
 
 def _ranking(args: View, given: SceneInput) -> Ranking | None:
-    """Scores of cameras: those of --selection, else of a run that chose its views."""
+    """Scores of cameras: those of --selection, else of a run that chose its views, or of its next photographs."""
     if args.selection is not None:
         refuse_foreign(args.selection, "a selection")
         return read_ranking(args.selection)
-    if given.record is None or not given.record.is_active:
+    if given.record is None:
         return None
-    path = given.run.path / _SELECTION
+    path = given.run.path / (_SELECTION if given.record.is_active else NEXT)
     return read_ranking(path) if path.is_file() else None
 
 

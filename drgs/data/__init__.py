@@ -10,6 +10,7 @@ from drgs.data.checks import list_images
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
 from drgs.data.guesses import scene_extent
+from drgs.data.held_out import apply_held_out
 from drgs.data.llff import POSES_BOUNDS
 from drgs.data.multicamera import frame_folders
 from drgs.data.points import added_points, initial_points, matched_points, triangulated_count, triangulated_points
@@ -87,7 +88,8 @@ def load(
     Views of synchronous cameras, which the second to the fourth of these formats have, are named by camera and frame
     (`cam03/0007`), and their times are 0 at the first frame that is used, 1 at the last, and between them by the
     frame's number. A frame of a video is decoded when its image is asked for. The first camera is held out at all
-    times, unless `test_meta.json` says which are.
+    times, unless `test_meta.json` says which are. A `held_out.json` beside a data set that states no split of its own
+    names the views that are held out (`drgs capture --add` writes it).
 
     Args:
         path: Folder or file.
@@ -136,6 +138,7 @@ def load(
     dataset.test_offset = test_offset
     if test_cameras is not None:
         dataset.test_cameras = tuple(test_cameras)
+    apply_held_out(dataset)
     dataset.split()  # refuses numbers that cannot be
     check_times(dataset)
     if semantics:

@@ -10,6 +10,7 @@ import torch
 
 from drgs.data import initial_points, scene_extent
 from drgs.display.progress import Bar
+from drgs.fitting.going_on import begin_with
 from drgs.fitting.parts import parts_of, with_exposure, with_poses
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.skybox import RADIUS, SHARE, Skybox, SkyboxChoice, far_evidence, why_not
@@ -17,6 +18,8 @@ from drgs.fitting.stages import first_time, times_of
 from drgs.fitting.trainer import Trainer
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from drgs.data import Dataset, View
     from drgs.fitting.config import FitConfig
     from drgs.fitting.dynamics import Motion
@@ -101,16 +104,28 @@ def start(
     reserved: int,
     motion: Motion | None = None,
     compared: tuple[np.ndarray, np.ndarray | None] | None = None,
+    begin: Path | None = None,
 ) -> tuple[Trainer, str, ExposureEstimate | None, PoseEvidence | None, SkyboxChoice]:
     """A trainer at step 0, where its points come from, what is known of exposure and poses, where asked for, and
     whether Gaussians begin far away.
 
     Points come, by default, if `strict`, only from `views`; then nothing is known of observations, either, and exposure
     is looked at again with every photograph that joins. `compared` are the points by which it is, as of
-    `ActiveViews.compared_points`; default the initial points.
+    `ActiveViews.compared_points`; default the initial points. `begin` is a checkpoint whose Gaussians the fit begins
+    with, instead of points.
     """
     if not frames:
         raise ValueError("fit: there must be at least one training view, got none; add photographs")
+    if begin is not None:
+        with Bar("Gaussians of the earlier fit") as bar:
+            beginning = begin_with(begin, frames, dataset.points, dataset.colors, config)
+            bar.note(f"begins with {beginning.source}")
+        model = beginning.rows
+        points = model.tensors["means"].detach()[model.skybox :].numpy()  # places that are compared, no gradient
+        extent = scene_extent([frame.camera for frame in frames], points)
+        choice = SkyboxChoice("the fit goes on from Gaussians of another one")
+        made, found, evidence = _unknowns(dataset, frames, config, parts_of(config, extent, None), extent, points)
+        return Trainer(config, frames, model, extent, made), beginning.source, found, evidence, choice
     choice = _choose_skybox(frames, config, parts is not None, strict, motion is not None)
     room = max(1, round(SHARE * config.density.max_gaussians)) if choice.reason is None else 0
     # Points that a data set brings along may have seen all its views; ours are made from the training views alone.
@@ -137,21 +152,45 @@ def start(
             skybox = Skybox.around(frames, extent, room, config.seed)
         model.add_skybox(skybox.rows(width))
         _log.info("skybox: %d Gaussians, %.4g and more away", len(skybox), RADIUS * extent)
-    found = None
-    if parts is None and config.data.exposure != "off":
+    found = evidence = None
+    if parts is None:
+        by, shown = (points, None) if compared is None else compared
+        made, found, evidence = _unknowns(dataset, frames, config, made, extent, by, shown, strict)
+    return Trainer(config, frames, model, extent, made, motion), source, found, evidence, choice
+
+
+def _unknowns(
+    dataset: Dataset,
+    frames: list[Frame],
+    config: FitConfig,
+    made: Parts,
+    extent: float,
+    points: np.ndarray,
+    shown: np.ndarray | None = None,
+    strict: bool = False,
+) -> tuple[Parts, ExposureEstimate | None, PoseEvidence | None]:
+    """Parts with what is unknown of photographs, exposure and poses, where that is asked for or clear; and what is
+    known of both.
+
+    Args:
+        dataset, frames, config, extent, strict: Arguments of `start`, and the extent of the scene.
+        made: Parts without.
+        points: Points (P, 3) by which photographs are compared.
+        shown: (V, P) bool, which photograph shows which point; None where all may.
+    """
+    found = evidence = None
+    if config.data.exposure != "off":
         from drgs.fitting.exposure import estimate_exposure
 
         with Bar("exposure") as bar:
-            by, shown = (points, None) if compared is None else compared
-            found = estimate_exposure(frames, by, config.seed, shown)
+            found = estimate_exposure(frames, points, config.seed, shown)
             is_on = config.data.exposure != "auto" or found.is_clear
             said = "each has its own" if is_on else "off, all have the same"
             now = " for now" if strict and config.data.exposure == "auto" else ""
             bar.note(f"exposure: {found.words()}; {said}{now}")
         if is_on:
             made = with_exposure(made, frames, config, found)
-    evidence = None
-    if parts is None and config.data.poses != "fixed":
+    if config.data.poses != "fixed":
         from drgs.fitting.poses import PoseEvidence
 
         with Bar("poses") as bar:
@@ -161,4 +200,4 @@ def start(
             bar.note(f"poses: {evidence.words()}; {'refined with the scene' if is_on else 'fixed'}")
         if is_on:
             made = with_poses(made, frames, config, extent, evidence.reach)
-    return Trainer(config, frames, model, extent, made, motion), source, found, evidence, choice
+    return made, found, evidence

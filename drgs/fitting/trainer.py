@@ -189,6 +189,22 @@ class Trainer:
         self._queue = self._queue[:0]
         self._sample()
 
+    def reschedule(self, max_steps: int) -> None:
+        """Let the fit end at another step; schedules go by the share of the steps that is done, so that they go on.
+
+        Args:
+            max_steps: Steps of the whole fit, more than have been done.
+        Raises:
+            ValueError: If they have been done already, or where things move, whose rates count steps.
+        """
+        if self.motion is not None:
+            raise ValueError("fit: steps must stay as they are where things move; fit again with others")
+        if max_steps <= self.step_index:
+            raise ValueError(f"fit: steps must be more than the {self.step_index} done, got {max_steps}; ask for more")
+        self.config = self.config.replace(max_steps=max_steps)
+        self.renderers = RendererSchedule.of(self.config.renderers, self.config.settings, max_steps)
+        self.resolution = Resolution(self.config.data.num_downscales, max_steps)
+
     def step(self) -> StepResult:
         """One view, one optimizer step, and what is due at it.
 

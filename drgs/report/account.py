@@ -27,6 +27,7 @@ _VIEWERS = {"split": str, "width": int, "height": int, "preset": str, "psnr": fl
 _METRICS = {"split": str, "count": int, "gaussians": int, "mean": dict, "views": [{"name": str}], "reasons": dict}
 _PICK = {"number": int, "step": int, "index": int, "name": str, "score": _NUMBER, "margin": _NUMBER, "seconds": float}
 _PICK |= {"policy": str, "parts": dict, "candidates": [{"index": int, "name": str, "score": _NUMBER}]}
+_PLACE = {"rank": int, "text": str, "origin": [float], "camera": dict}
 _SELECTION = {"start": [{"index": int, "name": str}], "picks": [_PICK], "pool": [str], "pool_leak": bool}
 
 
@@ -42,6 +43,7 @@ class Account:
         events: Lines of log.jsonl, without the steps that a resumed fit did again.
         metrics: Content of metrics.json; None before there is one.
         selection: Content of selection.json of an active fit, else None.
+        places: Picks of next.json, places for the next photographs; empty without.
         wall: Seconds from each start of the fit to the last thing that it logged, pauses left out.
     """
 
@@ -53,6 +55,7 @@ class Account:
     metrics: dict[str, Any] | None
     selection: dict[str, Any] | None
     wall: float
+    places: list[dict[str, Any]] = dataclasses.field(default_factory=list)
 
     def of(self, event: str) -> list[dict[str, Any]]:
         """The events of a name."""
@@ -92,7 +95,8 @@ def account_of(run: Run) -> Account:
         _check_numbers(run.path / "selection.json", pick["parts"])
     env = _optional(run.path / "env.json", {}) or {}
     events, wall = _events(run)
-    return Account(run, record, run.config(), env, events, metrics, selection, wall)
+    places = _optional(run.path / "next.json", {"picks": [_PLACE]}) or {"picks": []}
+    return Account(run, record, run.config(), env, events, metrics, selection, wall, places["picks"])
 
 
 def _optional(path: Path, kind: dict) -> dict[str, Any] | None:

@@ -111,16 +111,22 @@ def _part_bars(axis: Axes, picks: Sequence[Mapping[str, Any]], names: Sequence[s
     axis.legend(frameon=False, fontsize=7, ncols=2, loc="lower center", bbox_to_anchor=(0.5, 1.0))
 
 
-def camera_map(groups: Mapping[str, Sequence[Camera]], picked: Sequence[tuple[Camera, str]]) -> str | None:
+def camera_map(
+    groups: Mapping[str, Sequence[Camera]],
+    picked: Sequence[tuple[Camera, str]],
+    ways: Sequence[tuple[Camera, np.ndarray, str]] = (),
+) -> str | None:
     """A map of where cameras stand and where they look, seen from above.
 
     Args:
         groups: Name -> cameras: `start` or `fitted`, `not picked`, `held out`; drawn in this order.
         picked: Cameras that were chosen on the way, with the text beside each.
+        ways: Cameras of next photographs, each with where to go to it from (3,), and the text beside it.
     Returns:
         None without cameras.
     """
     cameras = [camera for group in groups.values() for camera in group] + [camera for camera, _ in picked]
+    cameras += [camera for camera, *_ in ways]
     if not cameras:
         return None
     centers = np.array([camera.center for camera in cameras], float)
@@ -137,6 +143,12 @@ def camera_map(groups: Mapping[str, Sequence[Camera]], picked: Sequence[tuple[Ca
     for name, group in groups.items():
         _stand(axis, group, axes, reach, styles[name], f"{name} ({len(group)})")
     _stand(axis, [x for x, _ in picked], axes, reach, ("o", _RED, 1.0), f"picked, in order ({len(picked)})")
+    _stand(axis, [x for x, *_ in ways], axes, reach, ("^", _RED, 1.0), f"to be taken next ({len(ways)})")
+    for camera, origin, text in ways:
+        place = axes @ camera.center
+        arrow = {"arrowstyle": "->", "color": _RED, "lw": 1.2, "shrinkA": 3, "shrinkB": 3}
+        axis.annotate("", tuple(place), xytext=tuple(axes @ origin), arrowprops=arrow)
+        axis.annotate(text, tuple(place), xytext=(5, 5), textcoords="offset points", color=_RED, fontsize=8)
     texts: dict[tuple[float, float], list[str]] = {}  # a camera may be picked at several times
     for camera, text in picked:
         x, y = np.round(axes @ camera.center / reach, 6) * reach

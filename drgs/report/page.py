@@ -94,6 +94,7 @@ def page_html(account: Account, shown: Shown, command: str, command_text: str) -
         "moments": shown.moments,
         "moments_text": f"Camera {shown.moments_of}, stopped where it is, at times of the sequence.",
         **_picks(account),
+        "places": [place["text"] for place in account.places],
         "timings": _timings(account),
         "memory": _memory(account),
         "command": command,
@@ -114,7 +115,7 @@ def _sections(context: Mapping[str, Any]) -> list[tuple[str, str]]:
         "renderers": ("Renderers", context["renderers"][2]),
         "labels": ("Labels", context["segmentation"]),
         "time": ("Over time", context["moments"]),
-        "cameras": ("Cameras", context["charts"].get("cameras") or context["picks"]),
+        "cameras": ("Cameras", context["charts"].get("cameras") or context["picks"] or context["places"]),
         "time-spent": ("Time and memory", True),
         "repeat": ("Again", True),
     }

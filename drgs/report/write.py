@@ -7,6 +7,9 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from drgs.data.camera_lists import camera_described
 from drgs.display.progress import Bar
 from drgs.files import Run, atomic_write
 from drgs.fitting.records import load_run
@@ -77,7 +80,7 @@ def _shown(account: Account, dataset: Dataset | None) -> Shown:
     drawn: dict[str, str | None] = {}
     if charts.is_available():
         drawn = {"progress": charts.progress(account), "scores": charts.score_bars(picks)}
-        drawn["cameras"] = None if cast is None else charts.camera_map(cast.groups, cast.picked)
+        drawn["cameras"] = None if cast is None else charts.camera_map(cast.groups, cast.picked, _ways(account))
     return Shown(
         charts=drawn,
         previews=pictures.previews(account),
@@ -89,6 +92,15 @@ def _shown(account: Account, dataset: Dataset | None) -> Shown:
         moments_of=still_name,
         notes=notes,
     )
+
+
+def _ways(account: Account) -> list[tuple[Camera, np.ndarray, str]]:
+    """Argument `ways` of `charts.camera_map`: the places for the next photographs."""
+    where = str(account.run.path / "next.json")
+    found = [(camera_described(where, place["camera"]), np.array(place["origin"], float)) for place in account.places]
+    if odd := [origin for _, origin in found if origin.shape != (3,)]:
+        raise ValueError(f"{where}: origin must be 3 numbers, got {len(odd[0])}; run `drgs capture --more` again")
+    return [(*pair, str(place["rank"])) for pair, place in zip(found, account.places, strict=True)]
 
 
 def _typical(account: Account) -> list[str]:

@@ -61,6 +61,8 @@ def photograph(placed: PlacedView, sight: Sight) -> str:
     used = {"training": "fitted to", "held out": "not fitted to", "candidate": "candidate"}[placed.kind]
     size = f"{camera.width}x{camera.height}"
     rows.append(f"{used}, {size}" + ("" if camera.time is None else f", time {camera.time:g}"))
+    if sight.way is not None:
+        rows.append(escape(sight.way.text))
     if sight.pick is not None:
         rows.append(f"pick {sight.pick}")
     if sight.score is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,12 +16,26 @@ from drgs.guards.json_files import check_json, read_json
 if TYPE_CHECKING:
     from drgs.data import View
 
-__all__ = ["Ranking", "Score", "Sight", "PlacedView", "read_ranking", "scale_colors", "score_colors", "placed_views_of"]
+__all__ = [
+    "NEXT",
+    "Ranking",
+    "Score",
+    "Sight",
+    "PlacedView",
+    "read_ranking",
+    "scale_colors",
+    "score_colors",
+    "placed_views_of",
+]
 
 Kind = Literal["training", "held out", "candidate"]
 
+NEXT = "next.json"
+"""File of a run with the places of the next photographs, as `drgs capture --more` writes it."""
+
 _ADVICE = "name what drgs select or an active fit has written"
 _SCORED = {"name": str, "score": (None, float), "parts": (None, dict)}
+_WAY = {"origin": [float], "text": str}
 _TRAINING = (66, 135, 245)
 _PLAIN = (150, 150, 150)
 
@@ -52,12 +66,27 @@ class Ranking:
         scores: Name -> score.
         picked: Names of the picks, the first one first.
         cameras: Cameras of candidates, where the file has them: they may be of no data set.
+        ways: Name -> how to get there, of places for next photographs.
     """
 
     title: str
     scores: dict[str, Score]
     picked: tuple[str, ...]
     cameras: tuple[Camera, ...] = ()
+    ways: Mapping[str, Way] = dataclasses.field(default_factory=dict)
+
+
+@dataclasses.dataclass(frozen=True)
+class Way:
+    """How to get to a place for a next photograph.
+
+    Attributes:
+        origin: (x, y, z) in the world, where the photograph was taken that the way begins at.
+        text: What to do, in words.
+    """
+
+    origin: tuple[float, float, float]
+    text: str
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -69,12 +98,14 @@ class Sight:
         photograph: Function that reads the photograph, at most so many pixels wide: (H, W, 3) float in [0, 1]; or None.
         score: Score of the view; None where it has none.
         pick: Number of the view among the picks, from 1; None: not picked.
+        way: How to get there, of a place for a next photograph.
     """
 
     camera: Camera
     photograph: Callable[[int], np.ndarray] | None = None
     score: Score | None = None
     pick: int | None = None
+    way: Way | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -133,7 +164,9 @@ def placed_views_of(views: Sequence[View], fitted: Iterable[str], ranking: Ranki
     there = {view.name for view in views}
     for camera in ranking.cameras if ranking else ():
         if camera.name not in there:
-            add("candidate", Sight(camera.undistorted(), None, scores.get(camera.name), picks.get(camera.name)))
+            name = camera.name
+            way = ranking.ways.get(name) if ranking else None
+            add("candidate", Sight(camera.undistorted(), None, scores.get(name), picks.get(name), way))
     made = []
     for sights in found.values():
         kinds = {kind for kind, _ in sights}
@@ -144,7 +177,7 @@ def placed_views_of(views: Sequence[View], fitted: Iterable[str], ranking: Ranki
 
 
 def read_ranking(path: Path) -> Ranking:
-    """What `drgs select` has written, or an active fit so far: its last pick and those before.
+    """What `drgs select` or `drgs capture --more` has written, or an active fit so far: its last pick and those before.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -153,9 +186,13 @@ def read_ranking(path: Path) -> Ranking:
     found = read_json(path, "a selection", _ADVICE)
     where = str(path)
     check_json(where, found, {"picks": [{"name": str}]}, _ADVICE)
-    if found.get("command") == "select":
+    if found.get("command") in ("select", "capture"):
         check_json(where, found, {"policy": str, "criterion": (None, str), "candidates": [_SCORED]}, _ADVICE)
         rows = found["candidates"]
+        if found["command"] == "capture":
+            check_json(where, rows, [_WAY], _ADVICE)
+            if odd := [len(row["origin"]) for row in rows if len(row["origin"]) != 3]:
+                raise ValueError(f"{where}: origin must be 3 numbers, got {odd[0]}; {_ADVICE}")
         criterion = found["criterion"]
         policy = found["policy"]
     else:
@@ -174,6 +211,7 @@ def read_ranking(path: Path) -> Ranking:
         _scores(where, rows),
         tuple(pick["name"] for pick in found["picks"]),
         tuple(cameras),
+        {row["name"]: Way(tuple(row["origin"]), row["text"]) for row in rows if "origin" in row and "text" in row},
     )
 
 

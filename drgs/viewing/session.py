@@ -43,6 +43,7 @@ REST = 0.3
 
 _PRESETS = ("exact", "fast", "gsplat", "3dgut")
 _PHOTOGRAPH = 360  # pixels of its width in the panel
+_WAY_COLOR = (240, 60, 60)
 _FRUSTUM = 0.05  # size of a camera's frustum, of its distance to what is looked at
 _COVERS = 0.5  # share of half a view's narrower side: a frustum that reaches farther is hidden
 _NARROW = 576  # pixels of a window that viser lays its panel over, as over a phone's
@@ -93,6 +94,7 @@ class Session:
         self._playing: asyncio.Task | None = None
         self._frusta: list[Any] = []
         self._reach = 0.0  # of a frustum, from its tip
+        self._ways: Any = None  # arrows to places for next photographs
         self.time = subject.moment(None)
         self._slider: Any = None
         self._button: Any = None
@@ -310,7 +312,31 @@ class Session:
             frustum.on_click(self._clicked(placed))
             self._frusta.append(frustum)
         self._reach = size
+        self._show_ways(size)
         self._show_frusta()
+
+    def _show_ways(self, size: float) -> None:
+        """Draw an arrow to each place for a next photograph that was picked, from the photograph that it is told from.
+
+        Args:
+            size: Reach of a frustum.
+        """
+        if self._ways is not None:
+            self._ways.remove()
+            self._ways = None
+        picked = [sight for placed in self.subject.placed_views if (sight := placed.best).pick and sight.way]
+        if not picked:
+            return
+        ends = [(np.array(sight.way.origin), sight.camera.center) for sight in picked if sight.way]
+        points = np.array(ends, np.float64) - self.subject.origin
+        self._ways = self.client.scene.add_arrows(
+            "/ways",
+            points.astype(np.float32),
+            _WAY_COLOR,
+            shaft_radius=0.06 * size,
+            head_radius=0.2 * size,
+            head_length=0.5 * size,
+        )
 
     def _show_frusta(self) -> None:
         """Show all frusta, or none, but for those that the camera stands in or near: they would cover what it sees."""
@@ -320,6 +346,8 @@ class Session:
             shown = self._are_shown.value and away > near
             if frustum.visible != shown:
                 frustum.visible = shown
+        if self._ways is not None and self._ways.visible != self._are_shown.value:
+            self._ways.visible = self._are_shown.value
 
     def _clicked(self, placed: PlacedView) -> Callable[[Any], Any]:
         """What a click on a frustum does."""

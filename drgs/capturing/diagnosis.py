@@ -1,0 +1,273 @@
+"""What photographs, poses and held-out views say about a shoot, and what to do at the next one.
+
+Every rule compares photographs with those next to them by name, which is the order in which a phone takes them: how
+sharp, how far apart, how much turned. Lengths are in units of the median distance of what a photograph shows, since
+structure from motion knows no meters.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drgs.data.checks import read_image
+from drgs.data.mapping import runs
+from drgs.data.shooting import Finding
+from drgs.display.progress import Bar
+from drgs.fitting.exposure import estimate_exposure
+from drgs.fitting.frames import load_frames
+
+if TYPE_CHECKING:
+    from drgs.data import Dataset, View
+    from drgs.data.sfm import SfmSummary
+
+__all__ = ["of_exposure", "of_photographs", "of_poses", "of_views"]
+
+_WIDTH = 640  # pixels of the longer side at which sharpness is looked at
+_NEIGHBORS = 3  # photographs on each side that say how sharp one should be
+_BLURRED = 0.3  # of the sharpness of its neighbors: below it a photograph is blurred
+_DARK, _BRIGHT = 0.06, 0.97  # mean gray, in [0, 1]
+_FEW = 12  # photographs with a pose
+_TURN = 8.0  # degrees between neighbors that count as a turn
+_ON_THE_SPOT = 0.2  # of the way that a walk around what is seen would take for the same turn
+_RUN = 2  # turns in a row that are worth a sentence
+_WIDE = 35.0  # degrees between neighbors, seen from what they show, above which they show little in common
+_SHOWN = 3  # names, or gaps, that a finding repeats
+_EXPOSURE_PIXELS = 20_000
+_BAD = 3.0  # dB below the median of the held-out views
+_FAR = 1.5  # times the usual angle to the nearest training view
+
+
+def of_photographs(folder: Path, names: Sequence[str]) -> list[Finding]:
+    """Blurred and dark photographs.
+
+    Args:
+        folder, names: The photographs, in the order in which they were taken.
+    """
+    import cv2
+
+    sharp, gray = [], []
+    with Bar("sharpness", len(names)) as bar:
+        for name in names:
+            image = read_image(folder / name)
+            plain = image if image.ndim == 2 else np.ascontiguousarray(image[..., :3]).mean(axis=2)
+            plain = (plain / (255.0 if image.dtype == np.uint8 else 65535.0)).astype(np.float32)
+            scale = _WIDTH / max(plain.shape)
+            if scale < 1:
+                plain = cv2.resize(plain, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            sharp.append(float(cv2.Laplacian(plain, cv2.CV_32F).var()))
+            gray.append(float(plain.mean()))
+            bar.advance()
+    found = []
+    if blurred := [name for name, share in zip(names, _relative(sharp), strict=True) if share < _BLURRED]:
+        one = "is" if len(blurred) == 1 else "are"
+        found.append(
+            Finding(
+                "blur",
+                f"{_some(blurred)} {one} blurred, compared with the photographs next to {_them(blurred)}",
+                "take these again: hold the phone still, with more light or a shorter exposure",
+            )
+        )
+    if dark := [name for name, mean in zip(names, gray, strict=True) if not _DARK < mean < _BRIGHT]:
+        found.append(
+            Finding(
+                "blank",
+                f"{_some(dark)} show next to nothing, too dark or too bright",
+                "leave these out, or take them again in other light",
+            )
+        )
+    return found
+
+
+def _relative(values: Sequence[float]) -> list[float]:
+    """Each value over the median of its neighbors."""
+    found = []
+    for index, value in enumerate(values):
+        first = max(0, index - _NEIGHBORS)
+        near = [x for other, x in enumerate(values[first : index + _NEIGHBORS + 1], first) if other != index]
+        usual = max(float(np.median(near)), 1e-12) if near else value  # a blank neighbor has a sharpness of 0
+        found.append(value / usual if usual else 1.0)
+    return found
+
+
+def of_poses(dataset: Dataset, names: Sequence[str], summary: SfmSummary | None = None) -> list[Finding]:
+    """Photographs without a pose, gaps between those that have one, and turns on the spot.
+
+    Args:
+        dataset: The data set, with points.
+        names: All photographs, in the order in which they were taken.
+        summary: What structure from motion said; None where it was not asked.
+    """
+    found = []
+    count = len(dataset.views)
+    if summary is not None and summary.missing:
+        advice = [line.removeprefix("what would help: ") for line in summary.explanation if line.startswith("what")]
+        advice = [line for line in advice if not line.startswith("--matcher")]
+        found.append(
+            Finding(
+                "poses",
+                f"{len(summary.missing)} of {summary.total} photographs have no pose: {runs(summary.missing, names)}",
+                f"take {advice[0]}" if advice and advice[0].startswith("photos") else (advice or ["take more"])[0],
+            )
+        )
+    if count < _FEW:
+        found.append(
+            Finding(
+                "poses",
+                f"only {count} photographs have a pose",
+                "take thirty to eighty, each overlapping the one before by two thirds",
+            )
+        )
+    views = sorted(dataset.views, key=lambda view: view.name)
+    if dataset.points is None or not len(dataset.points) or count < 3 or dataset.times:
+        return found
+    depths = [_depth(view, dataset.points) for view in views]
+    usual = float(np.median([depth for depth in depths if depth is not None] or [1.0]))
+    spots, gaps = list[list[str]](), list[tuple[float, str, str]]()
+    for before, view, depth in zip(views[:-1], views[1:], depths[1:], strict=True):
+        near = depth or usual
+        moved = float(np.linalg.norm(view.camera.center - before.camera.center))
+        turned = _angle(view.camera.c2w[:3, 2], before.camera.c2w[:3, 2])
+        if turned > _TURN and moved < _ON_THE_SPOT * near * math.radians(turned):
+            if spots and spots[-1][-1] == before.name:
+                spots[-1].append(view.name)
+            else:
+                spots.append([before.name, view.name])
+        target = before.camera.center + near * before.camera.c2w[:3, 2]
+        parallax = _angle(view.camera.center - target, before.camera.center - target)
+        if min(parallax, 180.0) > _WIDE and turned > _WIDE / 2:
+            gaps.append((parallax, before.name, view.name))
+    if turns := [spot for spot in spots if len(spot) > _RUN]:
+        shown = ", ".join(f"{spot[0]} to {spot[-1]}" for spot in turns[:_SHOWN])
+        found.append(
+            Finding(
+                "turn",
+                f"from {shown} you turned on the spot",
+                "take a step to the side with every photograph: from one place nothing has a depth",
+            )
+        )
+    gaps.sort(reverse=True)
+    # The jump from one round to the next is no gap: others stand in between.
+    wide = [gap for gap in gaps if not _is_filled(gap, views, usual)][:_SHOWN]
+    if wide:
+        shown = ", ".join(f"{a} and {b} ({angle:.0f} degrees apart)" for angle, a, b in wide)
+        found.append(
+            Finding("overlap", f"too little overlap between {shown}", "take two or three photographs in between")
+        )
+    return found
+
+
+def _is_filled(gap: tuple[float, str, str], views: Sequence[View], usual: float) -> bool:
+    """Whether each end of a gap has another photograph near it, besides those next to it by name."""
+    angle, *names = gap
+    by_name = {view.name: view for view in views}
+    ends = [by_name[name] for name in names]
+    closest = 2 * math.sin(math.radians(min(angle, 180.0)) / 4) * usual  # as far as half of the gap is wide
+    for end, other in zip(ends, ends[::-1], strict=True):
+        way = other.camera.center - end.camera.center
+        ahead = [
+            view
+            for view in views
+            if view.name not in names
+            and np.linalg.norm(view.camera.center - end.camera.center) < closest
+            and (view.camera.center - end.camera.center) @ way > 0
+        ]
+        if not ahead:
+            return False
+    return True
+
+
+def of_exposure(dataset: Dataset, seed: int = 0) -> list[Finding]:
+    """Photographs whose exposure or white balance differs from that of the others.
+
+    Args:
+        dataset: The data set, with points.
+        seed: Seed of the points that are looked at.
+    """
+    if dataset.points is None or not len(dataset.points) or dataset.times:
+        return []
+    frames = load_frames(sorted(dataset.views, key=lambda view: view.name), _EXPOSURE_PIXELS)
+    estimate = estimate_exposure(frames, dataset.points, seed)
+    if not estimate.is_clear:
+        return []
+    stops = estimate.log_gains / math.log(2)
+    order = np.argsort(-np.abs(stops).max(axis=1), kind="stable")[:_SHOWN]
+    shown = ", ".join(f"{frames[i].name} ({max(stops[i], key=abs):+.1f} stops)" for i in order)
+    return [
+        Finding(
+            "exposure",
+            f"exposure or white balance changes between photographs, most in {shown}",
+            "lock both before the first photograph: on most phones, hold a finger on the subject",
+        )
+    ]
+
+
+def of_views(dataset: Dataset, train: Sequence[str], psnr: Mapping[str, float]) -> list[Finding]:
+    """Held-out views that are much worse than the others, and whether photographs near them are missing.
+
+    Args:
+        dataset: The data set.
+        train: Names of the views that were fitted to.
+        psnr: Held-out view -> PSNR in dB.
+    """
+    if len(psnr) < 3 or dataset.times:
+        return []
+    by_name = {view.name: view for view in dataset.views}
+    fitted = [by_name[name] for name in train if name in by_name]
+    apart = {name: _apart(by_name[name], fitted) for name in psnr if name in by_name}
+    usual = float(np.median(list(apart.values()))) if apart else 0.0
+    middle = float(np.median(list(psnr.values())))
+    bad = sorted((value, name) for name, value in psnr.items() if value < middle - _BAD)
+    found = []
+    for value, name in bad[:_SHOWN]:
+        far = apart.get(name, 0.0) > _FAR * usual
+        nearest = min(fitted, key=lambda view: _apart(by_name[name], [view])).name if fitted and name in by_name else ""
+        why = f": the nearest photograph, {nearest}, looks from elsewhere" if far and nearest else ""
+        advice = (
+            f"take two or three photographs around where {name} was taken"
+            if far
+            else f"look at it in the report: is {name} blurred, or is something in it that moved?"
+        )
+        found.append(Finding("view", f"held-out view {name} has {value:.1f} dB, the others {middle:.1f}{why}", advice))
+    return found
+
+
+def _apart(view: View, others: Sequence[View]) -> float:
+    """How far the nearest of other cameras is: degrees between axes, and distance in those of their spread."""
+    if not others:
+        return 0.0
+    centers = np.stack([other.camera.center for other in others])
+    spread = max(float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()), 1e-12)  # all at one place: 0
+    return min(
+        _angle(view.camera.c2w[:3, 2], other.camera.c2w[:3, 2])
+        + 60.0 * float(np.linalg.norm(view.camera.center - other.camera.center)) / spread
+        for other in others
+    )
+
+
+def _depth(view: View, points: np.ndarray) -> float | None:
+    """Median distance along the axis of the points in the picture; None without any."""
+    camera = view.camera.undistorted()
+    pixels, depth = camera.project(points)
+    inside = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+    return float(np.median(depth[inside])) if inside.any() else None
+
+
+def _angle(a: np.ndarray, b: np.ndarray) -> float:
+    """Degrees between two directions."""
+    length = max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12)  # a camera at the point itself
+    return math.degrees(math.acos(float(np.clip(a @ b / length, -1, 1))))
+
+
+def _some(names: Sequence[str]) -> str:
+    """A few names, and how many more there are."""
+    more = len(names) - _SHOWN
+    return ", ".join(names[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
+
+
+def _them(names: Sequence[str]) -> str:
+    return "it" if len(names) == 1 else "them"

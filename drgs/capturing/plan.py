@@ -1,0 +1,345 @@
+"""What a budget of time is spent on: sizes and steps, from measurements on this machine before anything long begins.
+
+Poses are planned first: features of two of the photographs are found and matched, and from what that takes follows how
+large photographs may be looked at. What is left belongs to the fit: some steps of it are timed, in growing sizes, with
+as many Gaussians as it will have on average, and the largest size that fits gets as many steps as there is time for.
+Nothing is cut off while it runs: learning rates end where they should.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import logging
+import math
+import re
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drgs.data.checks import image_size, read_image
+from drgs.data.matching import extract, match, quiet
+from drgs.data.pairing import MAX_EXHAUSTIVE
+from drgs.data.videos import VideoFrame, read_video
+from drgs.display.progress import Bar, quietly
+from drgs.fitting.config import FitConfig
+from drgs.fitting.frames import frames_for
+from drgs.fitting.start import start
+from drgs.fitting.threads import fewer_torch_threads
+from drgs.guards.unfinished import temporary_folder
+
+if TYPE_CHECKING:
+    from drgs.data import Dataset, View
+
+__all__ = [
+    "FitPlan",
+    "PosePlan",
+    "Stopwatch",
+    "duration",
+    "plan_fit",
+    "plan_frames",
+    "plan_poses",
+    "planned_poses",
+    "seconds_of_budget",
+]
+
+_UNITS = {"s": 1.0, "sec": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
+_LEAST = 30.0  # seconds: less is not even enough to start all parts
+_FIRST_SIZE = 800  # pixels of the longer side at which two photographs are measured
+_IMAGE_SIZES = (1600, 1200, 1000, 800, 640, 480)
+_POSES_SHARE = 0.4  # of the budget, that poses should not exceed
+# Mapping of 16 photographs (`banana`) took 3.6 s, of 292 (`bonsai`) 2,280 s, where one photograph's features of 1,600
+# pixels took 3.2 s: what features take tells how fast the machine is.
+_MAPPING = (3.6 / 3.2 / 16**2.22, 2.22)
+_NEIGHBORS = 18  # pairs of each photograph where those near by name and by appearance are matched
+_FEWEST_FRAMES = 20  # however little time there is
+# (pixels of a photograph, Gaussians, steps) of fits, each about three times as long as the one before.
+_SIZES = (
+    (12_000, 8_000, 400),
+    (30_000, 12_000, 800),
+    (60_000, 20_000, 1_500),
+    (130_000, 30_000, 3_000),
+    (250_000, 60_000, 5_000),
+    (430_000, 120_000, 9_000),
+)
+_FEWER, _MORE = 0.5, 1.5  # of the steps of a size, that it may have
+_FEWEST_STEPS = 100
+_TIMED_VIEWS = 8
+_TIMED = 12  # steps: twice all renderers
+_END = 0.05  # of what is left, for what was measured too low
+# Held-out views and report, in seconds and in steps a view.
+_AFTER, _TRAINING, _HELD_OUT = 6.0, 2.0, 4.0
+
+
+@dataclasses.dataclass(frozen=True)
+class PosePlan:
+    """How large photographs are looked at for their poses.
+
+    Attributes:
+        max_image_size: Pixels of the longer side.
+        seconds: How long that is expected to take.
+    """
+
+    max_image_size: int
+    seconds: float
+
+
+@dataclasses.dataclass(frozen=True)
+class FitPlan:
+    """How large a fit is.
+
+    Attributes:
+        max_pixels: Pixels of a photograph.
+        max_gaussians: Number of Gaussians.
+        max_steps: Number of steps.
+        seconds: How long the steps are expected to take.
+        after: How long held-out views and the report are expected to take.
+    """
+
+    max_pixels: int
+    max_gaussians: int
+    max_steps: int
+    seconds: float
+    after: float = 0.0
+
+    def config(self, config: FitConfig) -> FitConfig:
+        """A configuration with these sizes."""
+        return config.replace(
+            max_steps=self.max_steps,
+            data=dataclasses.replace(config.data, max_pixels=self.max_pixels),
+            density=dataclasses.replace(config.density, max_gaussians=self.max_gaussians),
+        )
+
+    def line(self) -> str:
+        """In words."""
+        return (
+            f"{self.max_steps} steps at {self.max_pixels} pixels with up to {self.max_gaussians} Gaussians, about "
+            f"{duration(self.seconds)}"
+        )
+
+
+def seconds_of_budget(text: str) -> float:
+    """Seconds of `90s`, `10min`, `1.5h`.
+
+    Raises:
+        ValueError: If it is no such time, or less than half a minute.
+    """
+    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?|\.\d+)\s*([a-z]+)\s*", text.lower())
+    if found is None or found[2] not in _UNITS:
+        raise ValueError(f"--budget must be a time with its unit, e.g. 90s, 10min or 1.5h, got {text!r}; correct it")
+    seconds = float(found[1]) * _UNITS[found[2]]
+    if not _LEAST <= seconds <= 1e7:
+        raise ValueError(f"--budget must be at least {_LEAST:.0f}s, got {text}; allow more time")
+    return seconds
+
+
+def duration(seconds: float) -> str:
+    """A time in words, e.g. `40 s` or `12 min`."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def plan_poses(folder: Path, names: Sequence[str], budget: float) -> PosePlan:
+    """How large photographs may be looked at, from what two of them take.
+
+    Args:
+        folder, names: The photographs, at least two.
+        budget: Seconds of the whole capture.
+    """
+    largest = max(image_size(folder / names[0]))
+    chosen = [names[len(names) // 3], names[min(len(names) // 3 + 1, len(names) - 1)]]
+    with Bar("how long poses will take"):
+        features, pair = _timed_pair([read_image(folder / name) for name in chosen])
+    measured = min(_FIRST_SIZE, largest)
+    sizes = [size for size in _IMAGE_SIZES if size < largest]
+    sizes = [*sizes[: len(_IMAGE_SIZES)], *([largest] if largest <= _IMAGE_SIZES[0] else [])]
+    plans = [PosePlan(size, _pose_seconds(len(names), features, pair, size / measured)) for size in sorted(sizes)[::-1]]
+    return next((plan for plan in plans if plan.seconds <= _POSES_SHARE * budget), plans[-1])
+
+
+def plan_frames(video: Path, photographs: int, most: int, budget: float) -> int:
+    """How many frames of videos there may be at most, so that poses, at the smallest size, leave time for the fit.
+
+    Args:
+        video: One of the videos; two of its frames are timed.
+        photographs: Number of photographs beside them.
+        most: Number of frames that is asked for.
+        budget: Seconds of the whole capture.
+    """
+    found = read_video(video)
+    first = found.count // 3
+    with Bar("how long poses will take"):
+        features, pair = _timed_pair([VideoFrame(video, min(first + k, found.count - 1)).read() for k in (0, 10)])
+    largest = max(found.width, found.height)
+    scale = min(_IMAGE_SIZES[-1], largest) / min(_FIRST_SIZE, largest)
+    allowed = _POSES_SHARE * budget
+    for count in range(most, _FEWEST_FRAMES, -1):
+        if _pose_seconds(photographs + count, features, pair, scale) <= allowed:
+            return count
+    return min(most, _FEWEST_FRAMES)
+
+
+def _timed_pair(images: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Seconds that features of a photograph take, and to match two of them, at `_FIRST_SIZE` pixels."""
+    with temporary_folder("plan") as made:
+        database = made / "database.db"
+        names = [f"{number}.png" for number in range(len(images))]
+        for name, image in zip(names, images, strict=True):
+            _write_small(image, made / name)
+        began = time.perf_counter()
+        with quiet():
+            extract(database, made, names, camera_model="SIMPLE_RADIAL", shared_camera=False, wide_baseline=True)
+            features = (time.perf_counter() - began) / len(names)
+            began = time.perf_counter()
+            match(database, [(names[0], names[1])])
+            pair = time.perf_counter() - began
+    return features, pair
+
+
+def planned_poses(plan: PosePlan, count: int, left: float) -> str:
+    """The plan in words.
+
+    Args:
+        plan: How large photographs are looked at.
+        count: Number of photographs.
+        left: Seconds that are left of the budget.
+    """
+    size = plan.max_image_size
+    return (
+        f"{count} photographs at {size} pixels for poses, about {duration(plan.seconds)}; then a fit as large as the "
+        f"{duration(max(left - plan.seconds, 0.0))} after it allow, by timed steps"
+    )
+
+
+def _write_small(image: np.ndarray, target: Path) -> None:
+    """A photograph as PNG of at most `_FIRST_SIZE` pixels along the longer side."""
+    import cv2
+
+    image = image[..., 2::-1] if image.ndim == 3 else image
+    scale = min(1.0, _FIRST_SIZE / max(image.shape[:2]))
+    small = cv2.resize(np.ascontiguousarray(image), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    target.write_bytes(cv2.imencode(".png", small)[1].tobytes())
+
+
+def _pose_seconds(count: int, features: float, pair: float, scale: float) -> float:
+    """Seconds of poses of `count` photographs at `scale` times the size at which `features` and `pair` were taken."""
+    pairs = count * (count - 1) / 2 if count <= MAX_EXHAUSTIVE else count * _NEIGHBORS
+    factor, power = _MAPPING
+    # Features are found by their number of pixels, and compared all to all.
+    return (
+        count * features * scale**2
+        + pairs * pair * min(scale**4, 4.0)
+        + factor * features * (1600 / _FIRST_SIZE) ** 2 * count**power
+    )
+
+
+def plan_fit(
+    dataset: Dataset, config: FitConfig, left: float, least: int = 1, stopwatch: Stopwatch | None = None
+) -> FitPlan:
+    """How large a fit of a data set may be, from timed steps.
+
+    Args:
+        dataset: The data set, with points.
+        config: What else the fit does; its renderers are those that are timed.
+        left: Seconds that are left, for the fit and what follows it.
+        least: Gaussians that there are already, of which none are taken away.
+        stopwatch: What times steps; default one of this machine.
+    """
+    stopwatch = stopwatch or Stopwatch()
+    train, test = dataset.split(config.data.test_every, config.data.test_offset, config.data.test_cameras)
+    largest = max(view.camera.width * view.camera.height for view in train)
+    best: FitPlan | None = None
+    end = stopwatch.now() + left
+    before: float | None = None
+    with Bar("how long steps take", len(_SIZES)) as bar:
+        for number, (pixels, gaussians, steps) in enumerate(_SIZES):
+            bar.update(number)
+            rest = end - stopwatch.now()
+            if best is not None and before is not None and 2 * before * (_FEWER * steps + _TIMED) > rest - best.after:
+                break  # a step takes about twice as long as in the size before
+            size = FitPlan(min(pixels, largest), max(gaussians, least), steps, 0.0)
+            each = stopwatch.step(train, dataset, size.config(config), is_first=number == 0)
+            after = _AFTER + each * (_TRAINING * len(train) + _HELD_OUT * len(test))
+            room = (1 - _END) * (end - stopwatch.now() - after)
+            there = math.floor(room / each)
+            if best is not None and there < _FEWER * steps:
+                break
+            count = int(min(max(there, _FEWEST_STEPS), _MORE * steps))
+            best = FitPlan(size.max_pixels, size.max_gaussians, count, count * each, after)
+            before = each
+            if pixels >= largest:
+                break
+    assert best is not None
+    return best
+
+
+class Stopwatch:
+    """Times steps of a fit on this machine."""
+
+    def now(self) -> float:
+        """Seconds of a clock that never goes back."""
+        return time.monotonic()
+
+    def step(self, train: list[View], dataset: Dataset, config: FitConfig, is_first: bool) -> float:
+        """Seconds that a step takes on average, with as many Gaussians as there are on average.
+
+        Args:
+            train: Training views.
+            dataset: The data set.
+            config: Configuration with the sizes.
+            is_first: Whether to take all renderers' first steps, which compile, beforehand.
+        """
+        return _seconds_a_step(train, dataset, config, is_first)
+
+
+def _seconds_a_step(train: list[View], dataset: Dataset, config: FitConfig, is_first: bool) -> float:
+    """`Stopwatch.step`."""
+    views = train[:: max(1, len(train) // _TIMED_VIEWS)]
+    with quietly(), _unlogged(), fewer_torch_threads():
+        frames = frames_for(views, config.data)
+        timed = config.replace(data=dataclasses.replace(config.data, skybox="off", exposure="off", poses="fixed"))
+        trainer, *_ = start(_filled(dataset, config), views, frames, timed, None, None, False, 0)
+        # As late in a fit, where all degrees of color are there.
+        while trainer.rows.sh_degree < config.sh_degree:
+            trainer.rows.raise_sh_degree()
+        for _ in range(_TIMED if is_first else 0):
+            trainer.step()
+        began = time.perf_counter()
+        for _ in range(_TIMED):
+            trainer.step()
+        return (time.perf_counter() - began) / _TIMED
+
+
+@contextlib.contextmanager
+def _unlogged() -> Iterator[None]:
+    """Keep what a fit says at its start off the terminal: this one is no fit to hear of."""
+    log = logging.getLogger("drgs.train")
+    level = log.level
+    log.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
+
+
+def _filled(dataset: Dataset, config: FitConfig) -> Dataset:
+    """The data set with as many points as a fit has Gaussians on average: between its points and its most.
+
+    Points are repeated, displaced by a little of their own spread.
+    """
+    points, colors = dataset.points, dataset.colors
+    if points is None or not len(points):
+        return dataset
+    most = config.density.max_gaussians
+    # Growing evenly up to half of the steps, and full from there on.
+    wanted = min(most, int(0.25 * min(len(points), most) + 0.75 * most))
+    rng = np.random.default_rng(0)
+    chosen = rng.integers(0, len(points), wanted)
+    spread = np.median(np.abs(points - np.median(points, axis=0)), axis=0)
+    moved = points[chosen] + 0.01 * spread * rng.normal(size=(wanted, 3))
+    shown = None if colors is None else colors[chosen]
+    return dataclasses.replace(dataset, points=moved, colors=shown)

@@ -1,0 +1,155 @@
+"""`drgs capture --more -o RUN`: which photographs to take next, where to stand and where to look, in words."""
+
+from __future__ import annotations
+
+import dataclasses
+import statistics
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from drgs.capturing.places import Place, meters_of, places_around
+from drgs.commands.orbits import seen_distance
+from drgs.commands.scene_input import SceneInput
+from drgs.data.camera_lists import described
+from drgs.data.capture import upright
+from drgs.display.progress import Bar
+from drgs.files import SCHEMA, write_json
+from drgs.fitting.frames import load_dataset
+from drgs.fitting.records import fitted_views
+from drgs.guards.outputs import claim
+from drgs.information.cache import Cache
+from drgs.information.scoring import Scoring
+from drgs.integrator import render
+from drgs.select import select
+from drgs.sizes import at_most
+from drgs.viewing.placed_views import NEXT
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.data import View
+    from drgs.ellipsoids import Gaussians
+    from drgs.settings import RenderSettings
+
+__all__ = ["rank_next"]
+
+_PIXELS = 20_000  # of views whose information is compared
+_SOLID = 0.3  # opacity of Gaussians that one does not walk through
+_MOST_SOLID = 20_000
+_EMPTY = 0.25  # of a picture, that may show nothing beyond what photographs leave empty: a hole is to be looked at
+_LOOK = 2_500  # pixels of a picture that says how much shows nothing
+_MOST_PHOTOGRAPHS = 8  # of those there are, that the gain is compared with
+_SPREAD = 3.0  # times the median distance of cameras and what they see: floaters are beyond
+
+
+def rank_next(run: Path, k: int, length: str | None, show: bool = True) -> list[dict[str, Any]]:
+    """Rank places for the next photographs, and write them into the run as `next.json`.
+
+    Args:
+        run: A run folder.
+        k: How many places.
+        length: Two photographs and the distance between them, from which meters follow; None: shares of the way.
+        show: Whether to show progress.
+    Returns:
+        The picks of the file, the best first, with `text`: what to do, and `gain`: what it would tell, over what one of
+        the photographs that are there tells beside all others, on average.
+    Raises:
+        FileNotFoundError: If it is no run, or its data set has gone.
+        ValueError: If things move, the photographs say nothing of where one can stand, or `length` is wrong.
+    """
+    with claim(run, "capture", [NEXT]), Bar("next photographs", show=show) as bar:
+        given = SceneInput.at(run)
+        assert given.record is not None
+        assert given.run is not None
+        if given.moving is not None:
+            raise ValueError(f"{run}: --more must have a scene that stands still, this one moves; use drgs select")
+        given.record.check_data(run)
+        dataset = load_dataset(given.record.data, given.record.config, lazy=True, points=False, semantics=False)
+        views = given.record.with_refined_poses(dataset).views
+        cameras = {view.name: _camera(view, given) for view in views}
+        meters = None if length is None else meters_of(length, {name: x.center for name, x in cameras.items()})
+        train = [cameras[name] for name in fitted_views(given.run, given.record) if name in cameras]
+        up = upright(list(cameras.values()))
+        obstacles = _solid(given.gaussians, train)
+        places = places_around(list(cameras.values()), up, seen_distance(given.gaussians), obstacles)
+        settings = given.settings("fast")
+        # What looks past the scene would tell most, of what nobody wants to see.
+        most = _EMPTY + max(_empty_share(given.gaussians, camera, settings) for camera in train)
+        places = [place for place in places if _empty_share(given.gaussians, place.camera, settings) <= most]
+        if not places:
+            raise ValueError(f"{run}: there must be a place to stand at, found none that is free; use drgs select")
+        scoring = Scoring(settings=settings, semantics=given.semantics()).over(given.estimated)
+        cache = Cache()
+        told = len(train) + len(places)
+        bar.update(0, told)
+        count = min(k, len(places))
+        found = select(
+            given.scene,
+            [place.camera for place in places],
+            train,
+            count,
+            scoring=scoring,
+            cache=cache,
+            progress=bar.update,
+        )
+        usual = statistics.mean(
+            select(given.scene, [one], [x for x in train if x is not one], 1, scoring=scoring, cache=cache).scores[0]
+            for one in train[:: -(-len(train) // _MOST_PHOTOGRAPHS)]
+        )
+        rows = [{"index": i, "name": place.camera.name} for i, place in enumerate(places)]
+        after = [_told(place, meters) for place in places]
+        picks = [
+            {"rank": rank, **pick, "gain": pick["score"] / usual if usual > 0 else None}
+            for rank, pick in enumerate(found.picks_json(rows, after), 1)
+        ]
+        write_json(
+            run / NEXT,
+            {
+                "schema": SCHEMA,
+                "command": "capture",
+                "policy": "fisher",
+                "criterion": scoring.criterion,
+                "known": [camera.name for camera in train],
+                "meters": meters,
+                "picks": picks,
+                "candidates": found.candidates_json(rows, after),
+                "seconds": found.seconds,
+            },
+        )
+    return picks
+
+
+def _told(place: Place, meters: float | None) -> dict[str, Any]:
+    """What a file says of a place."""
+    return {
+        "base": place.base,
+        "origin": place.origin.tolist(),
+        "text": place.words(meters),
+        "camera": described(place.camera),
+    }
+
+
+def _camera(view: View, given: SceneInput) -> Camera:
+    """The pinhole camera of a photograph, reduced."""
+    assert given.record is not None
+    pixels = min(_PIXELS, given.record.config.data.max_pixels)
+    return at_most(dataclasses.replace(view.camera.undistorted(), name=view.name), pixels)
+
+
+def _empty_share(gaussians: Gaussians, camera: Camera, settings: RenderSettings) -> float:
+    """Share of a picture in which nothing is seen."""
+    with torch.no_grad():  # looked at only
+        alpha = render(gaussians, at_most(camera, _LOOK), settings, outputs=()).alpha
+    return float((alpha.cpu() < 0.5).float().mean())
+
+
+def _solid(gaussians: Gaussians, cameras: list[Camera]) -> np.ndarray:
+    """(P, 3) centers of Gaussians that one does not walk through."""
+    means = gaussians.means.detach().cpu().double().numpy() + gaussians.origin  # looked at only
+    solid = means[gaussians.opacities.detach().cpu().numpy() > _SOLID]
+    middle = np.median(np.stack([camera.center for camera in cameras]), axis=0)
+    far = np.linalg.norm(solid - middle, axis=1)
+    solid = solid[far <= _SPREAD * np.median(far)] if len(solid) else solid
+    return solid[:: max(1, -(-len(solid) // _MOST_SOLID))]

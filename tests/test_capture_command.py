@@ -1,0 +1,443 @@
+"""`drgs capture`: from photographs to a report, stopped in every step and resumed, within a budget, in two batches; and
+what it says of bad input.
+
+The photographs are of three textured walls that meet in a corner, small ones; features are found in them once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import shutil
+import types
+
+import json_page
+import numpy as np
+import pytest
+import torch
+
+from drgs import cli
+from drgs.capturing import plan
+from drgs.capturing.pace import Pacer
+from drgs.capturing.record import CaptureRecord
+from drgs.commands.capture import capture_photographs, run
+from drgs.commands.making_options import Capture
+from drgs.data import load
+from drgs.data.held_out import HELD_OUT, write_held_out
+from drgs.display.progress import Bar
+from drgs.files import Run, load_state
+from drgs.fitting.config import FitConfig
+from drgs.train import SelectionConfig, Trainer, fit
+
+pytest.importorskip("pycolmap")
+cv2 = pytest.importorskip("cv2")
+
+from test_sfm import corner_camera, corner_photo, corner_walls, write_photo  # noqa: E402
+
+STEPS = 40
+CONFIG = FitConfig.of(max_steps=STEPS, max_pixels=2000, max_gaussians=400, renderers=("fast",), skybox="off")
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory):
+    """`first` with six photographs along an arc, `more` with the two that come after them."""
+    folder = tmp_path_factory.mktemp("photographs")
+    walls = corner_walls(np.random.default_rng(5))
+    for index in range(8):
+        part = folder / ("first" if index < 6 else "more")
+        part.mkdir(exist_ok=True)
+        write_photo(part / f"IMG_{index}.png", corner_photo(corner_camera(index), walls)[0])
+    return folder
+
+
+@contextlib.contextmanager
+def stopped_at(label: str, done: int = 1):
+    """Ctrl-C once a bar of this name has come so far; 0: where it begins."""
+    enter, update = Bar.__enter__, Bar.update
+
+    def refused(bar):
+        if bar.label == label and not done:
+            raise KeyboardInterrupt
+        return enter(bar)
+
+    def stopped(bar, now, total=None, other=None, text=None):
+        update(bar, now, total, other, text)
+        if bar.label == label and now >= max(done, 1):
+            raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Bar, "__enter__", refused)
+        patch.setattr(Bar, "update", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            yield
+
+
+@contextlib.contextmanager
+def stopped_at_step(step: int):
+    """A process that is killed in the middle of the fit: nothing is saved on the way out."""
+    original = Trainer.step
+
+    def killed(self):
+        if self.step_index == step:
+            raise KeyboardInterrupt
+        return original(self)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Trainer, "step", killed)
+        with pytest.raises(KeyboardInterrupt):
+            yield
+
+
+def steps_of(folder) -> list[str]:
+    return [step.name for step in CaptureRecord.read(folder / "capture").batch.steps]
+
+
+@pytest.fixture(scope="module")
+def captured(photographs, tmp_path_factory):
+    """A capture that was stopped in the middle of each of its steps."""
+    folder = tmp_path_factory.mktemp("captured") / "run"
+    options = {"output": folder, "quiet": True}
+    first = Capture(paths=(photographs / "first",), **options)
+    again = Capture(resume=True, **options)
+    with stopped_at("sharpness"):
+        capture_photographs(first, CONFIG)
+    assert steps_of(folder) == []
+    with stopped_at("features"):
+        capture_photographs(again, CONFIG)
+    assert steps_of(folder) == ["photos"]
+    with stopped_at_step(STEPS // 2):
+        capture_photographs(again, CONFIG)
+    assert steps_of(folder) == ["photos", "poses"]
+    with stopped_at("maps of information"):
+        capture_photographs(Capture(paths=(photographs / "first",), resume=True, **options), CONFIG)
+    assert steps_of(folder) == ["photos", "poses", "fit"]
+    capture_photographs(again, CONFIG)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def joined(captured, photographs, tmp_path_factory):
+    """The same with two more photographs, stopped in each step, too; and its state before."""
+    folder = tmp_path_factory.mktemp("joined") / "run"
+    shutil.copytree(captured, folder, symlinks=True)
+    options = {"output": folder, "quiet": True}
+    with stopped_at("sharpness"):
+        run(Capture(paths=(photographs / "more",), add=True, **options))
+    again = Capture(resume=True, **options)
+    with stopped_at("features"):
+        run(again)
+    before = load(folder / "capture/scene")
+    with stopped_at("what poses say", 0):  # they have been joined, the record does not know yet
+        run(again)
+    assert steps_of(folder) == ["photos"]
+    with stopped_at("Gaussians of the earlier fit", 0):  # the run has made room, and has nothing of its own yet
+        run(again)
+    assert steps_of(folder) == ["photos", "poses"]
+    assert not (folder / "config.json").exists()
+    assert (folder / "capture/before.safetensors").is_file()
+    with stopped_at_step(5):
+        run(again)
+    with stopped_at("maps of information"):
+        run(again)
+    run(again)
+    return folder, before
+
+
+def test_every_step_goes_on(captured, photographs, tmp_path):
+    """Nothing is done twice or lost: the fit ends with the same bits as one that was never stopped."""
+    assert steps_of(captured) == ["photos", "poses", "fit", "report"]
+    scene = load(captured / "capture/scene")
+    assert [view.name for view in scene.views] == [f"IMG_{index}" for index in range(6)]
+    fit(scene, tmp_path / "run", CONFIG, progress=False)
+    (found, header), (wanted, _) = (load_state(Run(x).state) for x in (captured, tmp_path / "run"))
+    assert header["step"] == STEPS
+    assert found.keys() == wanted.keys()
+    assert all(torch.equal(x, wanted[name]) for name, x in found.items())
+    assert "IMG_0" in (captured / "report.html").read_text()
+    record = json.loads((captured / "capture/capture.json").read_text())
+    assert record["batches"][0]["inputs"][0][0] == str((photographs / "first/IMG_0.png").resolve())
+
+
+def test_what_is_told(captured, capsys):
+    """A line for each step, what to do at the next shoot, and what to do now."""
+    run(Capture(output=captured, resume=True))
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.partition(":")[0] for line in lines[:4]] == ["photos", "poses", "fit", "report"]
+    assert "6 of 6 photographs have a pose" in lines[1]
+    assert "400 Gaussians after 40 steps, held-out PSNR" in lines[2]
+    assert "at the next shoot: only 6 photographs have a pose; take thirty to eighty" in "\n".join(lines)
+    assert "drgs capture --more -o" in lines[-1]
+
+
+def test_further_photographs(joined, captured):
+    """They join the world that was there; held-out views stay the same; the fit begins with the Gaussians that exist,
+    and knows more afterwards.
+    """
+    folder, before = joined
+    after = load(folder / "capture/scene")
+    old = {view.name: view.camera.w2c for view in before.views}
+    assert {view.name for view in after.views} == {*old, "IMG_6", "IMG_7"}
+    for view in after.views:
+        if view.name in old:
+            np.testing.assert_allclose(view.camera.w2c, old[view.name], atol=1e-6)
+    config = Run(folder).config()
+    assert config["test"] == Run(captured).config()["test"] == ["IMG_0"]
+    assert config["train"] == [f"IMG_{index}" for index in range(1, 8)]
+    assert config["points"].startswith("400 Gaussians of an earlier fit")
+    assert "It began with the Gaussians of another fit" in (folder / "report.html").read_text()
+    first = json.loads((captured / "metrics.json").read_text())["mean"]["psnr"]
+    second = json.loads((folder / "metrics.json").read_text())
+    assert second["step"] == STEPS // 2
+    assert second["mean"]["psnr"] > first - 0.3  # 20 steps later
+    batches = CaptureRecord.read(folder / "capture").batches
+    assert len(batches) == 2
+    assert [step.name for step in batches[1].steps] == ["photos", "poses", "fit", "report"]
+    assert f"{first:.2f} dB before" in batches[1].steps[2].line
+    assert not (folder / "capture/before.safetensors").exists()
+    of_budgets = {"poses", "max_image_size", "fit", "max_gaussians", "max_steps", "after"}
+    record = json.loads((folder / "capture/capture.json").read_text())
+    absent = (*of_budgets, "capture", "kept", "cleared")
+    json_page.check("capture.json", record, elsewhere=("config",), absent=absent)
+    json_page.check("held_out.json", json.loads((folder / "capture/scene" / HELD_OUT).read_text()))
+
+
+def test_further_photographs_end_with_the_same_bits(joined, captured, tmp_path):
+    """As a fit that was never stopped, from the checkpoint that the first photographs left."""
+    folder, _ = joined
+    assert CaptureRecord.read(folder / "capture").batch.plan["before"]["views"] == 5
+    density = dataclasses.replace(CONFIG.density, max_gaussians=560)  # as 7 photographs to 5
+    config = CONFIG.replace(max_steps=STEPS // 2, density=density)
+    fit(load(folder / "capture/scene"), tmp_path / "run", config, progress=False, begin=Run(captured).state)
+    found, wanted = (load_state(Run(x).state)[0] for x in (folder, tmp_path / "run"))
+    assert all(torch.equal(x, wanted[name]) for name, x in found.items())
+
+
+def test_new_places_get_points(captured, tmp_path):
+    """Points of the data set that photographs which join show are added, as far as there is room."""
+    scene = load(captured / "capture/scene")
+    write = Run(captured).config()
+    left = [view for view in scene.views if view.name in write["train"][:2]]
+    # Two photographs, and Gaussians at points that are far from all others: the rest is open.
+    near = np.argsort(np.linalg.norm(scene.points - scene.points[0], axis=1))[:50]
+    few = load(captured / "capture/scene", test_every=0)
+    few.views, few.points, few.colors = left, scene.points[near], scene.colors[near]
+    fit(few, tmp_path / "few", CONFIG.replace(max_steps=2), progress=False)
+    result = fit(
+        scene, tmp_path / "run", CONFIG.replace(max_steps=2), progress=False, begin=tmp_path / "few/state.safetensors"
+    )
+    assert len(result.gaussians) > 100
+    assert "points that new photographs show" in result.run.config()["points"]
+
+
+def test_fits_that_cannot_begin_so(captured, tmp_path):
+    """A damaged checkpoint is refused, and a fit that chooses its views."""
+    scene = load(captured / "capture/scene")
+    (tmp_path / "bad").write_bytes(b"no checkpoint")
+    with pytest.raises(ValueError, match="bad"):
+        fit(scene, tmp_path / "run", CONFIG, progress=False, begin=tmp_path / "bad")
+    chosen = CONFIG.replace(selection=SelectionConfig())
+    with pytest.raises(ValueError, match="begin must be None where views are chosen on the way"):
+        fit(scene, tmp_path / "run", chosen, progress=False, begin=Run(captured).state)
+
+
+def test_held_out_views_are_named(captured, tmp_path):
+    """By a file beside the data set, which says so until it is deleted; a bad one is refused in one line."""
+    shutil.copytree(captured / "capture/scene", tmp_path / "scene", symlinks=True)
+    write_held_out(tmp_path / "scene", ["IMG_2", "IMG_4"], "capture")
+    train, test = load(tmp_path / "scene").split()
+    assert [view.name for view in test] == ["IMG_2", "IMG_4"]
+    assert len(train) == 4
+    write_held_out(tmp_path / "scene", [], "capture")
+    assert load(tmp_path / "scene").split()[1] == []
+    write_held_out(tmp_path / "scene", ["IMG_9"], "capture")
+    with pytest.raises(ValueError, match="test must name views of the data set, got 'IMG_9'"):
+        load(tmp_path / "scene")
+    (tmp_path / "scene" / HELD_OUT).write_text("{}")
+    with pytest.raises(ValueError, match=HELD_OUT):
+        load(tmp_path / "scene")
+
+
+# ---------------------------------------------------------------------------------------------- bad input
+
+
+def refused(line: list, capsys) -> str:
+    """What the command says, in one line."""
+    assert cli.main(["capture", *map(str, line)]) == 2
+    err = capsys.readouterr().err.strip()
+    assert err.count("\n") == 0, err
+    return err
+
+
+def test_bad_photographs(photographs, tmp_path, capsys):
+    """One alone, one that is damaged, and those that have nothing in common."""
+    first = photographs / "first"
+    assert "must be at least 3 photographs, got 1" in refused([first / "IMG_0.png", "-o", tmp_path / "a"], capsys)
+    (tmp_path / "damaged").mkdir()
+    for index in range(3):
+        shutil.copy(first / f"IMG_{index}.png", tmp_path / "damaged")
+    whole = (first / "IMG_3.png").read_bytes()
+    (tmp_path / "damaged/IMG_3.jpg").write_bytes(whole[: len(whole) // 3])
+    assert "IMG_3.jpg" in refused([tmp_path / "damaged", "-o", tmp_path / "b", "--quiet"], capsys)
+    assert "must be photographs or a video, found none" in refused([tmp_path / "no", "-o", tmp_path / "c"], capsys)
+    assert "must be photographs" in refused(["-o", tmp_path / "d"], capsys)
+    assert "--budget must be a time with its unit" in refused([first, "-o", tmp_path / "e", "--budget", "10"], capsys)
+
+
+def test_photographs_without_overlap(tmp_path, capsys):
+    """What connects none of them is said, and what would help."""
+    (tmp_path / "noise").mkdir()
+    for index in range(3):
+        noise = np.random.default_rng(index).integers(0, 255, (60, 80, 3), np.uint8)
+        cv2.imwrite(str(tmp_path / f"noise/{index}.png"), noise)
+    text = refused([tmp_path / "noise", "-o", tmp_path / "run", "--quiet"], capsys)
+    assert "could be connected; take more photos with smaller steps" in text
+    assert steps_of(tmp_path / "run") == ["photos"]
+
+
+def test_folders_of_others(captured, photographs, tmp_path, capsys):
+    """A capture goes into a new folder or on with its own; into nobody else's."""
+    first, more = photographs / "first", photographs / "more"
+    three = sorted(first.iterdir())[:3]
+    assert "holds a capture already; add --resume or --add" in refused([first, "-o", captured], capsys)
+    assert "the photographs changed" in refused([*three, "-o", captured, "--resume"], capsys)
+    assert "--seed was 0 and is 1" in refused(["-o", captured, "--resume", "--seed", 1], capsys)
+    assert "--add must have a capture to add to" in refused([more, "-o", tmp_path / "new", "--add"], capsys)
+    assert "not in the capture yet, got none" in refused([first, "-o", captured, "--add"], capsys)
+    assert "must be a new folder, or that of a capture" in refused(
+        [first, "-o", _fit_alone(captured, tmp_path)], capsys
+    )
+    (tmp_path / "own/capture/photos").mkdir(parents=True)
+    (tmp_path / "own/capture/photos/holiday.txt").write_text("mine")
+    assert "must not be replaced" in refused([first, "-o", tmp_path / "own"], capsys)
+    assert (tmp_path / "own/capture/photos/holiday.txt").read_text() == "mine"
+    (tmp_path / "cut").mkdir()
+    (tmp_path / "cut/capture").mkdir()
+    (tmp_path / "cut/capture/capture.json").write_text('{"schema": 1, "batches": []}')
+    assert "batches must be one or more" in refused([first, "-o", tmp_path / "cut", "--resume"], capsys)
+
+
+def _fit_alone(captured, tmp_path):
+    """A run that `drgs fit` could have made."""
+    shutil.copytree(captured, tmp_path / "fit", symlinks=True, ignore=shutil.ignore_patterns("capture"))
+    return tmp_path / "fit"
+
+
+def test_photographs_that_join_nothing(captured, tmp_path, capsys):
+    """They change nothing, and others can be added afterwards."""
+    folder = tmp_path / "run"
+    shutil.copytree(captured, folder, symlinks=True)
+    (tmp_path / "noise").mkdir()
+    noise = np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8)
+    cv2.imwrite(str(tmp_path / "noise/elsewhere.png"), noise)
+    state = (folder / "state.safetensors").read_bytes()
+    text = refused([tmp_path / "noise", "-o", folder, "--add", "--quiet"], capsys)
+    assert "none of 1 could be connected" in text
+    assert (folder / "state.safetensors").read_bytes() == state
+    cv2.imwrite(str(tmp_path / "noise/other.png"), noise[::-1])
+    os.remove(tmp_path / "noise/elsewhere.png")
+    assert "none of 1 could be connected" in refused([tmp_path / "noise", "-o", folder, "--add", "--quiet"], capsys)
+    assert len(CaptureRecord.read(folder / "capture").batches) == 2
+
+
+# ------------------------------------------------------------------------------------------------- budget
+
+
+class MadeStopwatch(plan.Stopwatch):
+    """A machine of a given speed, whose clock moves by what is timed on it."""
+
+    def __init__(self, speed: float) -> None:
+        self.speed = speed
+        self.time = 0.0
+
+    def now(self) -> float:
+        return self.time
+
+    def seconds(self, pixels: int, gaussians: int) -> float:
+        return (0.01 + 1e-6 * pixels + 1e-6 * gaussians) / self.speed
+
+    def step(self, train, dataset, config, is_first):
+        each = self.seconds(config.data.max_pixels, config.density.max_gaussians)
+        self.time += 12 * each
+        return each
+
+
+def large_views() -> types.SimpleNamespace:
+    """What a plan has to know of a data set of photographs of 12 megapixels."""
+    view = types.SimpleNamespace(camera=types.SimpleNamespace(width=4000, height=3000))
+    return types.SimpleNamespace(split=lambda *rule: ([view] * 35, [view] * 5))
+
+
+@pytest.mark.parametrize("speed", [0.2, 1.0, 10.0])
+def test_a_plan_fits_its_budget(speed):
+    """As many steps as there is time for, with larger photographs and more Gaussians where there is more."""
+    sizes = []
+    for left in (60, 300, 1200, 7200):
+        watch = MadeStopwatch(speed)
+        found = plan.plan_fit(large_views(), FitConfig(), left, stopwatch=watch)
+        each = watch.seconds(found.max_pixels, found.max_gaussians)
+        assert found.seconds == pytest.approx(found.max_steps * each)
+        used = watch.time + found.seconds + found.after
+        assert used <= left or found.max_steps == 100
+        sizes.append((found.max_pixels, found.max_gaussians, found.max_steps))
+        # Planned for nearly all of it, unless it is of the largest size.
+        assert used > 0.5 * left or found.max_pixels == 430_000
+    assert sizes == sorted(sizes)
+    assert sizes[0] < sizes[-1]
+
+
+def test_a_plan_leaves_gaussians_where_they_are():
+    """Of a fit that goes on there are at least as many as before."""
+    found = plan.plan_fit(large_views(), FitConfig(), 60, least=50_000, stopwatch=MadeStopwatch(1.0))
+    assert found.max_gaussians == 50_000
+
+
+@pytest.mark.parametrize("slower", [0.5, 1.0, 2.0, 4.0])
+def test_a_fit_keeps_to_its_budget(slower):
+    """Its number of steps follows the clock: on a machine that is 4 times as slow as planned, too, and where steps take
+    three times as long as at the start once all Gaussians are there.
+    """
+    now, planned, end = 0.0, 1000, 1000.0
+    pacer = Pacer(end, planned, lambda: now)
+    done, total = 0, planned
+    while done < total:
+        now += slower * 0.5 * (0.5 + min(1.0, done / total / 0.5))
+        done += 1
+        total = pacer(done, total)
+    assert now < 1.02 * end
+    assert now > 0.9 * end or total == 1.5 * planned
+
+
+def test_poses_are_planned(photographs):
+    """Smaller photographs in less time, and more time for more of them."""
+    few = plan._pose_seconds(10, 1.0, 0.1, 1.0)
+    assert plan._pose_seconds(50, 1.0, 0.1, 1.0) > 5 * few
+    assert plan._pose_seconds(10, 1.0, 0.1, 0.5) < few
+    names = [f"IMG_{index}.png" for index in range(6)]
+    found = plan.plan_poses(photographs / "first", names, 1e6)
+    assert found.max_image_size == 320  # the photographs' own
+
+
+def test_frames_are_planned(tmp_path):
+    """As many as there is time for, at least twenty, at most what is asked for."""
+    video = tmp_path / "walk.mp4"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"mp4v"), 10, (96, 64))
+    image = np.random.default_rng(0).integers(0, 255, (64, 300, 3), np.uint8)
+    for index in range(30):
+        writer.write(np.ascontiguousarray(image[:, index : index + 96]))
+    writer.release()
+    assert plan.plan_frames(video, 0, 150, 1e7) == 150
+    assert plan.plan_frames(video, 0, 150, 1e-3) == 20
+    assert plan.plan_frames(video, 0, 8, 1e-3) == 8
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("90s", 90), ("10min", 600), ("1.5h", 5400), (" 2 m ", 120)])
+def test_budgets(text, seconds):
+    assert plan.seconds_of_budget(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["10", "ten minutes", "5s", "-3min", "1e9h", ""])
+def test_bad_budgets(text):
+    with pytest.raises(ValueError, match="--budget must be"):
+        plan.seconds_of_budget(text)
