@@ -202,7 +202,8 @@ def test_photographs_to_take_next(viewer, place, tmp_path):  # noqa: F811
     """The picks of a selection are in the page in their order, behind the photographs, at one of which it opens."""
     picked, path = tmp_path / "selection.json", tmp_path / "x.html"
     run = str(place / "run")
-    assert cli.main(["select", run, *"--candidates dome --count 4 -k 2 --quiet -o".split(), str(picked)]) == 0
+    options = ["--candidates", "dome", "--count", "4", "-k", "2", "--quiet"]
+    assert cli.main(["select", run, *options, "-o", str(picked)]) == 0
     names = [pick["name"] for pick in json.loads(picked.read_text())["picks"]]
     assert cli.main(["share", run, "--selection", str(picked), "--no-uncertainty", "--quiet", "-o", str(path)]) == 0
     scene = told(path)
