@@ -198,6 +198,21 @@ def test_the_page_is_told_of_a_run(viewer, place, tmp_path):  # noqa: F811
     path.unlink()
 
 
+def test_photographs_to_take_next(viewer, place, tmp_path):  # noqa: F811
+    """The picks of a selection are in the page in their order, behind the photographs, at one of which it opens."""
+    picked, path = tmp_path / "selection.json", tmp_path / "x.html"
+    run = str(place / "run")
+    options = ["--candidates", "dome", "--count", "4", "-k", "2", "--quiet"]
+    assert cli.main(["select", run, *options, "-o", str(picked)]) == 0
+    names = [pick["name"] for pick in json.loads(picked.read_text())["picks"]]
+    assert cli.main(["share", run, "--selection", str(picked), "--no-uncertainty", "--quiet", "-o", str(path)]) == 0
+    scene = told(path)
+    following = [photo["name"] for photo in scene["photos"] if photo["kind"] == "next"]
+    assert following == [f"{k}. {name}" for k, name in enumerate(names, 1)]
+    assert scene["photos"][scene["first"]]["kind"] == "fitted"
+    assert "uncertainty" not in scene
+
+
 def test_what_does_not_carry_over_is_said(viewer, labelled_run, tmp_path, caplog):  # noqa: F811
     """A fit for renderers along rays alone looks otherwise in a page: one line of the log, and one of the page."""
     folder = tmp_path / "run"
