@@ -12,6 +12,8 @@ import json
 import os
 import shutil
 import types
+import urllib.error
+import urllib.request
 
 import json_page
 import numpy as np
@@ -29,15 +31,28 @@ from drgs.data.held_out import HELD_OUT, write_held_out
 from drgs.display.progress import Bar
 from drgs.files import Run, load_state
 from drgs.fitting.config import FitConfig
+from drgs.sharing import npm
 from drgs.train import SelectionConfig, Trainer, fit
 
 pytest.importorskip("pycolmap")
 cv2 = pytest.importorskip("cv2")
 
 from test_sfm import corner_camera, corner_photo, corner_walls, write_photo  # noqa: E402
+from test_share import write_viewer  # noqa: E402
 
 STEPS = 40
 CONFIG = FitConfig.of(max_steps=STEPS, max_pixels=2000, max_gaussians=400, renderers=("fast",), skybox="off")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def viewer(tmp_path_factory):
+    """Pages to send take a stand-in for the viewer's code, which is nowhere to be fetched from."""
+    folder = tmp_path_factory.mktemp("npm")
+    write_viewer(folder / "there")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(npm, "FOLDER", folder / "there")
+        patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +162,7 @@ def joined(captured, photographs, tmp_path_factory):
 
 def test_every_step_goes_on(captured, photographs, tmp_path):
     """Nothing is done twice or lost: the fit ends with the same bits as one that was never stopped."""
-    assert steps_of(captured) == ["photos", "poses", "fit", "report"]
+    assert steps_of(captured) == ["photos", "poses", "fit", "report", "share"]
     scene = load(captured / "capture/scene")
     assert [view.name for view in scene.views] == [f"IMG_{index}" for index in range(6)]
     fit(scene, tmp_path / "run", CONFIG, progress=False)
@@ -160,11 +175,37 @@ def test_every_step_goes_on(captured, photographs, tmp_path):
     assert record["batches"][0]["inputs"][0][0] == str((photographs / "first/IMG_0.png").resolve())
 
 
+def test_the_page_to_send_may_be_out_of_reach(captured, tmp_path, monkeypatch, capsys):
+    """Without the viewer's code the capture ends well, and says why there is no page; later there is one."""
+    folder = tmp_path / "run"
+    shutil.copytree(captured, folder, symlinks=True)
+    record = CaptureRecord.read(folder / "capture")
+    record.batch.steps.pop()
+    record.write()
+    (folder / "scene.html").unlink()
+
+    def refused(*_, **__):
+        raise urllib.error.URLError("no network")
+
+    there = npm.FOLDER
+    monkeypatch.setattr(npm, "FOLDER", tmp_path / "none")
+    monkeypatch.setattr(urllib.request, "urlopen", refused)
+    run(Capture(output=folder, resume=True))
+    told = capsys.readouterr().out
+    assert "share: not written, " in told
+    assert "no network" in told
+    assert steps_of(folder) == ["photos", "poses", "fit", "report"]
+    monkeypatch.setattr(npm, "FOLDER", there)
+    run(Capture(output=folder, resume=True))
+    assert (folder / "scene.html").is_file()
+    assert steps_of(folder)[-1] == "share"
+
+
 def test_what_is_told(captured, capsys):
     """A line for each step, what to do at the next shoot, and what to do now."""
     run(Capture(output=captured, resume=True))
     lines = capsys.readouterr().out.splitlines()
-    assert [line.partition(":")[0] for line in lines[:4]] == ["photos", "poses", "fit", "report"]
+    assert [line.partition(":")[0] for line in lines[:5]] == ["photos", "poses", "fit", "report", "share"]
     assert "6 of 6 photographs have a pose" in lines[1]
     assert "400 Gaussians after 40 steps, held-out PSNR" in lines[2]
     assert "at the next shoot: only 6 photographs have a pose; take thirty to eighty" in "\n".join(lines)
@@ -193,7 +234,7 @@ def test_further_photographs(joined, captured):
     assert second["mean"]["psnr"] > first - 0.3  # 20 steps later
     batches = CaptureRecord.read(folder / "capture").batches
     assert len(batches) == 2
-    assert [step.name for step in batches[1].steps] == ["photos", "poses", "fit", "report"]
+    assert [step.name for step in batches[1].steps] == ["photos", "poses", "fit", "report", "share"]
     assert f"{first:.2f} dB before" in batches[1].steps[2].line
     assert not (folder / "capture/before.safetensors").exists()
     of_budgets = {"poses", "max_image_size", "fit", "max_gaussians", "max_steps", "after"}

@@ -49,15 +49,20 @@ def blobs(count: int = 300, degree: int = 3, seed: int = 0) -> drgs.Gaussians:
     return drgs.Gaussians.from_arrays(torch.as_tensor(rng.normal(0, 0.5, (count, 3)), dtype=torch.float32), **tensors)
 
 
-@pytest.fixture
-def viewer(tmp_path, monkeypatch):
+def write_viewer(folder) -> None:
     """A stand-in for the viewer's code where none of it runs: files of the names that a page takes."""
-    folder = tmp_path / "npm"
     for package in npm.PACKAGES:
         for name in package.files:
             path = folder / package.folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(f"// {name}\nimport {{ x }} from './three.core.js';\n")
+
+
+@pytest.fixture
+def viewer(tmp_path, monkeypatch):
+    """Pages take a stand-in for the viewer's code."""
+    folder = tmp_path / "npm"
+    write_viewer(folder)
     monkeypatch.setattr(npm, "FOLDER", folder)
 
 

@@ -43,8 +43,8 @@ def begin_with(
     """The Gaussians of a checkpoint, and as many of the points that new photographs show as there is room for.
 
     Points where Gaussians are, too, are not left out: what was fitted to few photographs may be in the wrong place, and
-    nothing else would bring it to the right one. On `banana`, six photographs that joined eight, 200 steps: 27.9 dB with
-    the points, 27.3 dB with copies of Gaussians instead.
+    nothing else would bring it to the right one. On `banana`, six photographs that joined eight, 200 steps: 27.9 dB
+    with the points, 27.3 dB with copies of Gaussians instead.
 
     Args:
         checkpoint: File of a fit to what stands still.
