@@ -180,6 +180,7 @@ _OTHERS = {
     "guards/locks.py",  # .drgs.lock
     "guards/outputs.py",  # .drgs.jsonl
     "guards/writing.py",  # for log.jsonl
+    "meshing/writing.py",  # the header of a .glb
     "report/page.py",  # a cell of the report
     "sharing/page.py",  # what a page is told
 }

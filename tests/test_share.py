@@ -63,7 +63,7 @@ def viewer(tmp_path, monkeypatch):
     """Pages take a stand-in for the viewer's code."""
     folder = tmp_path / "npm"
     write_viewer(folder)
-    monkeypatch.setattr(npm, "FOLDER", folder)
+    monkeypatch.setattr(npm, "PACKAGED", folder)
 
 
 def told(path) -> dict:
@@ -139,7 +139,7 @@ def test_without_a_network(tmp_path, monkeypatch, capsys):
     """Where the viewer's code is neither in the wheel nor fetched, one line says what to do, and no page is left."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(npm, "FOLDER", tmp_path / "none")
+    monkeypatch.setattr(npm, "PACKAGED", tmp_path / "none")
 
     def refuse(address, timeout):
         raise urllib.error.URLError("no route to host")

@@ -17,9 +17,9 @@ import urllib.error
 import urllib.request
 from pathlib import Path
 
-__all__ = ["FOLDER", "PACKAGES", "Package", "fetch_into", "viewer_files"]
+__all__ = ["PACKAGED", "PACKAGES", "Package", "fetch_into", "viewer_files"]
 
-FOLDER = Path(__file__).parent / "npm"
+PACKAGED = Path(__file__).parent / "npm"
 """Where a wheel has the files of the packages, in a folder for each."""
 
 _TIMEOUT = 60.0  # seconds without an answer
@@ -91,7 +91,7 @@ def viewer_files(cache: Path | None = None) -> Path:
         OSError: If they are nowhere and cannot be fetched, or not be written.
         ValueError: If what was fetched is not what is pinned.
     """
-    for folder in (FOLDER, cache or _user_cache()):
+    for folder in (PACKAGED, cache or _user_cache()):
         if all((folder / package.folder / name).is_file() for package in PACKAGES for name in package.files):
             return folder
     fetch_into(folder)
