@@ -76,7 +76,7 @@ def test_an_unbundled_sog_is_known_by_its_folder_and_by_its_index(tmp_path):
         ("a.glb", b"glTF\2\0\0\0", "is a glTF file"),
         ("a.ply", b"<!DOCTYPE html><html>", r"is a web page; .* the link named Raw"),
         ("a.ply.gz", gzip.compress(b"ply\n", mtime=0), "is a gzip file; unpack it first"),
-        ("a.mp4", b"\0\0\0\x20ftypisom" + bytes(20), "is a video; take photographs out of it"),
+        ("a.mp4", b"\0\0\0\x20ftypisom" + bytes(20), "is a video; find its cameras first"),
     ],
 )
 def test_other_files_given_as_a_scene(tmp_path, name, data, told):
@@ -113,14 +113,17 @@ def test_a_git_lfs_pointer_is_one_wherever_a_file_is_read(tmp_path):
 
 
 def test_a_video_is_told_apart_from_a_folder_of_photographs(tmp_path, capsys):
-    """`drgs sfm film.mp4` and `drgs fit film.mp4` say how to get photographs out of it."""
+    """`drgs fit film.mp4` names `drgs sfm`, which says that this one is damaged."""
     film = tmp_path / "film.mp4"
     film.write_bytes(b"\0\0\0\x20ftypmp42" + bytes(20))
-    for command in ("sfm", "fit"):
+    for command, told in (
+        ("sfm", "film.mp4: must be a video, could not be opened"),
+        ("fit", "film.mp4 -o scene`"),
+    ):
         assert cli.main([command, str(film), "-o", str(tmp_path / "out")]) == 2
         line = capsys.readouterr().err
         assert line.count("\n") == 1
-        assert "is a video; take photographs out of it first" in line
+        assert told in line
 
 
 def test_ordinary_json_named_meta_is_no_sog(tmp_path):

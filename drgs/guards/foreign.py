@@ -102,10 +102,7 @@ def _other(head: bytes, path: Path) -> tuple[str, str] | None:
     if brand in (b"heic", b"heix", b"mif1", b"msf1", b"avif"):
         return "an HEIC or AVIF photograph", "convert it to JPEG or PNG"
     if brand or head.startswith(b"\x1aE\xdf\xa3") or head[8:12] == b"AVI ":
-        return "a video", (
-            f"take photographs out of it first, e.g. `mkdir photos; ffmpeg -i {shlex.quote(str(path))} -vf fps=2 "
-            "photos/%04d.jpg`, and run `drgs sfm photos -o scene`"
-        )
+        return "a video", f"find its cameras first: `drgs sfm {shlex.quote(str(path))} -o scene`"
     if head.startswith(b"PK\x03\x04") and path.suffix.lower() != ".npz":
         return "a zip archive", "unpack it first"
     if head.startswith(b"\x1f\x8b"):
