@@ -152,6 +152,7 @@ if TYPE_CHECKING:
     from drgs import integrator as integrator
     from drgs import lab as lab
     from drgs import ladder as ladder
+    from drgs import meshing as meshing
     from drgs import metrics as metrics
     from drgs import oracle as oracle
     from drgs import plugin as plugin
