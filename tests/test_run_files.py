@@ -176,6 +176,7 @@ _OTHERS = {
     "guards/locks.py",  # .drgs.lock
     "guards/outputs.py",  # .drgs.jsonl
     "guards/writing.py",  # for log.jsonl
+    "meshing/writing.py",  # inside a .glb
     "report/page.py",  # a cell of the report
 }
 """Modules that make JSON which is no file of the page."""
