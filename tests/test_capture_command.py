@@ -270,6 +270,10 @@ def test_new_places_get_points(captured, tmp_path):
     )
     assert len(result.gaussians) > 100
     assert "points that new photographs show" in result.run.config()["points"]
+    began = result.run.config()["begin"]
+    assert began == str(tmp_path / "few/state.safetensors")
+    fit(scene, tmp_path / "run", CONFIG.replace(max_steps=2), progress=False, resume=True)
+    assert result.run.config()["begin"] == began
 
 
 def test_fits_that_cannot_begin_so(captured, tmp_path):

@@ -168,7 +168,8 @@ class ExaminedVideo:
         far = [frame for frame in frames[1:] if frame.motion > _LONGEST_STEP]
         if len(far) > 0.1 * len(frames):
             text = f"{name}: {len(far)} of {len(frames)} frames share little with the one before"
-            more = f"ask for more frames (--frames {self.wanted}), or " if self.wanted > len(frames) else ""
+            most = min(self.wanted, self._video.count)
+            more = f"ask for more frames (--frames {most}), or " if most > len(frames) else ""
             found.append((length, Finding("overlap", text, f"{more}film more slowly")))
         return [finding for _, finding in sorted(found, key=lambda pair: -pair[0])]
 
