@@ -121,7 +121,7 @@ def test_without_the_package_the_names_are_refused(folder):
     for words, told in (
         (("fit", "lines", "-o", "runs/none"), "must hold camera poses"),
         (("render", "point_cloud.ply", "--set", "response=narrow", "-o", "out/none"), "response must be one of peak"),
-        (("convert", "point_cloud.ply", "out/none.rows"), "must end with .ply, .compressed.ply, .spz, .splat, .sog, .glb, got .rows"),
+        (("convert", "point_cloud.ply", "out/none.rows"), ".sog, .glb, got .rows; choose"),
     ):
         found = command(None, folder, *words, "--quiet")  # no progress: a busy machine says how long it takes
         assert found.returncode == 2
