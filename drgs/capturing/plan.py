@@ -51,9 +51,9 @@ _LEAST = 30.0  # seconds: less is not even enough to start all parts
 _FIRST_SIZE = 800  # pixels of the longer side at which two photographs are measured
 _IMAGE_SIZES = (1600, 1200, 1000, 800, 640, 480)
 _POSES_SHARE = 0.4  # of the budget, that poses should not exceed
-# Mapping of 16 photographs (`banana`) took 3.6 s, of 292 (`bonsai`) 2,280 s, where one photograph's features of 1,600
-# pixels took 3.2 s: what features take tells how fast the machine is.
-_MAPPING = (3.6 / 3.2 / 16**2.22, 2.22)
+# Mapping of 16 photographs of 752 pixels (`banana`) took 1.1 times as long as features of one of them, of 292 of 800
+# pixels (`bonsai`) 507 times: what features take tells how fast the machine is. Measured of smaller ones: a third.
+_MAPPING = (1.1 / 16**2.11, 2.11)
 _NEIGHBORS = 18  # pairs of each photograph where those near by name and by appearance are matched
 _FEWEST_FRAMES = 20  # however little time there is
 # (pixels of a photograph, Gaussians, steps) of fits, each about three times as long as the one before.
@@ -229,12 +229,8 @@ def _pose_seconds(count: int, features: float, pair: float, scale: float) -> flo
     """Seconds of poses of `count` photographs at `scale` times the size at which `features` and `pair` were taken."""
     pairs = count * (count - 1) / 2 if count <= MAX_EXHAUSTIVE else count * _NEIGHBORS
     factor, power = _MAPPING
-    # Features are found by their number of pixels, and compared all to all.
-    return (
-        count * features * scale**2
-        + pairs * pair * min(scale**4, 4.0)
-        + factor * features * (1600 / _FIRST_SIZE) ** 2 * count**power
-    )
+    # There are as many features as pixels, and they are compared all to all.
+    return count * features * scale**2 + pairs * pair * min(scale**4, 4.0) + factor * features * scale**2 * count**power
 
 
 def plan_fit(
