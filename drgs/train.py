@@ -244,10 +244,9 @@ def _fit(
         seconds = 0.0
     recorded = config_record(dataset, config, plan, taught, frames, held_out, source, motion.times if motion else ())
     recorded |= photographs_record(run, trainer, exposure, evidence, choice)
-    began = None if begin is None else str(begin)
-    if resume and (run.path / "config.json").is_file():
-        began = run.config().get("begin", began)
-    recorded |= {"begin": began} if began is not None else {}
+    earlier = run.config() if resume and (run.path / "config.json").is_file() else {}
+    began = earlier.get("begin", None if begin is None else str(begin))
+    recorded |= {} if began is None else {"begin": began}
     recorded |= {"exposure": plan.exposure} if plan and plan.exposure else {}
     recorded |= {"lenses": lenses.to_json()} if lenses and lenses.lost else {}
     poses = trainer.parts.poses
