@@ -1,58 +1,89 @@
 """How the page of `drgs share` agrees with our `gsplat`, at cameras of photographs, and how large it is.
 
     python benchmarks/share.py runs/scene [runs/other ...] [--views 3] [--pixels 250000]
+    python benchmarks/share.py --page
 
-Three numbers a view, in dB: `page` is a screenshot in headless Chromium beside `gsplat` of the run's own Gaussians; it
-is made of `archive`, what SOG loses (our `gsplat` of what the page holds beside that of the run's), and `rules`, how
-Spark draws (the screenshot beside our `gsplat` of what the page holds). Needs playwright and Chromium.
+Appends one row a run and view to benchmarks/share.jsonl, leaves out what is there, then writes the table of
+docs/share.md. Three numbers a view, in dB: `page` is a screenshot in headless Chromium beside `gsplat` of the run's own
+Gaussians; it is made of `archive`, what SOG loses (our `gsplat` of what the page holds beside that of the run's), and
+`rules`, how Spark draws (the screenshot beside our `gsplat` of what the page holds). Needs playwright and Chromium.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import os
 import re
+import sys
 import tempfile
 from pathlib import Path
 
-import cv2
-import numpy as np
-import torch
+os.environ.setdefault("DRGS_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from drgs.cameras import Camera
-from drgs.codecs import load_gaussians
-from drgs.codecs.sog import encode_sog
-from drgs.commands.options import Share
-from drgs.commands.share import shared_of
-from drgs.ellipsoids import Gaussians
-from drgs.integrator import render
-from drgs.settings import RenderSettings
-from drgs.sharing.write import write_page
-from drgs.sizes import reduced_size
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
+import cv2  # noqa: E402
+import numpy as np  # noqa: E402
+import torch  # noqa: E402
+from where import add_row, ran, read_rows  # noqa: E402
+
+from drgs.cameras import Camera  # noqa: E402
+from drgs.codecs import load_gaussians  # noqa: E402
+from drgs.codecs.sog import encode_sog  # noqa: E402
+from drgs.commands.options import Share  # noqa: E402
+from drgs.commands.share import shared_of  # noqa: E402
+from drgs.ellipsoids import Gaussians  # noqa: E402
+from drgs.integrator import render  # noqa: E402
+from drgs.settings import RenderSettings  # noqa: E402
+from drgs.sharing.write import write_page  # noqa: E402
+from drgs.sizes import reduced_size  # noqa: E402
+from drgs.studies.tables import fill_between  # noqa: E402
+
+ROWS = ROOT / "benchmarks" / "share.jsonl"
+PAGE = ROOT / "docs" / "share.md"
 _FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 _PATIENCE = 300_000  # ms
+_KINDS = ("page", "archive", "rules")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("runs", nargs="+", type=Path)
+    parser.add_argument("runs", nargs="*", type=Path)
+    parser.add_argument("--page", action="store_true", help="measure nothing, write the table of what is there")
     parser.add_argument("--views", type=int, default=3, help="views of each, evenly over its photographs")
     parser.add_argument("--pixels", type=int, default=250_000, help="of a picture, at most")
     parser.add_argument("--chromium", default="/usr/bin/chromium")
     parser.add_argument("--pictures", type=Path, default=None, help="folder for pictures: run, page, ten times apart")
     args = parser.parse_args()
-    from playwright import sync_api
+    if args.runs and not args.page:
+        from playwright import sync_api
 
-    print("| run | Gaussians | bytes each | page (MB) | view | page | archive | rules |")
-    print("|---|---|---|---|---|---|---|---|")
-    with sync_api.sync_playwright() as driver, tempfile.TemporaryDirectory() as folder:
-        browser = driver.chromium.launch(executable_path=args.chromium, args=_FLAGS)
-        for run in args.runs:
-            _measure(browser, run, Path(folder), args)
+        with sync_api.sync_playwright() as driver, tempfile.TemporaryDirectory() as folder:
+            browser = driver.chromium.launch(executable_path=args.chromium, args=_FLAGS)
+            for run in args.runs:
+                _measure(browser, run, Path(folder), args)
+    text = table(read_rows(ROWS))
+    print(text)
+    fill_between(PAGE, "share", text)
+
+
+def table(rows: list[dict]) -> str:
+    """A row a run, with the least and the largest of its views."""
+    lines = ["| run | Gaussians | bytes each | page (MB) | page (dB) | archive (dB) | rules (dB) |", "|---" * 7 + "|"]
+    for run in dict.fromkeys(row["run"] for row in rows):
+        mine = [row for row in rows if row["run"] == run]
+        first = mine[0]
+        ranges = (f"{min(x):.1f} to {max(x):.1f}" for x in ([row[key] for row in mine] for key in _KINDS))
+        size = f"{first['archive_bytes'] / first['gaussians']:.1f} | {first['page_bytes'] / 1e6:.1f}"
+        lines.append(f"| `{run}` | {first['gaussians']:,} | {size} | {' | '.join(ranges)} |")
+    return "\n".join(lines)
 
 
 def _measure(browser, run: Path, folder: Path, args: argparse.Namespace) -> None:
+    known = {(row["run"], row["view"]) for row in read_rows(ROWS)}
     shared = shared_of(Share(scene=run, uncertainty=False))
     page = folder / "scene.html"
     write_page(shared, page)
@@ -61,14 +92,19 @@ def _measure(browser, run: Path, folder: Path, args: argparse.Namespace) -> None
     held = load_gaussians(archive).replace(origin=shared.gaussians.origin)
     settings = RenderSettings.preset("gsplat", background=shared.background)
     count = len(shared.gaussians)
-    begin = f"| {run.name} | {count:,} | {archive.stat().st_size / count:.1f} | {page.stat().st_size / 1e6:.1f} |"
+    sizes = {"gaussians": count, "archive_bytes": archive.stat().st_size, "page_bytes": page.stat().st_size}
     fitted = [camera for kind, camera in shared.cameras if kind == "fitted"]
     for index in np.unique(np.linspace(0, len(fitted) - 1, args.views).round().astype(int)):
+        if (run.name, fitted[index].name) in known:
+            continue
         camera = _in_window(fitted[index], *reduced_size(fitted[index], args.pixels))
         shot = _screenshot(browser, page, camera)
         own, kept = (_drawn(g, camera, settings) for g in (shared.gaussians, held))
-        values = " | ".join(f"{_psnr(a, b):.1f}" for a, b in ((shot, own), (kept, own), (shot, kept)))
-        print(f"{begin} {camera.name} | {values} |", flush=True)
+        pairs = ((shot, own), (kept, own), (shot, kept))
+        row = {"run": run.name, "view": camera.name, "pixels": camera.width * camera.height, **sizes}
+        row |= {key: _psnr(a, b) for key, (a, b) in zip(_KINDS, pairs, strict=True)}
+        add_row(ROWS, row | ran())
+        print(row, flush=True)
         if args.pictures is not None:
             args.pictures.mkdir(parents=True, exist_ok=True)
             row = np.concatenate([own, shot, np.clip(10 * np.abs(shot - own), 0, 1)], 1)
