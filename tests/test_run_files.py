@@ -170,7 +170,7 @@ _WRITERS = {
 }
 """Module that writes JSON for users -> the sections of the page that tell its fields."""
 _OTHERS = {
-    "codecs/gltf.py",  # the header of a .glb
+    "codecs/glb.py",  # the header of a .glb
     "codecs/sog.py",  # the index in a .sog
     "commands/info.py",  # stdout
     "commands/repeat.py",  # options on a line of a report
@@ -180,7 +180,6 @@ _OTHERS = {
     "guards/locks.py",  # .drgs.lock
     "guards/outputs.py",  # .drgs.jsonl
     "guards/writing.py",  # for log.jsonl
-    "meshing/writing.py",  # the header of a .glb
     "report/page.py",  # a cell of the report
     "sharing/page.py",  # what a page is told
 }

@@ -12,7 +12,6 @@ signs (a half turn about z, as splat-transform does it), and with them those of 
 
 from __future__ import annotations
 
-import json
 import logging
 import struct
 from pathlib import Path
@@ -21,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drgs.codecs.codec import Codec
+from drgs.codecs.glb import BIN, JSON, glb_of
 from drgs.codecs.values import SH_COUNTS, assembled, check_count, flipped, log_of_scales, logits_of_opacities
 from drgs.ellipsoids import Y_00
 from drgs.guards.json_files import check_json, parse_json
@@ -37,8 +37,6 @@ _BYTE = 5121
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 # Component type -> its dtype and, where it is normalized, what 1 is.
 _KINDS = {5126: ("<f4", 1), 5120: ("i1", 127), 5121: ("u1", 255), 5122: ("<i2", 32767), 5123: ("<u2", 65535)}
-_JSON = 0x4E4F534A
-_BIN = 0x004E4942
 _LEAST = float(np.finfo(np.float32).tiny)  # what a scale of 0 is taken for
 _ADVICE = "export it as a GLB that is not compressed, or as a PLY"
 _log = logging.getLogger(__name__)
@@ -71,41 +69,17 @@ def encode_glb(g: Gaussians) -> bytes:
     parts = {name: np.ascontiguousarray(x, "<f4") for name, x in arrays.items()}
     # For viewers that show points only.
     parts["COLOR_0"] = np.rint(np.clip(colors, 0, 1) * 255).astype(np.uint8)
-    views: list[dict[str, Any]] = []
-    accessors: list[dict[str, Any]] = []
-    at = 0
-    for name, x in parts.items():
-        views.append({"buffer": 0, "byteOffset": at, "byteLength": x.nbytes, "target": 34962})
-        kind = next(key for key, width in _WIDTHS.items() if width == x.shape[1])
-        accessor: dict[str, Any] = {"bufferView": len(accessors), "count": len(g), "type": kind}
-        accessor |= {"componentType": _BYTE, "normalized": True} if x.dtype == np.uint8 else {"componentType": _FLOAT}
-        if name == "POSITION" and len(g):
-            accessor |= {"min": x.min(0).tolist(), "max": x.max(0).tolist()}
-        accessors.append(accessor)
-        at += x.nbytes
+    accessors = []
+    for x in parts.values():
+        kind: dict[str, Any] = {"type": next(key for key, width in _WIDTHS.items() if width == x.shape[1])}
+        kind |= {"componentType": _BYTE, "normalized": True} if x.dtype == np.uint8 else {"componentType": _FLOAT}
+        accessors.append((x, kind, 34962))
     primitive = {
         "attributes": {name: i for i, name in enumerate(parts)},
         "mode": 0,
         "extensions": {_NAME: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
     }
-    document = {
-        "asset": {"version": "2.0", "generator": "drgs"},
-        "extensionsUsed": [_NAME],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive]}],
-        "buffers": [{"byteLength": at}],
-        "bufferViews": views,
-        "accessors": accessors,
-    }
-    text = json.dumps(document, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    total = 12 + 8 + len(text) + 8 + at
-    if total >= 1 << 32:
-        raise ValueError(f"save_gaussians: a GLB has at most 4 GiB, {len(g)} Gaussians take {total} bytes; write a PLY")
-    chunks = [struct.pack("<4sII", b"glTF", 2, total), struct.pack("<II", len(text), _JSON), text]
-    return b"".join([*chunks, struct.pack("<II", at, _BIN), *(x.tobytes() for x in parts.values())])
+    return glb_of("save_gaussians", accessors, primitive, {"extensionsUsed": [_NAME]})
 
 
 def load_glb(path: Path) -> Gaussians:
@@ -160,7 +134,7 @@ def _chunks(path: Path) -> tuple[dict[str, Any], memoryview]:
     if len(data) < 20 or struct.unpack_from("<I", data, 4)[0] != 2:
         raise ValueError(f"{path}: must be a GLB of version 2, is none; {damaged}")
     length, kind = struct.unpack_from("<II", data, 12)
-    if kind != _JSON or 20 + length > len(data):
+    if kind != JSON or 20 + length > len(data):
         raise ValueError(f"{path}: the header claims {length} bytes of JSON, the file holds {len(data)}; {damaged}")
     document = parse_json(bytes(data[20 : 20 + length]), str(path), _ADVICE)
     shape = {"meshes": [{"primitives": [{"attributes": dict}]}], "accessors": [dict], "bufferViews": [dict]}
@@ -169,7 +143,7 @@ def _chunks(path: Path) -> tuple[dict[str, Any], memoryview]:
     if at + 8 > len(data):
         return document, data[:0]
     size, kind = struct.unpack_from("<II", data, at)
-    if kind != _BIN or at + 8 + size > len(data):
+    if kind != BIN or at + 8 + size > len(data):
         raise ValueError(f"{path}: the buffer claims {size} bytes, the file holds {len(data)}; {damaged}")
     return document, data[at + 8 : at + 8 + size]
 

@@ -6,13 +6,12 @@ Gaussians (`drgs.codecs.gltf`), and colors that are linear: what photographs sho
 
 from __future__ import annotations
 
-import json
-import struct
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.codecs.glb import glb_of
 from drgs.guards.outputs import replacing
 
 if TYPE_CHECKING:
@@ -82,7 +81,7 @@ def _glb(mesh: TriangleMesh) -> bytes:
     colors = mesh.colors.astype(np.float64)
     linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
     opaque = np.full((len(linear), 1), 65535)  # four channels: each vertex starts at a multiple of four bytes
-    parts = [
+    arrays = [
         (positions, {"componentType": 5126, "type": "VEC3"}, 34962),
         (
             np.column_stack([np.rint(linear * 65535), opaque]).astype("<u2"),
@@ -91,31 +90,6 @@ def _glb(mesh: TriangleMesh) -> bytes:
         ),
         (mesh.faces.astype("<u4").reshape(-1), {"componentType": 5125, "type": "SCALAR"}, 34963),
     ]
-    views: list[dict[str, Any]] = []
-    accessors: list[dict[str, Any]] = []
-    at = 0
-    for array, kind, target in parts:
-        views.append({"buffer": 0, "byteOffset": at, "byteLength": array.nbytes, "target": target})
-        accessors.append({"bufferView": len(accessors), "count": len(array), **kind})
-        at += array.nbytes
-    accessors[0] |= {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
     rough = {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 1}
     primitive = {"attributes": {"POSITION": 0, "COLOR_0": 1}, "indices": 2, "material": 0, "mode": 4}
-    document = {
-        "asset": {"version": "2.0", "generator": "drgs"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive]}],
-        "materials": [{"pbrMetallicRoughness": rough, "doubleSided": True}],
-        "buffers": [{"byteLength": at}],
-        "bufferViews": views,
-        "accessors": accessors,
-    }
-    text = json.dumps(document, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    total = 12 + 8 + len(text) + 8 + at
-    if total >= 1 << 32:
-        raise ValueError(f"mesh: a GLB has at most 4 GiB, this mesh takes {total} bytes; write a PLY")
-    head = struct.pack("<4sIIII", b"glTF", 2, total, len(text), 0x4E4F534A)
-    return b"".join([head, text, struct.pack("<II", at, 0x004E4942), *(array.tobytes() for array, *_ in parts)])
+    return glb_of("mesh", arrays, primitive, {"materials": [{"pbrMetallicRoughness": rough, "doubleSided": True}]})
