@@ -16,13 +16,13 @@ from viewing_client import Client
 import drgs
 from drgs import cli
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, look_at
-from drgs.capturing.places import Place, level_frame, meters_of, places_around, told_length
+from drgs.capturing.places import Place, meters_of, places_around, told_length
 from drgs.commands.next_views import rank_next
 from drgs.commands.options import View
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewed import subject_of
 from drgs.data import load
-from drgs.data.capture import upright
+from drgs.data.capture import level_frame, upright
 from drgs.fitting.config import FitConfig
 from drgs.train import fit
 from drgs.viewing import panel

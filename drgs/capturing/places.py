@@ -18,8 +18,9 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from drgs.cameras import Camera, look_at
+from drgs.data.capture import level_frame
 
-__all__ = ["Place", "level_frame", "meters_of", "places_around", "told_length"]
+__all__ = ["Place", "meters_of", "places_around", "told_length"]
 
 # (right, up, ahead) from a photograph, in shares of its way to what it shows.
 _MOVES = (
@@ -107,22 +108,6 @@ def told_length(share: float, meters: float | None) -> str:
         return min(_PARTS, key=lambda part: abs(part[0] - share))[1] + " of the way"
     length = share * meters
     return f"{100 * length:.0f} cm" if length < 0.95 else f"{length:.1f} m"
-
-
-def level_frame(camera: Camera, up: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Right, up and ahead (3,) of a camera that is held level, each of length 1.
-
-    Args:
-        camera: The camera. If it looks straight down or up, ahead is where the upper edge of its picture points.
-        up: (3,) of length 1.
-    """
-    axis = camera.c2w[:3, 2]
-    ahead = axis - (axis @ up) * up
-    if np.linalg.norm(ahead) < math.cos(math.radians(_STEEPEST)):
-        ahead = -camera.c2w[:3, 1] * -np.sign(axis @ up)
-        ahead = ahead - (ahead @ up) * up
-    ahead /= np.linalg.norm(ahead)
-    return np.cross(ahead, up), up, ahead
 
 
 def places_around(

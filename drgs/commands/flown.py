@@ -10,7 +10,7 @@ import numpy as np
 
 from drgs.cameras import Camera, intrinsics
 from drgs.commands.viewpoints import frame_size
-from drgs.data.capture import upright
+from drgs.data.capture import level_frame, upright
 from drgs.data.flight_files import read_flight
 
 if TYPE_CHECKING:
@@ -26,7 +26,6 @@ __all__ = [
     "film_of",
     "flight_cameras",
     "level_panorama",
-    "middle_camera",
     "panorama_size",
     "up_of",
 ]
@@ -35,7 +34,6 @@ _FRAMES = 60
 _FPS = 24.0
 _MOST = 100_000  # frames
 _WIDE = 2048  # pixels of a panorama
-_STEEP = 0.999  # cosine between up and the axis of a camera that looks up or down: its image's up says where to look
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,12 +149,6 @@ def check_panorama(settings: RenderSettings) -> None:
         )
 
 
-def middle_camera(cameras: list[Camera]) -> Camera:
-    """The camera whose place is nearest to the middle of all, coordinate by coordinate."""
-    centers = np.stack([camera.center for camera in cameras])
-    return cameras[int(np.linalg.norm(centers - np.median(centers, axis=0), axis=1).argmin())]
-
-
 def panorama_size(args: Render) -> tuple[int, int]:
     """Width and height in pixels, 2:1."""
     width = args.width or (2 * args.height if args.height else _WIDE)
@@ -171,13 +163,8 @@ def level_panorama(camera: Camera, up: np.ndarray, width: int, height: int) -> C
         up: (3,) world direction of length 1 that is up.
         width, height: Pixels of the picture, 360 by 180 degrees.
     """
-    c2w = camera.c2w
-    ahead = c2w[:3, 2]
-    if abs(float(ahead @ up)) > _STEEP:  # straight up or down: the upper edge of the image, or the lower one, is ahead
-        ahead = c2w[:3, 1] * np.sign(ahead @ up)
-    ahead = ahead - (ahead @ up) * up
-    ahead /= np.linalg.norm(ahead)
-    rotation = np.stack([np.cross(ahead, up), -up, ahead])
+    right, _, ahead = level_frame(camera, up)
+    rotation = np.stack([right, -up, ahead])
     w2c = np.eye(4)
     w2c[:3, :3] = rotation
     w2c[:3, 3] = -rotation @ camera.center

@@ -25,7 +25,6 @@ from drgs.commands.flown import (
     film_of,
     flight_cameras,
     level_panorama,
-    middle_camera,
     panorama_size,
     up_of,
 )
@@ -37,6 +36,7 @@ from drgs.commands.painters import PAINTINGS, painters
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import MAX_SIDE, captured_cameras, check_lenses, drawn_views
 from drgs.data.camera_lists import described, save_cameras_json
+from drgs.data.capture import middle_camera
 from drgs.display import pictures
 from drgs.display.mp4 import Mp4, need_mp4
 from drgs.display.progress import Bar

@@ -13,13 +13,13 @@ import numpy as np
 from drgs.commands.orbit_keys import UP
 from drgs.commands.orbits import scene_orbit, seen_distance
 from drgs.commands.scene_input import SceneInput
+from drgs.commands.viewed import ranking_of
 from drgs.data.capture import Focus, upright
 from drgs.files import Run
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import fitted_views, is_run
 from drgs.fitting.renderers import VIEWERS, planar_of
 from drgs.fitting.resume import claim_run
-from drgs.guards.foreign import refuse_foreign
 from drgs.guards.outputs import check_file
 from drgs.information.nuisances import Nuisances
 from drgs.report.pictures import spread
@@ -27,7 +27,7 @@ from drgs.sharing.layers import classes_layer, uncertainty_of
 from drgs.sharing.page import SHARED_BY
 from drgs.sharing.write import Shared, write_page
 from drgs.sizes import at_most
-from drgs.viewing.placed_views import NEXT, Ranking, placed_views_of, read_ranking
+from drgs.viewing.placed_views import placed_views_of
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -143,7 +143,7 @@ def _classes(given: SceneInput) -> tuple[dict[str, Any], np.ndarray] | None:
 
 def _cameras(args: Share, given: SceneInput) -> list[tuple[PhotoKind, Camera]]:
     """Cameras of the photographs that a run was fitted to, and of those to take next; none where nobody knows."""
-    ranking = _ranking(args, given)
+    ranking = ranking_of(args.selection, given)
     views, names = [], []
     if given.run is not None and given.record is not None:
         record = given.record
@@ -159,17 +159,6 @@ def _cameras(args: Share, given: SceneInput) -> list[tuple[PhotoKind, Camera]]:
     following = [dataclasses.replace(picks[k], name=f"{k}. {picks[k].name}") for k in sorted(picks)]
     ordered: list[tuple[PhotoKind, Camera]] = [("fitted", camera) for camera in sorted(fitted, key=lambda x: x.name)]
     return ordered + [("next", camera) for camera in following]
-
-
-def _ranking(args: Share, given: SceneInput) -> Ranking | None:
-    """Picks of --selection, else those of a run that chose its views, or places for next photographs of any other."""
-    if args.selection is not None:
-        refuse_foreign(args.selection, "a selection")
-        return read_ranking(args.selection)
-    if given.run is None or given.record is None:
-        return None
-    path = given.run.path / ("selection.json" if given.record.is_active else NEXT)
-    return read_ranking(path) if path.is_file() else None
 
 
 def _times(given: SceneInput, count: int) -> tuple[float, ...]:

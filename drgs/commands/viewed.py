@@ -58,7 +58,7 @@ def subject_of(args: View, given: SceneInput, before: Subject | None = None) -> 
     """
     notes: list[str] = []
     known = _known(args, given, notes)
-    ranking = _ranking(args, given)
+    ranking = ranking_of(args.selection, given)
     placed_views = _placed_views(args, given, ranking, notes)
     uncertainty = _uncertainty(args, given, known)
     origin = np.array(given.gaussians.origin, np.float64)
@@ -150,12 +150,19 @@ def _placed_views(args: View, given: SceneInput, ranking: Ranking | None, notes:
     return placed_views_of(views, fitted, ranking)
 
 
-def _ranking(args: View, given: SceneInput) -> Ranking | None:
-    """Scores of cameras: those of --selection, else of a run that chose its views, or of its next photographs."""
-    if args.selection is not None:
-        refuse_foreign(args.selection, "a selection")
-        return read_ranking(args.selection)
-    if given.record is None:
+def ranking_of(selection: Path | None, given: SceneInput) -> Ranking | None:
+    """Scores of cameras: those of a file, else of a run that chose its views, or places of its next photographs.
+
+    Args:
+        selection: What `--selection` names.
+        given: What is looked at.
+    Raises:
+        FileNotFoundError, ValueError: If a file is not there, or damaged.
+    """
+    if selection is not None:
+        refuse_foreign(selection, "a selection")
+        return read_ranking(selection)
+    if given.record is None or given.run is None:
         return None
     path = given.run.path / (_SELECTION if given.record.is_active else NEXT)
     return read_ranking(path) if path.is_file() else None

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from drgs.cameras import Camera
 
-__all__ = ["Focus", "path", "upright"]
+__all__ = ["Focus", "level_frame", "middle_camera", "path", "upright"]
 
 _ROUNDS = 30  # of reweighting; the median of lines settles in about ten
 _MEETING = 0.02  # smallest mean squared sine between the axes and their mean: 8 degrees
@@ -31,6 +31,7 @@ _TILT = 0.05  # weight of the images' up where their horizontals leave it open
 _JUMP = 8.0  # times the median step between photographs: no path leads there
 _TURN = 75.0  # degrees between photographs of one path
 _SMOOTH = 0.75  # standard deviation of the smoothing in steps between photographs, at least
+_STEEPEST = 80.0  # degrees above or below the horizon, beyond which an axis does not say what is ahead
 _SMOOTHED = 40  # and in parts of the whole path, of which a video has many photographs
 
 
@@ -135,6 +136,29 @@ def upright(cameras: list[Camera]) -> np.ndarray:
     lean = np.eye(3) - np.outer(mean, mean)
     up = np.linalg.eigh(rights.T @ rights / len(rights) + _TILT * lean)[1][:, 0]
     return up if up @ mean >= 0 else -up
+
+
+def level_frame(camera: Camera, up: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Right, up and ahead (3,) of a camera that is held level, each of length 1.
+
+    Args:
+        camera: The camera. If it looks almost straight down, ahead is where the upper edge of its picture points, if
+            almost straight up, the lower one.
+        up: (3,) of length 1.
+    """
+    axis = camera.c2w[:3, 2]
+    ahead = axis - (axis @ up) * up
+    if np.linalg.norm(ahead) < np.cos(np.radians(_STEEPEST)):
+        ahead = camera.c2w[:3, 1] * np.sign(axis @ up)
+        ahead = ahead - (ahead @ up) * up
+    ahead /= np.linalg.norm(ahead)
+    return np.cross(ahead, up), up, ahead
+
+
+def middle_camera(cameras: list[Camera]) -> Camera:
+    """The camera whose place is nearest to the middle of all, coordinate by coordinate."""
+    centers = np.stack([camera.center for camera in cameras])
+    return cameras[int(np.linalg.norm(centers - np.median(centers, axis=0), axis=1).argmin())]
 
 
 def path(cameras: list[Camera], frames: int) -> list[np.ndarray]:

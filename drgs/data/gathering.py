@@ -6,7 +6,6 @@ import dataclasses
 import itertools
 import json
 import logging
-import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ import cv2
 import numpy as np
 
 from drgs.data.checks import IMAGE_SUFFIXES, list_images
+from drgs.data.photo_files import link_or_copy
 from drgs.data.shooting import Finding
 from drgs.data.video_frames import Picked, examine
 from drgs.data.videos import VIDEO_SUFFIXES, list_videos
@@ -155,11 +155,7 @@ def fill(
     names = list[str]()
     for path in photographs:
         names.append(_free_name(folder, path))
-        target = folder / names[-1]
-        try:
-            target.symlink_to(path.resolve())
-        except OSError:  # a file system without links
-            shutil.copyfile(path, target)
+        link_or_copy(path, folder / names[-1])
     rows = list[dict[str, Any]]()
     total = sum(len(one.frames) for one in picked)
     for video, stem, one in zip(videos, _stems(videos), picked, strict=True):

@@ -14,7 +14,7 @@ import numpy as np
 from drgs.data.checks import IMAGE_SUFFIXES, read_image
 from drgs.data.heif import heif_as_jpeg, is_heif
 
-__all__ = ["check_names", "readable_photos"]
+__all__ = ["check_names", "link_or_copy", "readable_photos"]
 
 _QUALITY = 98  # of JPEG, for what has been compressed before
 _LONGEST = 251  # bytes of a name, where file systems allow 255 and COLMAP wants .png behind it
@@ -69,10 +69,7 @@ def readable_photos(folder: Path, names: list[str], target: Path, progress: Call
         return folder
     target.mkdir()
     for name in set(names) - set(foreign):
-        try:
-            (target / name).symlink_to((folder / name).resolve())
-        except OSError:
-            shutil.copyfile(folder / name, target / name)
+        link_or_copy(folder / name, target / name)
     for done, name in enumerate(foreign):
         progress("decoding", done, len(foreign))
         if is_heif(folder / name):
@@ -83,6 +80,14 @@ def readable_photos(folder: Path, names: list[str], target: Path, progress: Call
             (target / name).write_bytes(encoded.tobytes())
     progress("decoding", len(foreign), len(foreign))
     return target
+
+
+def link_or_copy(file: Path, target: Path) -> None:
+    """Make a new file that is another one: a link, or a copy where the file system has none."""
+    try:
+        target.symlink_to(file.resolve())
+    except OSError:
+        shutil.copyfile(file, target)
 
 
 def _is_webp(path: Path) -> bool:

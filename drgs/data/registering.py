@@ -20,7 +20,7 @@ from drgs.data.checks import IMAGE_SUFFIXES, image_size
 from drgs.data.gathering import FRAMES, joined_frames, recorded_frames, write_frames
 from drgs.data.mapping import PhotoGroups, map_photos
 from drgs.data.pairing import choose_new_pairs
-from drgs.data.photo_files import check_names, readable_photos
+from drgs.data.photo_files import check_names, link_or_copy, readable_photos
 from drgs.data.sfm import SfmSummary
 from drgs.guards.outputs import claim
 from drgs.guards.unfinished import temporary_folder
@@ -161,9 +161,9 @@ def _registered(
     for folder in ("photos", "models", "sparse/0"):
         (partial / folder).mkdir(parents=True)
     for path in _photographs(scene / "images"):
-        _link(path, partial / "photos" / path.name)
+        link_or_copy(path, partial / "photos" / path.name)
     for file, name in zip(files, names, strict=True):
-        _link(file, partial / "photos" / name)
+        link_or_copy(file, partial / "photos" / name)
     database = partial / "database.db"
     shutil.copyfile(scene / "database.db", database)
     before = pycolmap.Reconstruction(str(scene / "sparse/0"))
@@ -258,13 +258,6 @@ def _photographs(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES)
 
 
-def _link(file: Path, target: Path) -> None:
-    try:
-        target.symlink_to(file.resolve())
-    except OSError:  # a file system without links
-        shutil.copyfile(file, target)
-
-
 def _moved(before: Any, after: Any) -> float:
     """How far cameras that two models share are apart at most, over the spread of those of the first."""
     names = {after.images[i].name: i for i in after.reg_image_ids()}
@@ -283,7 +276,7 @@ def _install(output: Claim, partial: Path, files: list[Path], names: list[str]) 
         made = partial / "images"
         made.mkdir()
         for path in _photographs(images):
-            _link(path, made / path.name)
+            link_or_copy(path, made / path.name)
         output.remove(images)
         output.put(made, "images")
     for name in names:

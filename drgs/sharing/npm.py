@@ -10,6 +10,7 @@ import base64
 import dataclasses
 import hashlib
 import io
+import logging
 import os
 import tarfile
 import tempfile
@@ -22,6 +23,7 @@ __all__ = ["PACKAGED", "PACKAGES", "Package", "fetch_into", "viewer_files"]
 PACKAGED = Path(__file__).parent / "npm"
 """Where a wheel has the files of the packages, in a folder for each."""
 
+_log = logging.getLogger("drgs.sharing.npm")  # by this name where it is loaded by itself, too
 _TIMEOUT = 60.0  # seconds without an answer
 _LARGEST = 64 << 20  # bytes of an archive
 
@@ -122,6 +124,7 @@ def _user_cache() -> Path:
 
 def _fetched(package: Package) -> bytes:
     """The archive as npm has it."""
+    _log.info("fetching %s, once, for the pages of drgs share", package.address)
     try:
         with urllib.request.urlopen(package.address, timeout=_TIMEOUT) as answer:
             return answer.read(_LARGEST)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy as np
 if TYPE_CHECKING:
     from drgs.cameras import Camera
 
-__all__ = ["PhotoKind", "columns", "median_camera", "photo", "upright_matrix"]
+__all__ = ["PhotoKind", "columns", "photo", "upright_matrix"]
 
 PhotoKind = Literal["fitted", "next", "other"]
 """A photograph, one to be taken next, or a view of what has no photographs."""
@@ -59,9 +58,3 @@ def upright_matrix(up: np.ndarray) -> np.ndarray:
     turned = np.eye(4)
     turned[:3, :3] = np.stack([side, up, np.cross(side, up)])
     return turned
-
-
-def median_camera(cameras: Sequence[Camera]) -> int:
-    """Index of the camera that stands nearest to where most stand."""
-    centers = np.stack([camera.center for camera in cameras])
-    return int(np.argmin(np.linalg.norm(centers - np.median(centers, axis=0), axis=1)))

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drgs.codecs.clustering import morton_order
+from drgs.data.capture import middle_camera
 from drgs.display.progress import Bar
 from drgs.files import atomic_write
 from drgs.sharing.gaussians import archive_of
 from drgs.sharing.layers import moments_of, uncertainty_layer
 from drgs.sharing.npm import viewer_files
 from drgs.sharing.page import scene_html
-from drgs.sharing.placing import PhotoKind, columns, median_camera, photo, upright_matrix
+from drgs.sharing.placing import PhotoKind, columns, photo, upright_matrix
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -80,7 +81,7 @@ def write_page(shared: Shared, path: str | os.PathLike) -> dict[str, int]:
         archive, harmonics = archive_of(shared.gaussians)
     first = [camera for _, camera in shared.cameras]
     fitted = [camera for kind, camera in shared.cameras if kind == "fitted"] or first
-    begin = fitted[median_camera(fitted)]
+    begin = middle_camera(fitted)
     distances = np.linalg.norm(shared.gaussians.means.numpy() + origin - begin.center, axis=1)
     reach = float(np.linalg.norm(shared.target - begin.center))
     scene: dict[str, Any] = {
