@@ -20,6 +20,7 @@ import torch
 
 from drgs import runtime
 from drgs.commands.flown import (
+    Film,
     check_flight_options,
     check_panorama,
     film_of,
@@ -78,10 +79,7 @@ def run(args: Render) -> None:
     if "mp4" in formats:
         need_mp4("render: --format mp4")
     film = film_of(args)
-    is_alone = args.panorama and not (args.cameras or args.view or args.orbit)  # one place, of the photographs'
-    views = args.cameras or (str(args.scene) if (args.view or is_alone) and args.scene.is_dir() else "orbit")
-    if is_alone and views == "orbit" and args.path is None:
-        raise ValueError("render: --panorama must have a place, a file of Gaussians has none; add --path or --cameras")
+    views = _views_of(args)
     movie = "flight" if args.path is not None else "turntable" if views == "orbit" else "video"
     if alone is not None:
         movie = alone.stem
@@ -93,27 +91,7 @@ def run(args: Render) -> None:
     paint = painters(kinds, given, args.scene)
     gaussians = given.gaussians if paint else given.colors
     settings = given.over_background(settings)
-    size = args.width, args.height
-    photographs = captured_cameras(given) if args.panorama or film.flight is not None else []
-    if film.flight is not None:
-        shape = photographs[0].height / photographs[0].width if photographs else 0.75
-        cameras, source = flight_cameras(args, film, given, shape)
-    else:
-        cameras, source = drawn_views(args, views, given, film.frames, size, returns=True)
-        cameras = [middle_camera(cameras)] if is_alone else named_view(cameras, args.view, source)
-    placed = photographs or cameras
-    cameras = at_times(cameras[: args.limit], args.time, film.frames, given, is_film=film.flight is not None)
-    if args.panorama:
-        up, across = up_of(placed, Wish.of(args).up), panorama_size(args)
-        cameras = [level_panorama(camera, up, *across) for camera in cameras]
-    else:
-        cameras = [_resized(camera, args.width, args.height) for camera in cameras]
-    follows = args.undistort == "auto" and settings.traversal == "bvh"
-    bent = sum(camera.is_distorted for camera in cameras)
-    if bent and not args.panorama and not (follows or given.keeps_lenses(args.undistort)):
-        cameras = [camera.undistorted() for camera in cameras]
-        _say(args, f"{bent} cameras have a lens: drawn without it; --undistort off draws through it")
-    check_lenses("render", settings, cameras)
+    cameras, source = _cameras_of(args, views, film, given, settings)
     if alone is not None:
         cameras = alone.named(cameras)
     _check_memory(cameras, settings, formats, 0 if gaussians.features is None else gaussians.features.shape[1])
@@ -159,6 +137,52 @@ def run(args: Render) -> None:
         )
     write_json(args.output / "render.json", {"schema": SCHEMA, "command": "render"} | report)
     _say(args, _summary(report, args.output))
+
+
+def _is_one_place(args: Render) -> bool:
+    """Whether there is one panorama, from where the middle photograph was taken."""
+    return args.panorama and not (args.path or args.cameras or args.view or args.orbit)
+
+
+def _views_of(args: Render) -> str:
+    """Where cameras come from: what `--cameras` names, else the run or an orbit.
+
+    Raises:
+        ValueError: If a panorama has no place.
+    """
+    is_of_run = (args.view or _is_one_place(args)) and args.scene.is_dir()
+    views = args.cameras or (str(args.scene) if is_of_run else "orbit")
+    if _is_one_place(args) and views == "orbit":
+        raise ValueError("render: --panorama must have a place, a file of Gaussians has none; add --path or --cameras")
+    return views
+
+
+def _cameras_of(
+    args: Render, views: str, film: Film, given: SceneInput, settings: RenderSettings
+) -> tuple[list[Camera], str]:
+    """The cameras that are drawn, at their sizes and times, and where they come from in words."""
+    is_flight = film.flight is not None
+    photographs = captured_cameras(given) if args.panorama or is_flight else []
+    if is_flight:
+        shape = photographs[0].height / photographs[0].width if photographs else 0.75
+        cameras, source = flight_cameras(args, film, given, shape)
+    else:
+        cameras, source = drawn_views(args, views, given, film.frames, (args.width, args.height), returns=True)
+        cameras = [middle_camera(cameras)] if _is_one_place(args) else named_view(cameras, args.view, source)
+    placed = photographs or cameras
+    cameras = at_times(cameras[: args.limit], args.time, film.frames, given, is_film=is_flight)
+    if args.panorama:
+        up, across = up_of(placed, Wish.of(args).up), panorama_size(args)
+        cameras = [level_panorama(camera, up, *across) for camera in cameras]
+    else:
+        cameras = [_resized(camera, args.width, args.height) for camera in cameras]
+    follows = args.undistort == "auto" and settings.traversal == "bvh"
+    bent = sum(camera.is_distorted for camera in cameras)
+    if bent and not args.panorama and not (follows or given.keeps_lenses(args.undistort)):
+        cameras = [camera.undistorted() for camera in cameras]
+        _say(args, f"{bent} cameras have a lens: drawn without it; --undistort off draws through it")
+    check_lenses("render", settings, cameras)
+    return cameras, source
 
 
 def render_views(
