@@ -24,12 +24,11 @@ def glb_of(
     """The bytes of a file.
 
     Args:
-        where: What writes it, for the message.
-        arrays: Of each accessor, in their order: values, little-endian, each row a multiple of 4 bytes; the fields of
-            the accessor beside its view and count; the target of the view. The first one is POSITION, whose range is
-            stated.
-        primitive: Of the mesh.
-        more: What else the document states.
+        where: Name of what writes it, for the message.
+        arrays: Accessors in their order, each with its values (little-endian, each row a multiple of 4 bytes), its
+            fields beside view and count, and the target of its view. The first one is POSITION, whose range is stated.
+        primitive: The primitive of the mesh.
+        more: Further fields of the document.
     Raises:
         ValueError: If it takes more than 4 GiB.
     """
