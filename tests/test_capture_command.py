@@ -24,6 +24,7 @@ from drgs import cli
 from drgs.capturing import plan
 from drgs.capturing.pace import Pacer
 from drgs.capturing.record import CaptureRecord
+from drgs.commands import capture
 from drgs.commands.capture import capture_photographs, run
 from drgs.commands.making_options import Capture
 from drgs.data import load
@@ -253,6 +254,22 @@ def test_further_photographs_end_with_the_same_bits(joined, captured, tmp_path):
     fit(load(folder / "capture/scene"), tmp_path / "run", config, progress=False, begin=Run(captured).state)
     found, wanted = (load_state(Run(x).state)[0] for x in (folder, tmp_path / "run"))
     assert all(torch.equal(x, wanted[name]) for name, x in found.items())
+
+
+def test_many_that_join_are_fitted_anew(captured, photographs, tmp_path, monkeypatch, capsys):
+    """With all steps, from points, and a line says so; the checkpoint of before does not stay behind."""
+    monkeypatch.setattr(capture, "_ANEW", 0.3)
+    folder = tmp_path / "run"
+    shutil.copytree(captured, folder, symlinks=True)
+    run(Capture(output=folder, paths=(photographs / "more",), add=True))
+    assert "fit: from the beginning, 2 photographs to fit to have joined 5" in capsys.readouterr().out
+    config = Run(folder).config()
+    assert "begin" not in config
+    assert "COLMAP" in config["points"]
+    assert json.loads((folder / "metrics.json").read_text())["step"] == STEPS
+    assert config["fit"]["density"]["max_gaussians"] == 560
+    assert config["test"] == ["IMG_0"]
+    assert not (folder / "capture/before.safetensors").exists()
 
 
 def test_new_places_get_points(captured, tmp_path):

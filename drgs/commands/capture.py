@@ -58,6 +58,7 @@ __all__ = ["capture_photographs", "run"]
 _PHOTOS, _SCENE = "photos", "scene"
 _BEFORE = "before.safetensors"  # checkpoint that a fit to further photographs goes on from
 _SHARE_OF_STEPS = 0.5  # of those of the fit before, that further photographs get without a budget
+_ANEW = 0.5  # of the photographs before: where more join, the fit begins anew (benchmarks/batches.py)
 _FEWEST = 3  # photographs that a scene needs; two may have poses, but nothing is left to be held out
 
 
@@ -422,10 +423,11 @@ class _Capture:
     def _fit(self) -> Outcome:
         """Gaussians: new ones, or, of photographs that join others, those that there are and more."""
         config = self.config
-        begin = None
+        before = begin = None
         if self.is_added:
-            begin = self._make_room()
-            config = self._further_config()
+            before = self._make_room()
+            config, goes_on = self._further_config()
+            begin = before if goes_on else None
         resume = is_run(self.args.output)
         if resume:
             config = _config_of(self.run_folder)
@@ -453,9 +455,9 @@ class _Capture:
         earlier = self.record.batches[-2].result if self.is_added else {}
         if quality and earlier.get("psnr") is not None and earlier.get("max_pixels") == size:
             quality += f", {earlier['psnr']:.2f} dB before"
-        if begin is not None:
+        if before is not None:
             with claim(self.folder, "capture") as held:
-                held.remove(begin)
+                held.remove(before)
         steps = result.metrics["step"]
         line = f"{len(result.gaussians)} Gaussians after {steps} steps{quality}"
         record = fit_record(result.run)
@@ -483,18 +485,26 @@ class _Capture:
             self._hand_over("cleared")
         return kept
 
-    def _further_config(self) -> FitConfig:
-        """That of the fit before, with more Gaussians where there are more photographs."""
+    def _further_config(self) -> tuple[FitConfig, bool]:
+        """That of the fit before, with more Gaussians where there are more photographs; and whether the fit goes on.
+
+        Where many join, it begins anew: what was fitted to too few photographs is in the wrong places.
+        """
         told = self.batch.plan["before"]
         before = recorded_config(told["config"])
         views = load_dataset(self.folder / _SCENE, before, lazy=True, points=False, semantics=False)
         train, _ = views.split(before.data.test_every, before.data.test_offset, before.data.test_cameras)
         most = round(before.density.max_gaussians * max(1.0, len(train) / told["views"]))
-        return before.replace(
-            max_steps=max(1, round(_SHARE_OF_STEPS * before.max_steps)),
+        joined = len(train) - told["views"]
+        goes_on = joined <= _ANEW * told["views"]
+        if not goes_on:
+            self._say(f"fit: from the beginning, {joined} photographs to fit to have joined {told['views']}")
+        config = before.replace(
+            max_steps=max(1, round(_SHARE_OF_STEPS * before.max_steps)) if goes_on else before.max_steps,
             seed=self.args.seed,
             density=dataclasses.replace(before.density, max_gaussians=most),
         )
+        return config, goes_on
 
     def _hand_over(self, state: str) -> None:
         self.batch.handover = state
