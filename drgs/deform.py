@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from drgs.dynamics.hexplane import HexPlane, features
+from drgs.dynamics.lives import LIVES, Lives, drift, living, logit_at
 from drgs.ellipsoids import Gaussians
 from drgs.guards.arguments import ArgumentError, must_be
 
@@ -220,9 +221,16 @@ class DynamicGaussians:
         gaussians: The canonical ones.
         field: What moves them.
         motion: (N,) logit of the gate; None: all move as the field says.
+        lives: Times at which each is there, and how it drifts; None: all are there all the time.
     """
 
-    def __init__(self, gaussians: Gaussians, field: DeformationField, motion: torch.Tensor | None = None) -> None:
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        field: DeformationField,
+        motion: torch.Tensor | None = None,
+        lives: Lives | None = None,
+    ) -> None:
         must_be("DynamicGaussians", "gaussians", gaussians, Gaussians, "the canonical ones")
         must_be(
             "DynamicGaussians", "field", field, DeformationField, "DeformationField(config, bounds, span) makes one"
@@ -237,6 +245,7 @@ class DynamicGaussians:
         self.gaussians = gaussians
         self.field = field
         self.motion = motion
+        self.lives = lives
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -248,9 +257,24 @@ class DynamicGaussians:
             return torch.ones(len(self), dtype=torch.bool, device=self.gaussians.means.device)
         return self.motion.detach() >= 0  # who moves has no derivative
 
+    @property
+    def living(self) -> torch.Tensor:
+        """(N,) bool, which Gaussians are there for a time alone."""
+        if self.lives is None:
+            return torch.zeros(len(self), dtype=torch.bool, device=self.gaussians.means.device)
+        first, last = (float(x) for x in self.field.grid.span)
+        return living(self.lives.log_widths, last - first)
+
+    def without_lives(self) -> DynamicGaussians:
+        """The same, all of them there all the time, where they are at their birth."""
+        return DynamicGaussians(self.gaussians, self.field, self.motion)
+
     def parameters(self) -> dict[str, torch.Tensor]:
-        """Raw parameters of the Gaussians, `motion` if there is one, and the field's: `phi.grid.*`, `phi.mlp.*`."""
+        """Raw parameters of the Gaussians, `motion` if there is one, those of `lives`, and the field's: `phi.grid.*`,
+        `phi.mlp.*`.
+        """
         gate = {} if self.motion is None else {"motion": self.motion}
+        gate |= {} if self.lives is None else dict(zip(LIVES, self.lives, strict=False))
         return self.gaussians.parameters() | gate | {PHI + name: x for name, x in self.field.named_parameters()}
 
     def at(self, time: float | torch.Tensor | None) -> Gaussians:
@@ -277,6 +301,8 @@ class DynamicGaussians:
         fields = dict(parameters)
         phi = {name.removeprefix(PHI): fields.pop(name) for name in parameters if name.startswith(PHI)}
         motion = fields.pop("motion", None)
+        lives = None if self.lives is None else Lives.of(fields, self.lives.births)
+        fields = {name: x for name, x in fields.items() if name not in LIVES}
         means = fields["means"]
         index = None
         if motion is not None:
@@ -290,7 +316,17 @@ class DynamicGaussians:
             else:
                 factor = (0.5 * motion[index]).tanh()  # 2 sigmoid(m) - 1
                 fields[name] = fields[name].index_add(0, index, delta * factor.to(delta.dtype)[:, None])
+        if lives is not None:
+            self._live(fields, lives, time)
         return self.gaussians.replace(**fields)
+
+    def _live(self, fields: dict[str, torch.Tensor], lives: Lives, time: float | torch.Tensor) -> None:
+        """Put those that are there for a time where they are at a time, as opaque as they are then."""
+        index = self.living.nonzero()[:, 0]
+        mortal = lives.take(index)
+        fields["means"] = fields["means"].index_add(0, index, drift(mortal, time).to(fields["means"].dtype))
+        logits = fields["logit_opacities"]
+        fields["logit_opacities"] = logits.index_copy(0, index, logit_at(logits[index], mortal, time))
 
 
 def is_finite(x: torch.Tensor) -> bool:

@@ -154,4 +154,5 @@ def _segmentation(loaded: LoadedRun, dataset: Dataset, frames: list[Frame]) -> S
 
 def _who_moves(scene: DynamicGaussians) -> dict:
     moving = int(scene.moving.sum())
-    return {"moving": moving, "share": moving / max(len(scene), 1)}
+    told = {"moving": moving, "share": moving / max(len(scene), 1)}
+    return told | ({} if scene.lives is None else {"living": int(scene.living.sum())})

@@ -281,7 +281,7 @@ def test_closed_gates_open_again():
 
 def test_claims_of_a_header_are_not_believed(dataset, tmp_path):
     """Sizes of a field that its tensors do not have are refused before anything of that size is made."""
-    run = fit(dataset, tmp_path / "run", config(max_steps=6), progress=False).run
+    run = fit(dataset, tmp_path / "run", config(max_steps=6, lives="off"), progress=False).run
     tensors, header = load_state(run.state)
     run.point_cloud.unlink()
     for key, value in (
@@ -302,7 +302,7 @@ def test_claims_of_a_header_are_not_believed(dataset, tmp_path):
 
 def test_depth_of_older_files(dataset, tmp_path):
     """A checkpoint whose header counts one layer as a depth of 0 loads as the same network, without a warning."""
-    run = fit(dataset, tmp_path / "run", config(max_steps=6), progress=False).run
+    run = fit(dataset, tmp_path / "run", config(max_steps=6, lives="off"), progress=False).run
     tensors, header = load_state(run.state)
     assert header["field"]["depth"] == 1
     new = load_run(run).scene.parameters()
@@ -331,7 +331,7 @@ def run(dataset, tmp_path_factory):
     """A finished run whose gates are open for five Gaussians, with a field that has learned something."""
     with pytest.MonkeyPatch.context() as patch:
         _small_field.__wrapped__(patch)
-        run = fit(dataset, tmp_path_factory.mktemp("run") / "run", config(max_steps=6), progress=False).run
+        run = fit(dataset, tmp_path_factory.mktemp("run") / "run", config(max_steps=6, lives="off"), progress=False).run
     tensors, header = load_state(run.state)
     tensors["parameter.motion"] = torch.where(torch.arange(len(tensors["parameter.motion"])) < 5, 2.0, -2.0)
     tensors["deformation.mlp.parameter.means.3.bias"] += 0.2
@@ -483,6 +483,6 @@ def test_who_moves_is_learned(tmp_path, way):
         assert moved["moving"] <= 1
         return
     assert int(front.sum()) > 0
-    assert bool(scene.moving[front].all())
+    assert bool((scene.moving | scene.living)[front].all())
     assert moved["moving"] <= 6
     assert result.metrics["views"][2]["psnr"] > 24

@@ -55,7 +55,7 @@ class Capture(Common):
     resume: bool = False
     """Go on where an earlier command was stopped: with the same options, and the same files or none."""
     add: bool = False
-    """Further photographs of what RUN shows: they join its data set; the fit goes on, or begins anew where many join."""
+    """Further photographs of what RUN shows: they join its data set, and the fit goes on (or, of many, anew)."""
     more: bool = False
     """Say which photographs to take next: where to stand, where to look, and what that is worth."""
     k: Annotated[int, arg(aliases=["-k"])] = 5

@@ -91,7 +91,8 @@ def shared_of(args: Share) -> Shared:
     if not len(given.gaussians):
         raise ValueError(f"{args.scene}: there must be at least one Gaussian, got none; fit longer, or name another")
     times = _times(given, args.moments)
-    gaussians = given.gaussians if given.moving is None else given.moving.at(times[0])
+    # The page itself says when what is there for a time is there.
+    gaussians = given.gaussians if given.moving is None else given.moving.without_lives().at(times[0])
     gaussians = gaussians.replace(features=None).detach()
     cameras = _cameras(args, given)
     fitted = [camera for kind, camera in cameras if kind == "fitted"]

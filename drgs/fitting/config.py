@@ -12,6 +12,8 @@ import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+from drgs.fitting.motion_config import Dynamics, FieldPreset, LivesUse, MotionConfig
+from drgs.fitting.ranges import COUNT, FADING, FRACTION, OPACITY, RATE, WEIGHT
 from drgs.fitting.renderers import AUTO, check_renderers, named_renderers, planar_of
 from drgs.guards.arguments import check_fields
 from drgs.guards.records import Record, first_difference, ways_of
@@ -36,6 +38,7 @@ __all__ = [
     "Filter3DUse",
     "FitConfig",
     "InitPoints",
+    "LivesUse",
     "LossConfig",
     "MaskUse",
     "MotionConfig",
@@ -69,16 +72,8 @@ TransientUse = Literal["auto", "mask", "keep"]
 Degree = Literal[0, 1, 2, 3]
 SemanticUse = Literal["auto", "ignore"]
 FeatureSize = Literal["image", "teacher"]
-Dynamics = Literal["auto", "ignore"]
-FieldPreset = Literal["neu3d", "dnerf"]
 
 _FAST = RenderSettings.preset("fast")
-_COUNT = (1, 10**9)
-_SHARE = (0.0, 1.0)
-_RATE = (0.0, 1e6)
-_FADING = (1e-30, 1e6)  # of rates whose logarithms are interpolated
-_WEIGHT = (0.0, 1e6)
-_OPACITY = (1e-6, 1 - 1e-6)  # its logit is finite in float32
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -133,7 +128,7 @@ class DataConfig(Record):
 
     def __post_init__(self) -> None:
         low = {"test_every": (0, 10**9), "test_offset": (0, 10**9)}
-        check_fields("fit", self, {"max_pixels": _COUNT, "num_downscales": (0, 16), "times": (1, 10**6), **low})
+        check_fields("fit", self, {"max_pixels": COUNT, "num_downscales": (0, 16), "times": (1, 10**6), **low})
         if self.test_every == 1:
             raise ValueError("fit: test_every must be 0 (hold out none) or >= 2, got 1")
         if self.test_offset >= max(self.test_every, 1):
@@ -184,14 +179,14 @@ class DensityConfig(Record):
     def __post_init__(self) -> None:
         shares = ("refine_start", "refine_stop", "refine_every", "min_opacity", "grow_until")
         ranges = {
-            "max_gaussians": _COUNT,
-            "initial_opacity": _OPACITY,
-            "dense_opacity": _OPACITY,
+            "max_gaussians": COUNT,
+            "initial_opacity": OPACITY,
+            "dense_opacity": OPACITY,
             "dense_scale": (1e-6, 1e6),
-            "noise": _WEIGHT,
+            "noise": WEIGHT,
             "jitter": (0.0, 1e3),
         }
-        check_fields("fit", self, ranges | dict.fromkeys(shares, _SHARE))
+        check_fields("fit", self, ranges | dict.fromkeys(shares, FRACTION))
 
     def start_of(self, dense: bool) -> tuple[float, float]:
         """Opacity, and factor of the scales, of new Gaussians; `dense` for points from depth maps."""
@@ -226,7 +221,7 @@ class RateConfig(Record):
 
     def __post_init__(self) -> None:
         single = ("dc_rate", "rest_rate", "opacity_rate", "scale_rate", "rotation_rate")
-        check_fields("fit", self, {"means_rate": _FADING, "sh_every": _SHARE, **dict.fromkeys(single, _RATE)})
+        check_fields("fit", self, {"means_rate": FADING, "sh_every": FRACTION, **dict.fromkeys(single, RATE)})
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -252,7 +247,7 @@ class LossConfig(Record):
 
     def __post_init__(self) -> None:
         weights = ("outside_weight", "opacity_weight", "scale_weight")
-        check_fields("fit", self, {"ssim_weight": _SHARE, **dict.fromkeys(weights, _WEIGHT)})
+        check_fields("fit", self, {"ssim_weight": FRACTION, **dict.fromkeys(weights, WEIGHT)})
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -286,61 +281,8 @@ class FeatureConfig(Record):
     where: ClassVar[str] = "fit"
 
     def __post_init__(self) -> None:
-        rates = {"feature_rate": _RATE, "decoder_rate": _RATE}
-        check_fields("fit", self, {"feature_width": (1, 4096), "feature_weight": _WEIGHT, **rates})
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class MotionConfig(Record):
-    """Gaussians that a deformation field moves [1], where the training views are of two times or more.
-
-    The static stage fits Gaussians that stand still to the first time of all training cameras (to all times, where
-    fewer than 3 photographs show the first). The dynamic stage goes on with them, and with their moments in the
-    optimizer, and adds the field. Rates and SH follow one schedule over both; those of the field begin with the dynamic
-    stage. Density control goes through its schedule in each stage: the static one up to half of `max_gaussians`, the
-    dynamic one up to all, so that there are some left for what appears later.
-
-    The field's rates are ten times those of [1], which are for 14,000 steps: in some hundred or thousand, motion must
-    be found before what is in the wrong place has become transparent. A gate is a logit a Gaussian; what no photograph
-    shows to move comes to a rest by their weight, and is not deformed.
-
-    Attributes:
-        dynamics: Fit a deformation field where the views have several times (auto), or static Gaussians to all times
-            (ignore).
-        static_share: Fraction of the steps that fit static Gaussians to the first time, before the deformation field is
-            added; 0 leaves them out.
-        field_preset: Size of the deformation field: for videos of several cameras (neu3d), or one camera around an
-            object (dnerf).
-        grid_rate: First and last learning rate of the field's planes.
-        field_rate: First and last learning rate of the field's MLP.
-        motion_rate: Learning rate of the gates (a logit each Gaussian: does it move?), times the steps of the dynamic
-            stage.
-        motion_weight: Weight in the loss of the mean of all gates: the larger, the fewer Gaussians move.
-        smooth_weight: Weight of the field's smoothness along time.
-        plane_weight: Weight of the smoothness of the field's planes of space (x and y, x and z, y and z).
-        l1_time_weight: Weight of the L1 distance of the field's planes of time from 1, at which they change nothing.
-    Reference:
-        [1] Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", CVPR 2024, and its code.
-    """
-
-    dynamics: Dynamics = "auto"
-    static_share: float = 3 / 17
-    field_preset: FieldPreset = "neu3d"
-    grid_rate: tuple[float, float] = (1.6e-2, 1.6e-3)
-    field_rate: tuple[float, float] = (1.6e-3, 1.6e-4)
-    motion_rate: float = 120.0
-    motion_weight: float = 0.03
-    smooth_weight: float = 1e-3
-    plane_weight: float = 2e-4
-    l1_time_weight: float = 1e-4
-    where: ClassVar[str] = "fit"
-
-    def __post_init__(self) -> None:
-        weights = ("motion_weight", "smooth_weight", "plane_weight", "l1_time_weight")
-        rates = {"grid_rate": _FADING, "field_rate": _FADING, "motion_rate": _RATE}
-        check_fields("fit", self, {"static_share": _SHARE, **rates, **dict.fromkeys(weights, _WEIGHT)})
-        if self.static_share == 1:
-            raise ValueError("fit: static_share must be below 1, got 1; --dynamics ignore fits no motion at all")
+        rates = {"feature_rate": RATE, "decoder_rate": RATE}
+        check_fields("fit", self, {"feature_width": (1, 4096), "feature_weight": WEIGHT, **rates})
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -357,7 +299,7 @@ class SavingConfig(Record):
     where: ClassVar[str] = "fit"
 
     def __post_init__(self) -> None:
-        check_fields("fit", self, {"save_every": _COUNT, "save_minutes": (1e-3, 1e9)})
+        check_fields("fit", self, {"save_every": COUNT, "save_minutes": (1e-3, 1e9)})
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -413,7 +355,7 @@ class SelectionConfig(Record):
         check_named("active", POLICIES, self.policy)
         if self.add == 0:
             raise ValueError("active: add must be >= 1, got 0; without --views active all views are used")
-        check_fields("active", self, dict.fromkeys(("initial", "add", "every", "info_pixels", "measure"), _COUNT))
+        check_fields("active", self, dict.fromkeys(("initial", "add", "every", "info_pixels", "measure"), COUNT))
         if self.scoring.settings != Scoring.settings or self.scoring.semantics is not None:
             raise ValueError("active: scoring must leave settings and semantics to the fit, got others; drop them")
 
@@ -436,11 +378,14 @@ def recorded_config(fit: Any, active: Mapping[str, Any] | None = None) -> FitCon
     Args:
         fit: What `to_json` made, or all fields beside each other, as older versions wrote them.
         active: Those of the selection, which older versions wrote elsewhere. The first did not begin again after a
-            pick, and had no field that says so. Nor had they one for renderers: all steps had the same settings.
+            pick, and had no field that says so. Nor had they one for renderers, all steps had the same settings, nor
+            for lives, all Gaussians were always there.
     Raises:
         ValueError: If a field is unknown or out of range.
     """
     config = FitConfig.from_json(fit)
+    if "lives" not in fit.get("motion", fit):
+        config = config.replace(motion=dataclasses.replace(config.motion, lives="off"))
     if "renderers" not in fit:
         config = config.replace(renderers=(config.settings.nearest_preset()[0],))
     return config.replace(selection=selection_of_flat({"restart": "never", **active})) if active else config
@@ -513,7 +458,7 @@ class FitConfig(Record):
     where: ClassVar[str] = "fit"
 
     def __post_init__(self) -> None:
-        check_fields("fit", self, {"max_steps": _COUNT, "seed": (0, 2**31 - 1)})  # a seed is what COLMAP takes
+        check_fields("fit", self, {"max_steps": COUNT, "seed": (0, 2**31 - 1)})  # a seed is what COLMAP takes
         check_renderers(self.renderers, self.settings)
         if self.data.undistort == "off":
             _check_lenses(self)

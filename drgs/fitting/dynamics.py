@@ -24,13 +24,17 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 
 from drgs.deform import DeformationField, DynamicGaussians, FieldConfig
+from drgs.dynamics.lives import Lives, living
 from drgs.dynamics.regularizers import plane_smoothness, time_l1, time_smoothness
+from drgs.fitting.lives import Lasting, add_births, always, checked_lives, life_rates, lives_of
 from drgs.fitting.networks import Network
-from drgs.fitting.stages import Stage, first_time
+from drgs.fitting.parts import means_rate
+from drgs.fitting.stages import Stage, first_time, spacing
 from drgs.guards.json_files import check_json
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
+    from drgs.fitting.births import Births
     from drgs.fitting.config import FitConfig
     from drgs.fitting.frames import Frame
     from drgs.fitting.parts import Parts
@@ -45,6 +49,7 @@ FIELD = ("deformation.grid", "deformation.mlp")
 _STATIC_BUDGET = 0.5  # of the Gaussians there may be
 _WARM_UP = 0.2  # of the dynamic stage, in which all gates stay open: the field must have learned something
 _OPEN = 2.0  # logit of a gate at the start, which lets 0.76 of a motion through
+_SHUT = -2.0  # logit of the gate of one that is born for a time
 _CLOSED = -1.0  # logit below which a gate has no penalty: it must be able to come back
 _AGAIN = 0.6  # of the dynamic stage: when all gates open again, those of what stood still as at the start
 _LOOK = 0.05  # of the dynamic stage, in which they then stay open
@@ -52,6 +57,7 @@ _NOISE = 0.3  # epsilon of a gate's Adam, in weights of its penalty: below, a ga
 _FASTEST = 0.5  # change of a logit in a step
 _OUTSIDE = 0.005  # part of the Gaussians that may lie below the bounds of the field along an axis, and above
 _MARGIN = 0.1  # of the field's size
+_AFTER = 2.0  # times between photographs
 _REPEATS = 5  # of a measured time
 _ADVICE = "restore the file, or fit again in another folder"
 
@@ -120,9 +126,14 @@ class Motion:
         self._length = header["field_length"]
         return self._extended(rows, parts, torch.tensor([[0.0] * 3, [1.0] * 3]))
 
+    def give_birth(self, rows: GaussianRows, found: Births) -> None:
+        """Add Gaussians that are there for a time; they drift by themselves, and the field does not move them."""
+        add_births(rows, found, self.times, _SHUT, self.config.density.max_gaussians)
+
     def new_gates(self, count: int, rows: GaussianRows) -> dict[str, torch.Tensor]:
-        """Gates of Gaussians that are added from points."""
-        return {"motion": torch.full((count,), _OPEN)} if self.has_begun(rows) else {}
+        """Gates and lives of Gaussians that are added from points: they are always there."""
+        gates = {"motion": torch.full((count,), _OPEN)} if self.has_begun(rows) else {}
+        return gates | always(count, rows, self.times)
 
     def prepare(self, rows: GaussianRows, step: int) -> None:
         """Before a step of the dynamic stage: gates get the epsilon of their optimizer and, once, all open again."""
@@ -132,7 +143,20 @@ class Motion:
         group["eps"] = max(_NOISE * self.config.motion.motion_weight / max(len(rows), 1), 1e-15)
         if step == self._again:
             with torch.no_grad():  # leaves are changed in place
-                rows.overwrite(torch.arange(len(rows)), {"motion": gates.clamp(min=_OPEN)})
+                opened = gates.clamp(min=_OPEN)
+                lives = lives_of(rows.tensors)
+                if lives is not None:
+                    opened = torch.where(self._living(lives), gates, opened)
+                rows.overwrite(torch.arange(len(rows)), {"motion": opened})
+
+    def hold(self, rows: GaussianRows) -> None:
+        """After gradients are known: what is there for a time alone keeps one color in all directions.
+
+        The few photographs that see it would each have a color of their own, wherever it is.
+        """
+        lives, rest = lives_of(rows.tensors), rows.tensors["sh_rest"].grad
+        if lives is not None and rest is not None:
+            rest[self._living(lives)] = 0
 
     def is_held_open(self, step: int) -> bool:
         """Whether gates stay as they are in a step, without a penalty, for the field to learn what it can do."""
@@ -159,7 +183,7 @@ class Motion:
             progress: Called with the runs done and those there are.
         Returns:
             JSON-serializable: `moving`, `share`, `seconds` of deforming them and `seconds_all` of deforming all, a
-            step; None in the static stage.
+            step, and, where some were born, `living`, how many are there for a time alone; None in the static stage.
         """
         if self.field is None:
             return None
@@ -180,7 +204,13 @@ class Motion:
         seconds, everything = (sorted(spent)[_REPEATS // 2] for spent in took)
         moving = int(scenes[0].moving.sum())
         share = moving / max(len(rows), 1)
-        return {"moving": moving, "share": share, "seconds": seconds, "seconds_all": everything}
+        told = {"moving": moving, "share": share, "seconds": seconds, "seconds_all": everything}
+        lives = lives_of(rows.tensors)
+        return told | ({} if lives is None else {"living": int(self._living(lives).sum())})
+
+    def _living(self, lives: Lives) -> torch.Tensor:
+        """(N,) bool, which Gaussians are there for a time alone."""
+        return living(lives.log_widths, self.times[-1] - self.times[0])
 
     def _extended(self, rows: GaussianRows, parts: Parts, bounds: torch.Tensor) -> Parts:
         """The parts of the dynamic stage, around a new field."""
@@ -202,6 +232,9 @@ class Motion:
         terms = [*parts.terms, Smoothness(field, config)]
         if config.motion.motion_weight:
             terms.append(Rest(self, rows, config.motion.motion_weight))
+        if config.motion.lives == "auto":
+            terms.append(Lasting(rows, spacing(self.times), config.motion.life_weight))
+        after = _AFTER * spacing(self.times)
         steps = max(config.max_steps - self.first_step, 1)
         gates = min(config.motion.motion_rate / steps, _FASTEST)
         return dataclasses.replace(
@@ -210,9 +243,15 @@ class Motion:
             rates={
                 **parts.rates,
                 "motion": lambda part: 0.0 if self.is_held_open(round(part * config.max_steps)) else gates,
+                **life_rates(self.times),
+                # Some times after its birth they move a Gaussian as far as the rate of the means does.
+                "velocities": lambda part: means_rate(config, part) * self._length / after,
+                "accelerations": lambda part: means_rate(config, part) * self._length / after**2,
             },
             networks=[*parts.networks, *networks],
-            scene=lambda rows: DynamicGaussians(rows.gaussians(), field, rows.tensors["motion"]),
+            scene=lambda rows: DynamicGaussians(
+                rows.gaussians(), field, rows.tensors["motion"], lives_of(rows.tensors)
+            ),
         )
 
 
@@ -283,7 +322,7 @@ def moving_scene(
     gates = tensors.get("parameter.motion")
     if gates is None or tuple(gates.shape) != (len(gaussians),) or not bool(torch.isfinite(gates).all()):
         raise ValueError(f"{where}: motion must be {len(gaussians)} finite numbers, one a Gaussian; {_ADVICE}")
-    return DynamicGaussians(gaussians, field, gates)
+    return DynamicGaussians(gaussians, field, gates, checked_lives(tensors, len(gaussians), where))
 
 
 def _sizes(header: dict, networks: dict[str, dict], where: str) -> FieldConfig:

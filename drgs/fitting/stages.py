@@ -8,11 +8,13 @@ import dataclasses
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
+import numpy as np
+
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.data import Dataset
 
-__all__ = ["Stage", "first_time", "moving_labels", "times_of"]
+__all__ = ["Stage", "first_time", "moving_labels", "spacing", "times_of"]
 
 _FEWEST = 3  # photographs of one time that show the depth of things, with one to spare
 
@@ -71,6 +73,12 @@ def first_time(views: Sequence[_T]) -> list[_T]:
     first = min((t for view in views if (t := view.camera.time) is not None), default=None)
     found = [view for view in views if view.camera.time == first]
     return found if len(found) >= _FEWEST else list(views)
+
+
+def spacing(times: Sequence[float]) -> float:
+    """Median time between one photograph and the next of another time; 1 where there is one time."""
+    apart = np.diff(np.unique(times))
+    return float(np.median(apart)) if len(apart) else 1.0
 
 
 def moving_labels(dataset: Dataset) -> frozenset[int]:

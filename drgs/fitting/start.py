@@ -145,7 +145,15 @@ def start(
     _log.info("%d initial points: %s", len(points), source)
     if empty := [x for x in (frame.empty() for frame in frames) if x is not None]:
         share = float(sum(x.sum() for x in empty)) / sum(frame.pixels[..., 0].numel() for frame in frames)
-        _log.info("%.0f %% of the training pixels show nothing, by masks or alpha", 100 * share)
+        color = " ".join(f"{x:g}" for x in config.settings.background)
+        _log.info(
+            "%.0f %% of the training pixels show nothing, by masks or alpha: %s is behind them%s",
+            100 * share,
+            color,
+            ""
+            if any(config.settings.background) or all(frame.alpha is None for frame in frames)
+            else " (--background; readers of D-NeRF's and Blender's data sets take 1 1 1)",
+        )
     made = parts or parts_of(config, extent, channels)
     if room:
         with Bar("colors of the skybox"):

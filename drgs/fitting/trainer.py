@@ -231,6 +231,8 @@ class Trainer:
         for optimizer in optimizers:
             optimizer.zero_grad(set_to_none=True)
         loss.backward()
+        if self.motion is not None:
+            self.motion.hold(self.rows)
         with torch.no_grad():  # told, not optimized
             mse = self._mse(frame, out.rgb)
         if (bad := self._not_finite(loss)) is None:
@@ -429,8 +431,22 @@ class Trainer:
         self.parts = self.motion.begin(self.rows, self.parts, self.extent)
         self._check_parts()
         self._queue = self._queue[:0]
+        events = self._look_for_births() if self.config.motion.lives == "auto" else []
         self._start_count = len(self.rows)
-        return [{"event": "stage", "name": "dynamic", "gaussians": len(self.rows)}]
+        return [{"event": "stage", "name": "dynamic", "gaussians": len(self.rows)}, *events]
+
+    def _look_for_births(self) -> list[dict]:
+        """Add Gaussians where photographs of a time show what the scene does not."""
+        from drgs.fitting.births import find_births
+        from drgs.fitting.lives import MOST_BORN
+
+        assert self.motion is not None
+        most = round(MOST_BORN * self.config.density.max_gaussians) - self.reserved
+        if most <= 0:
+            return []
+        found = find_births(self.photographs(), self.scene(), self.config.settings, self.extent, most, self._generator)
+        self.motion.give_birth(self.rows, found)
+        return [{"event": "births", "found": len(found.points), "gaussians": len(self.rows)}]
 
     def _fitted_scene(self) -> Scene:
         """What a step renders and differentiates."""

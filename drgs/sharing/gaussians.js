@@ -90,12 +90,14 @@ export class Gaussians {
     this.mesh.updateGenerator();
   }
 
-  // Moves some of them: `places` are their indices, `poseOf(k, center, scales, quaternion)` says where the k-th is.
+  // Moves some of them: `places` are their indices, `poseOf(k, center, scales, quaternion)` says where the k-th is, and
+  // returns its opacity over that of the file.
   move(places, poseOf) {
+    this.opacities ??= Float32Array.from(places, (index) => this.splats.getSplat(index).opacity);
     places.forEach((index, k) => {
-      const { center, scales, quaternion, opacity, color } = this.splats.getSplat(index);
-      poseOf(k, center, scales, quaternion);
-      this.splats.setSplat(index, center, scales, quaternion, opacity, color);
+      const { center, scales, quaternion, color } = this.splats.getSplat(index);
+      const share = poseOf(k, center, scales, quaternion);
+      this.splats.setSplat(index, center, scales, quaternion, share * this.opacities[k], color);
     });
     this.upload();
   }

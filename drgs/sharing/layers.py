@@ -96,7 +96,7 @@ def uncertainty_layer(values: np.ndarray) -> tuple[dict[str, Any], bytes]:
 
 
 def moments_of(moving: DynamicGaussians, times: Sequence[float], rest: Gaussians, order: np.ndarray) -> tuple:
-    """Where the Gaussians that move are at each of some times, in 16 bits a number.
+    """Where the Gaussians that move are at each of some times, in 16 bits a number, and when they are there.
 
     Args:
         moving: The Gaussians and what moves them.
@@ -104,10 +104,14 @@ def moments_of(moving: DynamicGaussians, times: Sequence[float], rest: Gaussians
         rest: Those that the page's archive holds.
         order: (N,) the archive's order of them.
     Returns:
-        What a page is told of it; indices of what moves in the archive's order, uint32; and (T, 10, M) uint16 means,
-        log scales and quaternions (wxyz) of these, each within its own range.
+        What a page is told of it; indices of what moves in the archive's order, uint32; (T, 10, M) uint16 means, log
+        scales and quaternions (wxyz) of these, as if they were there all the time, each within its own range; and
+        (9, M) float32 center and width in time (0: always there), velocity, acceleration and time of birth, which a
+        page adds.
     """
     numbers = []
+    lives, living = moving.lives, moving.living.cpu().numpy()[order]
+    moving = moving.without_lives()
     with torch.no_grad(), Bar("moments", len(times)) as bar:  # values, to be written
         for time in times:
             numbers.append(_numbers(moving.at(time))[:, order])
@@ -119,14 +123,25 @@ def moments_of(moving: DynamicGaussians, times: Sequence[float], rest: Gaussians
     extent = np.ptp(still[:3], axis=1).max()
     scale = np.array([extent] * 3 + [1.0] * 7)[:, None]
     moves = ((np.ptp(found, axis=0) / scale).max(0) > _STILL) | ((np.abs(found[0] - still) / scale).max(0) > _STILL)
-    places = np.flatnonzero(moves)
+    places = np.flatnonzero(moves | living)
     found = found[:, :, places]
     low = found.min((0, 2)) if len(places) else np.zeros(10)
     high = found.max((0, 2)) if len(places) else np.zeros(10)
     span = np.where(high > low, high - low, 1.0)[:, None]
     codes = np.rint((found - low[:, None]) / span * 65535)
     known = {"times": [float(x) for x in times], "count": len(places), "low": low.tolist(), "high": high.tolist()}
-    return known, places.astype("<u4").tobytes(), codes.astype("<u2").tobytes()
+    there = np.zeros((9, len(places)))
+    if lives is not None:
+        columns = (
+            lives.centers,
+            lives.log_widths.exp(),
+            *lives.velocities.T,
+            *lives.accelerations.T,
+            lives.births,
+        )
+        values = np.stack([x.detach().double().cpu().numpy() for x in columns])[:, order][:, places]
+        there = np.where(living[places], values, 0.0)
+    return known, places.astype("<u4").tobytes(), codes.astype("<u2").tobytes(), there.astype("<f4").tobytes()
 
 
 def _numbers(g: Gaussians) -> np.ndarray:

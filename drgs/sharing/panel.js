@@ -130,10 +130,12 @@ function scaleOf({ low, high, text, colors }) {
   return element("div", {}, bar, ends);
 }
 
-// What moves, at the moments that the page has; between two of them on a straight line.
+// What moves, at the moments that the page has; between two of them on a straight line. What is there for a time alone
+// drifts besides, and comes and goes.
 async function moments({ times, count, low, high }, gaussians, bytesOfPart) {
   const places = new Uint32Array((await bytesOfPart("moving")).buffer);
   const codes = new Uint16Array((await bytesOfPart("moments")).buffer); // moment, number, Gaussian
+  const lives = new Float32Array((await bytesOfPart("lives")).buffer); // number, Gaussian
   const value = (moment, number, k) => {
     const code = codes[(moment * 10 + number) * count + k];
     return low[number] + ((high[number] - low[number]) * code) / 65535;
@@ -150,6 +152,14 @@ async function moments({ times, count, low, high }, gaussians, bytesOfPart) {
       center.set(at(0, k), at(1, k), at(2, k));
       scales.set(Math.exp(at(3, k)), Math.exp(at(4, k)), Math.exp(at(5, k)));
       quaternion.set(at(7, k), at(8, k), at(9, k), at(6, k)).normalize();
+      const [middle, width, x, y, z, ax, ay, az, birth] =
+        [0, 1, 2, 3, 4, 5, 6, 7, 8].map((number) => lives[number * count + k]);
+      if (width === 0) return 1; // always there
+      const ahead = time - birth;
+      center.x += ahead * (x + 0.5 * ahead * ax);
+      center.y += ahead * (y + 0.5 * ahead * ay);
+      center.z += ahead * (z + 0.5 * ahead * az);
+      return Math.exp(-0.5 * ((time - middle) / width) ** 2);
     });
   };
 }

@@ -102,7 +102,7 @@ def write_page(shared: Shared, path: str | os.PathLike) -> dict[str, int]:
         scene["classes"], labels = shared.classes
         parts["classes"] = labels[order].astype("<u2").tobytes()
     if shared.moving is not None:
-        scene["moments"], parts["moving"], parts["moments"] = moments_of(
+        scene["moments"], parts["moving"], parts["moments"], parts["lives"] = moments_of(
             shared.moving, shared.times, shared.gaussians, order
         )
     page, sizes = scene_html(shared.title, shared.lines, scene, parts, viewer)

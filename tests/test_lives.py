@@ -1,0 +1,339 @@
+"""Gaussians that are there for a time: what they look like at it, derivatives and information, and where a fit finds
+them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from scenes_random import camera, gaussians
+
+from drgs import fisher, reference
+from drgs.cameras import orbit
+from drgs.data import Dataset, View
+from drgs.deform import DeformationField, DynamicGaussians, FieldConfig
+from drgs.display.pictures import write_png
+from drgs.dynamics.lives import LIVES, Lives, living, logit_at
+from drgs.ellipsoids import Gaussians
+from drgs.files import load_state, save_state
+from drgs.fitting.births import find_births
+from drgs.fitting.config import recorded_config
+from drgs.fitting.frames import load_frames
+from drgs.fitting.records import load_run
+from drgs.fitting.stages import spacing
+from drgs.integrator import render, render_jvp
+from drgs.settings import RenderSettings
+from drgs.train import FitConfig, Trainer, fit
+
+FAST = RenderSettings.preset("fast", transmittance_min=1e-10)
+SMOOTH = RenderSettings(order="center", extent=8.0, transmittance_min=1e-10)
+SPAN = (0.0, 2.0)
+
+
+def field_of(g: Gaussians) -> DeformationField:
+    config = FieldConfig(channels=3, resolution=4, time_resolution=5, width=8, last_std=0.3)
+    means = g.means.detach().double()
+    return DeformationField(config, torch.stack([means.amin(0), means.amax(0)]), SPAN).to(g.means.dtype)
+
+
+def scene_of(g: Gaussians, generator: torch.Generator) -> DynamicGaussians:
+    """The last three of ten are always there; of the others some move by the field, too."""
+    rand = lambda *shape: torch.rand(*shape, generator=generator, dtype=g.means.dtype)  # noqa: E731
+    widths = (0.2 + 0.6 * rand(10)).log()
+    widths[7:] = math.log(30.0)
+    lives = Lives(2 * rand(10), widths, 0.4 * rand(10, 3) - 0.2, rand(10, 3) - 0.5, 2 * rand(10))
+    return DynamicGaussians(g, field_of(g), torch.linspace(-1, 2.5, 10).to(g.means.dtype), lives)
+
+
+@pytest.fixture
+def view(rng):
+    cam = dataclasses.replace(camera(rng, (18, 14)), time=0.7)
+    scene = scene_of(gaussians(rng, 10, 4).detach(), torch.Generator().manual_seed(1))
+    return scene, dataclasses.replace(cam, w2c=cam.w2c.detach())
+
+
+def plain(scene: DynamicGaussians, time: float | torch.Tensor) -> Gaussians:
+    """The Gaussians at a time once more, from the equations, in float64."""
+    base = DynamicGaussians(scene.gaussians, scene.field, scene.motion).at(time)
+    lives = scene.lives
+    there = torch.sigmoid(base.logit_opacities) * torch.exp(
+        -0.5 * ((time - lives.centers) / lives.log_widths.exp()) ** 2
+    )
+    ahead = (time - lives.births)[:, None]
+    ends = lives.log_widths.exp() < 10 * (SPAN[1] - SPAN[0])
+    return base.replace(
+        means=base.means
+        + torch.where(ends[:, None], lives.velocities * ahead + lives.accelerations * ahead**2 / 2, 0.0),
+        logit_opacities=torch.where(ends, torch.log(there / (1 - there)), base.logit_opacities),
+    )
+
+
+def double(scene: DynamicGaussians) -> DynamicGaussians:
+    g = scene.gaussians.replace(**{name: x.double() for name, x in scene.gaussians.parameters().items()})
+    field = DeformationField(scene.field.config, scene.field.grid.bounds, SPAN).double()
+    field.load_state_dict(scene.field.state_dict())
+    return DynamicGaussians(g, field, scene.motion.double(), Lives(*[x.double() for x in scene.lives]))
+
+
+def test_opacity_and_place_at_a_time(view):
+    """They are those of the equations; what is always there keeps its bits at all times."""
+    scene, _ = view
+    exact = double(scene)
+    for time in (0.0, 0.7, 2.0):
+        found, want = exact.at(time), plain(exact, time)
+        torch.testing.assert_close(found.means, want.means, rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(found.logit_opacities, want.logit_opacities, rtol=1e-9, atol=1e-9)
+        now, rest = scene.at(time), DynamicGaussians(scene.gaussians, scene.field, scene.motion).at(time)
+        for name, x in now.parameters().items():
+            assert torch.equal(x[7:], rest.parameters()[name][7:])
+    assert living(scene.lives.log_widths, 2.0).tolist() == [True] * 7 + [False] * 3
+
+
+@pytest.mark.parametrize("logit", [-90.0, -20.0, 0.0, 20.0, 80.0])
+@pytest.mark.parametrize("distance", [0.0, 1e-3, 1.0, 30.0, 1e4])
+def test_logits_at_the_extremes(logit, distance):
+    """However opaque, transparent or long ago, logit and derivatives are finite, and right where float64 tells."""
+    lives = Lives(torch.zeros(1), torch.zeros(1), torch.zeros(1, 3), torch.zeros(1, 3), torch.zeros(1))
+    x = torch.tensor([logit], requires_grad=True)
+    time = torch.tensor(distance, requires_grad=True)
+    found = logit_at(x, lives, time)
+    slopes = torch.autograd.grad(found.sum(), [x, time])
+    assert all(bool(torch.isfinite(part).all()) for part in (found, *slopes))
+    a = -np.logaddexp(0.0, -float(logit)) - 0.5 * float(distance) ** 2
+    want = a - np.log(-np.expm1(a))
+    # From a logit of 69 on nothing but the logit grows: 1 - opacity is below 1e-30.
+    assert float(found.detach()) == pytest.approx(min(want, 30 * math.log(10)), rel=1e-5, abs=1e-5)
+
+
+@pytest.mark.parametrize("preset", ["exact", "fast", "gsplat"])
+def test_forward_is_the_transpose_of_reverse(view, preset):
+    """Of every new parameter, through the bridge and through torch, in each renderer; none is 0."""
+    scene, cam = view
+    settings = RenderSettings.preset(preset)
+    draw = torch.Generator().manual_seed(2)
+    leaves = [x.clone().requires_grad_() for x in scene.lives[:4]]
+    live = DynamicGaussians(scene.gaussians, scene.field, scene.motion, Lives(*leaves, scene.lives.births))
+    image = render(live, cam, settings).rgb
+    cotangent = torch.randn(image.shape, generator=draw)
+    slopes = torch.autograd.grad(image, leaves, cotangent)
+    for name, slope in zip(LIVES, slopes, strict=True):
+        along = torch.randn(slope.shape, generator=draw)
+        pushed = float((render_jvp(scene, cam, {name: along}, settings).rgb * cotangent).sum())
+        size = float((slope.abs() * along.abs()).sum())
+        assert pushed == pytest.approx(float((slope * along).sum()), abs=2e-4 * size)
+        assert size > 0.01
+        assert not slope[7:].any()  # always there
+
+
+def test_derivatives_against_the_reference(view):
+    """Of an image in float64 from the equations, by every new parameter and by the time."""
+    scene, cam = view
+    exact = double(scene)
+    leaves = [x.clone().requires_grad_() for x in exact.lives[:4]]
+    time = torch.tensor(cam.time, dtype=torch.float64, requires_grad=True)
+    lives = Lives(*leaves, exact.lives.births)
+    image = reference.render(
+        plain(DynamicGaussians(exact.gaussians, exact.field, exact.motion, lives), time), cam, SMOOTH
+    )
+    draw = torch.Generator().manual_seed(3)
+    cotangent = torch.randn(image.rgb.shape, generator=draw, dtype=torch.float64)
+    want = torch.autograd.grad(image.rgb, [*leaves, time], cotangent)
+    own = [x.clone().requires_grad_() for x in scene.lives[:4]]
+    live = DynamicGaussians(scene.gaussians, scene.field, scene.motion, Lives(*own, scene.lives.births))
+    moment = torch.tensor(cam.time, requires_grad=True)
+    found = torch.autograd.grad(render(live.at(moment), cam, SMOOTH).rgb, [*own, moment], cotangent.float())
+    for slope, other in zip(found, want, strict=True):
+        torch.testing.assert_close(slope.double(), other, rtol=1e-3, atol=1e-4 * float(other.abs().max()))
+
+
+def test_information_of_lives(view):
+    """Exact columns are the squares of forward derivatives of single parameters; nothing is told of what is always
+    there."""
+    scene, cam = view
+    found = fisher.diagonal(scene, cam, FAST, "columns", groups=list(LIVES))
+    for name in LIVES:
+        x = scene.parameters()[name]
+        for index in (0, 3, 8):
+            along = torch.zeros_like(x)
+            along[(index, 1) if x.ndim == 2 else index] = 1
+            want = float(render_jvp(scene, cam, {name: along}, FAST).rgb.double().square().sum())
+            got = float(found[name][(index, 1) if x.ndim == 2 else index])
+            assert got == pytest.approx(want, rel=1e-3, abs=1e-9)
+        assert not found[name][7:].any()
+        assert float(found[name].max()) > 0
+
+
+# ------------------------------------------------------------------------------------------ a ball that flies
+
+TIMES = tuple(k / 11 for k in range(12))
+FLIGHT = 2.2  # way of the ball, whose diameter is 0.3: 0.7 of it from one time to the next, and 7 in all
+
+
+def room() -> Gaussians:
+    """A wall of large blobs."""
+    draw = torch.Generator().manual_seed(0)
+    x, y = torch.meshgrid(torch.linspace(-1.5, 1.5, 5), torch.linspace(-1.5, 1.5, 5), indexing="ij")
+    means = torch.stack([x.flatten(), y.flatten(), torch.full((25,), 0.6)], 1)
+    sh = (0.3 + 0.3 * torch.rand(25, 3, generator=draw) - 0.5) * math.sqrt(4 * math.pi)
+    return Gaussians.from_arrays(means, torch.eye(4)[[0] * 25], torch.full((25, 3), 0.4), torch.full((25,), 0.95), sh)
+
+
+def ball(time: float, way: float = FLIGHT) -> Gaussians:
+    """A ball before the wall, from left to right."""
+    mean = torch.tensor([[way * (time - 0.5), 0.3 * math.sin(3 * time) * min(way, 1.0), -0.4]])
+    sh = (torch.tensor([[1.0, 0.2, 0.1]]) - 0.5) * math.sqrt(4 * math.pi)
+    return Gaussians.from_arrays(mean, torch.eye(4)[[0]], torch.full((1, 3), 0.1), torch.tensor([0.95]), sh)
+
+
+def together(a: Gaussians, b: Gaussians) -> Gaussians:
+    return a.replace(**{name: torch.cat([x, b.parameters()[name]]) for name, x in a.parameters().items()})
+
+
+def filmed(folder, cameras_a_time: int, way: float = FLIGHT) -> Dataset:
+    """Six places in turn, or all at each time; the wall's points."""
+    folder.mkdir(parents=True)
+    around = orbit((0, 0, 0), 3.0, 24, width=32, height=32, up=(0, 0, -1), elevation=60.0)[::4]
+    views = []
+    for k, time in enumerate(TIMES):
+        for j in range(cameras_a_time):
+            name = f"r_{k:02d}_{j}"
+            place = (5 * k + j) % len(around)  # neighbors in time are apart in place
+            seen = dataclasses.replace(around[place], time=time, name=name)
+            picture = render(together(room(), ball(time, way)), seen, FAST).rgb
+            write_png(folder / f"{name}.png", picture.clamp(0, 1).numpy())
+            views.append(View(camera=seen, name=name, image_path=folder / f"{name}.png", split="train"))
+    wall = room()
+    colors = (0.5 + wall.sh[:, 0] / math.sqrt(4 * math.pi)).numpy()
+    return Dataset(folder, "transforms", views, wall.means.double().numpy(), colors, "made")
+
+
+@pytest.mark.parametrize(
+    ("cameras_a_time", "near"),
+    [(1, 0.15), (6, 0.15)],
+    ids=["one camera at a time", "six cameras"],
+)
+def test_births_are_where_the_ball_is(tmp_path, cameras_a_time, near):
+    """Residuals alone tell where it is at each time, to a part of its own size, and how fast it goes."""
+    dataset = filmed(tmp_path / "data", cameras_a_time)
+    frames = load_frames(dataset.views, 10**6)
+    found = find_births(frames, room(), FAST, 3.0, 500, torch.Generator().manual_seed(0))
+    assert len({round(float(t) * 11) for t in found.times}) >= 11  # of 12 times
+    away, speed = [], []
+    for point, time, velocity in zip(found.points, found.times, found.velocities, strict=True):
+        away.append(float((point - ball(float(time)).means[0]).norm()))
+        speed.append(float(velocity[0]))
+    assert float(np.median(away)) < near
+    assert float(np.quantile(away, 0.9)) < 0.3
+    if cameras_a_time == 1:  # with six of one time, one place agrees whatever the velocity
+        assert float(np.median(speed)) == pytest.approx(FLIGHT, rel=0.25)
+
+
+def test_at_five_diameters_a_frame(tmp_path):
+    """Nothing of it overlaps from one time to the next; cameras of the same time tell where it is."""
+    dataset = filmed(tmp_path / "data", 6, way=2.2 * 7.5)
+    visible = [view for view in dataset.views if abs(float(ball(view.camera.time, 16.5).means[0, 0])) < 1.2]
+    frames = load_frames(dataset.views, 10**6)
+    found = find_births(frames, room(), FAST, 3.0, 500, torch.Generator().manual_seed(0))
+    times = {view.camera.time for view in visible}
+    assert len(times) == 2  # it is in the pictures at two of twelve times: 1.5 apart, five of its diameters
+    assert times <= set(found.times.tolist())
+    for time in times:
+        points = found.points[found.times == time]
+        assert float((points - ball(time, 16.5).means[0]).norm(dim=1).median()) < 0.15
+
+
+def test_nothing_is_born_where_nothing_is_missing(tmp_path):
+    """Of a scene that shows what photographs do."""
+    frames = load_frames(filmed(tmp_path / "data", 2, way=0.0).views, 10**6)
+    still = together(room(), ball(0.5, 0.0))
+    found = find_births([frames[k] for k in (0, 1, 2)], still, FAST, 3.0, 500, torch.Generator().manual_seed(0))
+    assert not len(found.points)
+
+
+def config(**fields) -> FitConfig:
+    short = {"renderers": ("fast",), "max_steps": 240, "max_gaussians": 200, "sh_degree": 1, "save_every": 1000}
+    rates = {"means_rate": (1e-3, 1e-4), "dc_rate": 0.02, "static_share": 0.2, "initial_opacity": 0.8}
+    return FitConfig.of(**{**short, **rates, **fields})
+
+
+@pytest.fixture(autouse=True)
+def _small_field(monkeypatch):
+    """A field of some hundred numbers, whatever the preset."""
+    small = {"channels": 4, "resolution": 6, "time_resolution": 6, "levels": (1,), "width": 16}
+    monkeypatch.setattr(FieldConfig, "preset", classmethod(lambda cls, name, times=None: cls(**small)))
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    """One camera at each time."""
+    return filmed(tmp_path_factory.mktemp("flies") / "data", 1)
+
+
+def of_the_ball(scene, times=TIMES) -> float:
+    """Mean error of the pixels that show the ball, from a place that no photograph was taken from."""
+    between = orbit((0, 0, 0), 3.0, 24, width=32, height=32, up=(0, 0, -1), elevation=60.0)[2]
+    errors = []
+    for time in times[1:-1]:
+        seen = dataclasses.replace(between, time=time)
+        want = render(together(room(), ball(time)), seen, FAST).rgb
+        where = (want - render(room(), seen, FAST).rgb).abs().amax(2) > 0.1
+        errors.append(float((render(scene, seen, FAST).rgb - want)[where].abs().mean()))
+    return float(np.mean(errors))
+
+
+def test_a_fit_shows_what_flies(dataset, tmp_path):
+    """From where no photograph was taken, at a third of the error of a fit without lives; the run keeps them, and says
+    how many there are."""
+    found = {}
+    for lives in ("auto", "off"):
+        result = fit(dataset, tmp_path / lives, config(lives=lives), progress=False)
+        found[lives] = of_the_ball(load_run(result.run).scene)
+        assert ("living" in result.metrics["motion"]) == (lives == "auto")
+    assert found["auto"] < 0.33 * found["off"]  # measured: see the closing assertion
+    scene = load_run(fit(dataset, tmp_path / "short", config(max_steps=60), progress=False).run).scene
+    assert int(scene.living.sum()) > 0
+    assert not scene.gaussians.sh[scene.living][:, 1:].any()  # one color in all directions
+
+
+def test_a_fit_that_was_stopped_ends_with_the_same_bits(dataset, tmp_path):
+    """Lives are in the checkpoint; damaged ones are refused, with their name."""
+    how = config(max_steps=60, deterministic=True, save_every=30)
+    whole = fit(dataset, tmp_path / "whole", how, progress=False).run
+    step = Trainer.step
+    with pytest.MonkeyPatch.context() as patch:
+
+        def until(self):
+            if self.step_index == 40:
+                raise KeyboardInterrupt
+            return step(self)
+
+        patch.setattr(Trainer, "step", until)
+        with pytest.raises(KeyboardInterrupt):
+            fit(dataset, tmp_path / "parts", how, progress=False)
+    parts = fit(dataset, tmp_path / "parts", how, resume=True, progress=False).run
+    wanted, _ = load_state(whole.state)
+    found, header = load_state(parts.state)
+    assert {"parameter.births", *(f"parameter.{name}" for name in LIVES)} <= set(wanted)
+    assert all(torch.equal(x, wanted[name]) for name, x in found.items())
+    parts.point_cloud.unlink()  # else it would be shown instead
+    nan = torch.full_like(found["parameter.births"], math.nan)
+    for name, bad in (("velocities", torch.zeros(3, 3)), ("life_centers", nan)):
+        save_state(parts.state, found | {f"parameter.{name}": bad}, header)
+        with pytest.raises(ValueError, match=rf"state\.safetensors: \S*{name} must be"):
+            load_run(parts)
+
+
+def test_old_runs_have_none():
+    """A config that knows nothing of lives was of a fit without."""
+    record = FitConfig().to_json()
+    assert recorded_config(record).motion.lives == "auto"
+    del record["motion"]["lives"]
+    assert recorded_config(record).motion.lives == "off"
+
+
+def test_time_between_photographs():
+    assert spacing([0.0, 1.0, 1.0, 3.0, 4.0]) == 1.0
+    assert spacing([2.0, 2.0]) == 1.0
