@@ -65,6 +65,8 @@ def _shown(value: float | None, digits: str) -> str:
 def _motion_line(moved: dict, count: int) -> str:
     """Who moves and, after a fit, what it saves that the others do not."""
     line = f"{moved['moving']:,} of {count:,} Gaussians move ({moved['share']:.1%})"
+    if "living" in moved:
+        line += f", {moved['living']:,} are there for a time"
     if "seconds" not in moved:
         return line
     some, everything = (1000 * moved[key] for key in ("seconds", "seconds_all"))

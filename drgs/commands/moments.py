@@ -103,14 +103,16 @@ def write_plys(scene: Scene, cameras: list[Camera], folder: Path, moving: bool, 
         scene: What is drawn.
         cameras: Cameras whose times count.
         folder: Folder of the files, which are named as `ply_names` says.
-        moving: Whether only Gaussians that move are written.
+        moving: Whether only Gaussians that move, or are there for a time, are written.
         features: Whether they are written with their features, if they have any.
     Returns:
         JSON-serializable: file, time and number of Gaussians of each.
     Raises:
         ValueError: If only those that move are wanted, and none does.
     """
-    chosen = getattr(scene, "moving", None)
+    from drgs.deform import DynamicGaussians
+
+    chosen = scene.moving | scene.living if isinstance(scene, DynamicGaussians) else None
     if moving and (chosen is None or not bool(chosen.any())):
         raise ValueError("--moving must have a scene where something moves, nothing does here; drop it")
     names = ply_names(cameras)

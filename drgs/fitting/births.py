@@ -51,6 +51,10 @@ _LATER = 0.02  # how much other times then count, and a velocity against it: the
 _AGREE = 0.6  # of them that must agree
 _BEFORE = 0.98  # of a distance: what is rendered nearer stands before it
 _NOTHING = 1e9  # distance to where a ray ends in nothing
+_WINDOW = 8.0  # times between photographs, within which velocities and accelerations are made to agree
+_SPREAD = 0.025  # extents of the scene: how far apart places of one thing are
+_REACH = 0.05  # the same: what velocity and acceleration may be off by at the end of the window
+_TURNED = 0.25  # part of its way that a thing may be off its straight path
 _FAR = 0.95  # quantile of the distances to all Gaussians, beyond which nothing is looked for
 _FASTEST = 0.15  # extents of the scene in the time between two photographs
 
@@ -63,6 +67,7 @@ class Births(NamedTuple):
         colors: (M, 3) in [0, 1].
         times: (M,) times at which something is there.
         velocities: (M, 3) world units in a unit of time.
+        accelerations: (M, 3) what these change by in a unit of time.
         sizes: (M,) half of how far apart they are, world units.
         lasting: (M,) how well photographs of other times agree with where they are then, in [0, 1].
     """
@@ -71,6 +76,7 @@ class Births(NamedTuple):
     colors: torch.Tensor
     times: torch.Tensor
     velocities: torch.Tensor
+    accelerations: torch.Tensor
     sizes: torch.Tensor
     lasting: torch.Tensor
 
@@ -149,6 +155,7 @@ def find_births(
                     bar.advance()
     found = [_found(look) for look in looks]
     whole = Births(*[torch.cat(x) for x in zip(*found, strict=True)])
+    whole = _bent(whole, extent, step)
     count = len(whole.points)
     if count <= most:
         return whole
@@ -167,9 +174,44 @@ def _found(look: _Look) -> Births:
         colors=colors,
         times=torch.full((len(depth),), look.time, dtype=torch.float64),
         velocities=look.velocity[good],
+        accelerations=torch.zeros_like(look.velocity[good]),
         sizes=depth * (math.sqrt(pixels) / 2 / float(look.camera.K[0, 0])),
         lasting=look.lasting[good],
     )
+
+
+def _bent(found: Births, extent: float, step: float) -> Births:
+    """With the velocities and accelerations that places of times near theirs agree on.
+
+    Each place predicts where it is at those times. What is found there then, of its color, is a measurement of how far
+    the prediction is off: offset, velocity and acceleration are fitted to all of them, least squares with priors, and
+    the offset is dropped, for what is found is another place of the same thing.
+    """
+    velocities, accelerations = found.velocities.clone(), found.accelerations.clone()
+    times = found.times
+    late = _WINDOW * step
+    # Of an offset, and of what velocity and acceleration come to at the end of the window, over the noise of a place.
+    prior = torch.tensor([1.0, _REACH / _SPREAD, _REACH / _SPREAD]).square().reciprocal().diag()
+    for time in times.unique():
+        here = (times == time).nonzero()[:, 0]
+        there = ((times - time).abs() < late).nonzero()[:, 0]
+        part = ((times[there] - time) / late).float()
+        expected = found.points[here][:, None] + found.velocities[here][:, None] * (part * late)[None, :, None]
+        off = found.points[there][None] - expected
+        speed = found.velocities[here].norm(dim=1, keepdim=True)
+        same = off.norm(dim=2) < _SPREAD * extent * 2 + _TURNED * speed * (part * late).abs()
+        same &= torch.cdist(found.colors[here], found.colors[there]) < 2 * _COLOR
+        basis = torch.stack([torch.ones_like(part), part, part.square()], 1)
+        # A time counts once: its photographs show one side of a thing, all places of which are off alike.
+        each = torch.unique(times[there], return_inverse=True)[1]
+        counted = same.float() @ torch.nn.functional.one_hot(each).float()
+        weights = same / counted[:, each].clamp(min=1)
+        weighted = weights[..., None] * basis  # (here, there, 3)
+        normal = weighted.transpose(1, 2) @ basis + prior
+        solved = torch.linalg.solve(normal, weighted.transpose(1, 2) @ off)
+        velocities[here] += solved[:, 1] / late
+        accelerations[here] = 2 * solved[:, 2] / late**2
+    return found._replace(velocities=velocities, accelerations=accelerations)
 
 
 def _reduced(frame: Frame) -> torch.Tensor:

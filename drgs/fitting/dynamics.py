@@ -57,7 +57,7 @@ _NOISE = 0.3  # epsilon of a gate's Adam, in weights of its penalty: below, a ga
 _FASTEST = 0.5  # change of a logit in a step
 _OUTSIDE = 0.005  # part of the Gaussians that may lie below the bounds of the field along an axis, and above
 _MARGIN = 0.1  # of the field's size
-_AFTER = 2.0  # times between photographs
+_SOON, _LATE = 2.0, 8.0  # times between photographs
 _REPEATS = 5  # of a measured time
 _ADVICE = "restore the file, or fit again in another folder"
 
@@ -89,6 +89,17 @@ class Motion:
     def is_due(self, step: int) -> bool:
         """Whether the dynamic stage is to begin before a step."""
         return self.field is None and step >= self.first_step
+
+    def is_to_look(self, step: int, frames: list[Frame]) -> bool:
+        """Whether to look, before a step, for what photographs show and the scene does not.
+
+        Where the static stage was fitted to all times it shows nothing that moves, and this is at once. Where it shows
+        the first time, the field may carry what it shows to the others, and is given the time for it.
+        """
+        if self.config.motion.lives == "off":
+            return False
+        wait = 0.0 if len(first_time(frames)) == len(frames) else _WARM_UP
+        return step == self.first_step + round(wait * (self.config.max_steps - self.first_step))
 
     def stage(self) -> Stage:
         """Over which density control runs now."""
@@ -234,7 +245,7 @@ class Motion:
             terms.append(Rest(self, rows, config.motion.motion_weight))
         if config.motion.lives == "auto":
             terms.append(Lasting(rows, spacing(self.times), config.motion.life_weight))
-        after = _AFTER * spacing(self.times)
+        apart = spacing(self.times)
         steps = max(config.max_steps - self.first_step, 1)
         gates = min(config.motion.motion_rate / steps, _FASTEST)
         return dataclasses.replace(
@@ -244,9 +255,9 @@ class Motion:
                 **parts.rates,
                 "motion": lambda part: 0.0 if self.is_held_open(round(part * config.max_steps)) else gates,
                 **life_rates(self.times),
-                # Some times after its birth they move a Gaussian as far as the rate of the means does.
-                "velocities": lambda part: means_rate(config, part) * self._length / after,
-                "accelerations": lambda part: means_rate(config, part) * self._length / after**2,
+                # They move a Gaussian as far as the rate of the means does, one soon after its birth, the other late.
+                "velocities": lambda part: means_rate(config, part) * self._length / (_SOON * apart),
+                "accelerations": lambda part: means_rate(config, part) * self._length / (_LATE * apart) ** 2,
             },
             networks=[*parts.networks, *networks],
             scene=lambda rows: DynamicGaussians(

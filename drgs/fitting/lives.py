@@ -112,7 +112,7 @@ def add_births(rows: GaussianRows, found: Births, times: Sequence[float], gate: 
     new["log_scales"] = found.sizes.log()[:, None].repeat(1, 3)
     new["motion"] = torch.full((count,), gate)
     moments = found.times.float()
-    began = (moments, _widths(found, times).log().float(), found.velocities, torch.zeros(count, 3))
+    began = (moments, _widths(found, times).log().float(), found.velocities, found.accelerations)
     new |= dict(zip(LIVES, began, strict=True))
     new[BIRTHS] = moments
     for name, x in rows.tensors.items():  # features and view-dependent colors begin at 0

@@ -213,6 +213,8 @@ class Trainer:
         """
         config, rows, done = self.config, self.rows, self.step_index
         events = self._begin_motion() if self.motion is not None and self.motion.is_due(done) else []
+        if self.motion is not None and self.motion.is_to_look(done, self.frames):
+            events += self._look_for_births()
         events += self.resolution.events(done, self.frames)
         events += self._prepare(done)
         if self.transients.is_due(done, config.max_steps, len(self.frames)):
@@ -431,9 +433,8 @@ class Trainer:
         self.parts = self.motion.begin(self.rows, self.parts, self.extent)
         self._check_parts()
         self._queue = self._queue[:0]
-        events = self._look_for_births() if self.config.motion.lives == "auto" else []
         self._start_count = len(self.rows)
-        return [{"event": "stage", "name": "dynamic", "gaussians": len(self.rows)}, *events]
+        return [{"event": "stage", "name": "dynamic", "gaussians": len(self.rows)}]
 
     def _look_for_births(self) -> list[dict]:
         """Add Gaussians where photographs of a time show what the scene does not."""
