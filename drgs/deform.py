@@ -242,6 +242,8 @@ class DynamicGaussians:
                     f"DynamicGaussians: motion must be {len(gaussians)} floats, one a Gaussian, got {motion.dtype} of "
                     f"shape {tuple(motion.shape)}; pass None to let all move"
                 )
+        if lives is not None:
+            _check_lives(lives, len(gaussians))
         self.gaussians = gaussians
         self.field = field
         self.motion = motion
@@ -290,7 +292,10 @@ class DynamicGaussians:
         seen = self.deform(parameters, time)
         moved = seen.means, seen.quats, seen.log_scales
         with torch.no_grad():  # a check, which leaves no graph
-            if not all(is_finite(x) for x in (*moved, *(() if self.motion is None else (self.motion,)))):
+            checked = [*moved]
+            checked += [] if self.motion is None else [self.motion]
+            checked += [] if self.lives is None else [seen.logit_opacities, *self.lives]
+            if not all(is_finite(x) for x in checked):
                 _name_what_is_not_finite(parameters, dict(zip(Deltas._fields, moved, strict=True)))
         return seen
 
@@ -332,6 +337,18 @@ class DynamicGaussians:
 def is_finite(x: torch.Tensor) -> bool:
     """Whether all entries are: NaN passes through the reduction."""
     return x.numel() == 0 or all(math.isfinite(float(end)) for end in torch.aminmax(x))
+
+
+def _check_lives(lives: Lives, count: int) -> None:
+    """Raise ValueError unless they are of so many Gaussians."""
+    must_be("DynamicGaussians", "lives", lives, Lives, "a center, a width, ... a Gaussian")
+    for name, x in zip(Lives._fields, lives, strict=True):
+        shape = (count, 3) if name in ("velocities", "accelerations") else (count,)
+        if tuple(x.shape) != shape or not x.is_floating_point():
+            raise ArgumentError(
+                f"DynamicGaussians: lives.{name} must be floats of shape {shape}, got {x.dtype} of shape "
+                f"{tuple(x.shape)}; give each Gaussian its own"
+            )
 
 
 def _name_what_is_not_finite(parameters: dict[str, torch.Tensor], moved: dict[str, torch.Tensor]) -> None:

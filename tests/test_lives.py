@@ -166,6 +166,21 @@ def test_information_of_lives(view):
         assert float(found[name].max()) > 0
 
 
+def test_what_is_wrong_is_named(view):
+    """The tensor, what must hold and what was got."""
+    scene, cam = view
+    short = scene.lives._replace(velocities=torch.zeros(10))
+    with pytest.raises(ValueError, match=r"lives\.velocities must be floats of shape \(10, 3\), got torch\.float32 of"):
+        DynamicGaussians(scene.gaussians, scene.field, scene.motion, short)
+    for name in LIVES:
+        x = scene.parameters()[name].clone()
+        x[1] = math.nan
+        names = ("centers", "log_widths", "velocities", "accelerations")
+        damaged = scene.lives._replace(**{names[LIVES.index(name)]: x})
+        with pytest.raises(ValueError, match=rf"DynamicGaussians\.at: {name} must be finite, got nan at index \[1"):
+            render(DynamicGaussians(scene.gaussians, scene.field, scene.motion, damaged), cam, FAST)
+
+
 # ------------------------------------------------------------------------------------------ a ball that flies
 
 TIMES = tuple(k / 11 for k in range(12))
