@@ -93,7 +93,7 @@ def measured(scene: str, run: Path, ground: tuple[float, ...], pictures: Path | 
             {
                 "view": frame.name,
                 "psnr": psnr(image, truth),
-                "psnr_moving": psnr(image[mask], truth[mask]) if mask.any() else None,
+                "psnr_moving": psnr(image, truth, mask.float()) if mask.any() else None,
                 "overlap": float((found & mask).sum() / union.sum()) if mask.any() else None,
             }
         )

@@ -23,7 +23,7 @@ from drgs.fitting.births import find_births
 from drgs.fitting.config import recorded_config
 from drgs.fitting.frames import load_frames
 from drgs.fitting.records import load_run
-from drgs.fitting.stages import spacing
+from drgs.fitting.stages import shows_first_time, spacing
 from drgs.integrator import render, render_jvp
 from drgs.settings import RenderSettings
 from drgs.train import FitConfig, Trainer, fit
@@ -347,6 +347,14 @@ def test_old_runs_have_none():
     assert recorded_config(record).motion.lives == "auto"
     del record["motion"]["lives"]
     assert recorded_config(record).motion.lives == "off"
+
+
+def test_what_the_static_stage_shows(tmp_path):
+    """The first time where three photographs or more are of it, also when there are no others yet; else all times."""
+    one, six = (filmed(tmp_path / str(n), n).views for n in (1, 6))
+    assert not shows_first_time(one)
+    assert shows_first_time(six)
+    assert shows_first_time([view for view in six if view.camera.time == 0])
 
 
 def test_time_between_photographs():

@@ -39,7 +39,7 @@ __all__ = ["Births", "find_births"]
 _PIXELS = 10_000  # of the pictures that are compared
 _CLEAR = 0.08  # mean difference of colors of a pixel that shows something else
 _OFTEN = 4  # photographs from one place that tell what is seen from there at most times
-_SOLID = 0.5  # opacity below which a ray ends in nothing
+_SOLID = 0.5  # opacity below which a ray ends in nothing, and a mask below which a pixel does not count
 _SEEDS = 128  # pixels of a photograph whose depth is searched
 _SAME, _NEAR = 6, 8  # photographs of the same time, and of other times near it, that a pixel is compared with
 _TURNS = 8  # of the search
@@ -256,6 +256,8 @@ def _look(
     other = residual > _CLEAR
     if usual is not None:
         other &= avg_pool2d((image - usual).abs().mean(0)[None], 3, 1, 1)[0] > _CLEAR
+    if frame.mask is not None:
+        other &= interpolate(frame.mask[None, None], (height, width), mode="area")[0, 0] > _SOLID
     # What is thinner than three pixels is an edge that is not sharp yet.
     core = -max_pool2d(-other.float()[None], 3, 1, 1)
     other = (max_pool2d(core, 3, 1, 1)[0] > 0) & other

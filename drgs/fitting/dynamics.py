@@ -29,7 +29,7 @@ from drgs.dynamics.regularizers import plane_smoothness, time_l1, time_smoothnes
 from drgs.fitting.lives import Lasting, add_births, always, checked_lives, life_rates, lives_of
 from drgs.fitting.networks import Network
 from drgs.fitting.parts import means_rate
-from drgs.fitting.stages import Stage, first_time, spacing
+from drgs.fitting.stages import Stage, first_time, shows_first_time, spacing
 from drgs.guards.json_files import check_json
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ class Motion:
         """
         if self.config.motion.lives == "off":
             return False
-        wait = 0.0 if len(first_time(frames)) == len(frames) else _WARM_UP
+        wait = _WARM_UP if shows_first_time(frames) else 0.0
         return step == self.first_step + round(wait * (self.config.max_steps - self.first_step))
 
     def stage(self) -> Stage:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.data import Dataset
 
-__all__ = ["Stage", "first_time", "moving_labels", "spacing", "times_of"]
+__all__ = ["Stage", "first_time", "moving_labels", "shows_first_time", "spacing", "times_of"]
 
 _FEWEST = 3  # photographs of one time that show the depth of things, with one to spare
 
@@ -73,6 +73,11 @@ def first_time(views: Sequence[_T]) -> list[_T]:
     first = min((t for view in views if (t := view.camera.time) is not None), default=None)
     found = [view for view in views if view.camera.time == first]
     return found if len(found) >= _FEWEST else list(views)
+
+
+def shows_first_time(views: Sequence[_Seen]) -> bool:
+    """Whether `first_time` is of the first time alone."""
+    return len({view.camera.time for view in first_time(views)}) == 1
 
 
 def spacing(times: Sequence[float]) -> float:
