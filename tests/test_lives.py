@@ -207,8 +207,8 @@ def together(a: Gaussians, b: Gaussians) -> Gaussians:
     return a.replace(**{name: torch.cat([x, b.parameters()[name]]) for name, x in a.parameters().items()})
 
 
-def filmed(folder, cameras_a_time: int, way: float = FLIGHT) -> Dataset:
-    """Six places in turn, or all at each time; the wall's points."""
+def filmed(folder, cameras_a_time: int, way: float = FLIGHT, shown: tuple[float, float] = (0.0, 1.0)) -> Dataset:
+    """Six places in turn, or all at each time; the wall's points. The ball is there between two times."""
     folder.mkdir(parents=True)
     around = orbit((0, 0, 0), 3.0, 24, width=32, height=32, up=(0, 0, -1), elevation=60.0)[::4]
     views = []
@@ -217,7 +217,8 @@ def filmed(folder, cameras_a_time: int, way: float = FLIGHT) -> Dataset:
             name = f"r_{k:02d}_{j}"
             place = (5 * k + j) % len(around)  # neighbors in time are apart in place
             seen = dataclasses.replace(around[place], time=time, name=name)
-            picture = render(together(room(), ball(time, way)), seen, FAST).rgb
+            is_there = shown[0] <= time <= shown[1]
+            picture = render(together(room(), ball(time, way)) if is_there else room(), seen, FAST).rgb
             write_png(folder / f"{name}.png", picture.clamp(0, 1).numpy())
             views.append(View(camera=seen, name=name, image_path=folder / f"{name}.png", split="train"))
     wall = room()
@@ -311,6 +312,25 @@ def test_a_fit_shows_what_flies(dataset, tmp_path):
     scene = load_run(fit(dataset, tmp_path / "short", config(max_steps=60), progress=False).run).scene
     assert int(scene.living.sum()) > 0
     assert not scene.gaussians.sh[scene.living][:, 1:].any()  # one color in all directions
+
+
+def test_what_appears_and_vanishes(tmp_path):
+    """A lamp that is on for a third of the time is seen then, and not before or after; it comes and goes within two
+    times between photographs, for opacity is a bell in time.
+    """
+    dataset = filmed(tmp_path / "data", 6, way=0.0, shown=(0.35, 0.65))
+    scene = load_run(fit(dataset, tmp_path / "run", config(max_steps=600), progress=False).run).scene
+    between = orbit((0, 0, 0), 3.0, 24, width=32, height=32, up=(0, 0, -1), elevation=60.0)[2]
+    lit, dark = together(room(), ball(0.5, 0.0)), room()
+    where = (render(lit, between, FAST).rgb - render(dark, between, FAST).rgb).abs().amax(2) > 0.1
+    for time in TIMES:
+        if abs(abs(time - 0.5) - 0.15) < 2 / 11 and not 0.4 < time < 0.6:
+            continue  # it comes or goes
+        seen = dataclasses.replace(between, time=time)
+        image = render(scene, seen, FAST).rgb
+        away = [float((image - render(x, seen, FAST).rgb)[where].abs().mean()) for x in (lit, dark)]
+        is_on = 0.35 < time < 0.65
+        assert away[not is_on] < 0.4 * away[is_on], time  # measured: at most 0.2
 
 
 def test_a_fit_that_was_stopped_ends_with_the_same_bits(dataset, tmp_path):
