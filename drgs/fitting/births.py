@@ -43,7 +43,11 @@ _SOLID = 0.5  # opacity below which a ray ends in nothing, and a mask below whic
 _SEEDS = 128  # pixels of a photograph whose depth is searched
 _SAME, _NEAR = 6, 8  # photographs of the same time, and of other times near it, that a pixel is compared with
 _TURNS = 8  # of the search
-_TRIED = 24  # random depths and velocities of a pixel in each turn
+_TRIED, _CHANGED, _TAKEN = 24, 8, 5  # depths and velocities of a pixel in each turn: random, changed, of other pixels
+_NEAREST = 0.02  # of the way to what is rendered: the least depth
+_DECADES, _RESTING = 2.5, 0.3  # that random speeds span, and part of them that are 0
+_STEP = 0.25  # relative change of a depth in the second turn, and of a velocity; it halves with each
+_PROMISING = 0.3  # score from which on what a pixel has is tried by others
 _COLOR = 0.15  # standard deviation of a color of one thing in two photographs
 _FEWEST = 2  # photographs that must show the place
 _ENOUGH = 3  # photographs of the same time that tell a place without others
@@ -303,19 +307,19 @@ def _turn(
     end = look.distance[y, x].clamp(max=far)
     rand = lambda *shape: torch.rand(*shape, generator=generator)  # noqa: E731
     randn = lambda *shape: torch.randn(*shape, generator=generator)  # noqa: E731
-    depths = [end[:, None] * (0.02 + 0.98 * rand(seeds, _TRIED))]
-    speed = fastest * 10 ** (-2.5 * rand(seeds, _TRIED, 1)) * (rand(seeds, _TRIED, 1) > 0.3)
+    depths = [end[:, None] * (_NEAREST + (1 - _NEAREST) * rand(seeds, _TRIED))]
+    speed = fastest * 10 ** (-_DECADES * rand(seeds, _TRIED, 1)) * (rand(seeds, _TRIED, 1) > _RESTING)
     direction = torch.nn.functional.normalize(randn(seeds, _TRIED, 3), dim=-1)
     velocities = [speed * direction]
     if look.tried:
         depth, velocity = look.depth[:, None], look.velocity[:, None]
         depths.append(depth)
         velocities.append(velocity)
-        scale = 0.5 ** (turn - 1)
-        small = 0.2 * scale * randn(seeds, 8)
-        depths.append(depth * small.exp())
-        velocities.append(velocity + 0.3 * scale * fastest * randn(seeds, 8, 3) * rand(seeds, 8, 1) ** 3)
-        others = torch.randint(seeds, (seeds, 6), generator=generator)
+        scale = _STEP * 0.5 ** (turn - 1)
+        depths.append(depth * (scale * randn(seeds, _CHANGED)).exp())
+        # Most changes of a velocity are small ones.
+        velocities.append(velocity + scale * fastest * randn(seeds, _CHANGED, 3) * rand(seeds, _CHANGED, 1) ** 3)
+        others = torch.randint(seeds, (seeds, _TAKEN), generator=generator)
         depths.append(look.depth[others])
         velocities.append(look.velocity[others])
         taken = _taken_over(look, [looks[j] for j in near])
@@ -334,10 +338,10 @@ def _turn(
 
 
 def _taken_over(look: _Look, near: list[_Look]) -> tuple[torch.Tensor, torch.Tensor] | None:
-    """(S, 4) depths and (S, 4, 3) velocities that pixels of other photographs have, of those seen nearest to each."""
+    """(S, T) depths and (S, T, 3) velocities that pixels of other photographs have, of those seen nearest to each."""
     points, velocities = [], []
     for other in near:
-        good = other.score > 0.3
+        good = other.score > _PROMISING
         place = other.center + other.depth[:, None] * other.rays + other.velocity * (look.time - other.time)
         points.append(place[good])
         velocities.append(other.velocity[good])
@@ -348,7 +352,7 @@ def _taken_over(look: _Look, near: list[_Look]) -> tuple[torch.Tensor, torch.Ten
         return None
     place, speed, pixels = place[front], speed[front], torch.from_numpy(projected)[front]
     apart = torch.cdist(look.seeds.double() + 0.5, pixels)
-    nearest = apart.topk(min(4, len(place)), dim=1, largest=False).indices
+    nearest = apart.topk(min(_TAKEN, len(place)), dim=1, largest=False).indices
     return (place[nearest] - look.center).norm(dim=-1), speed[nearest]
 
 

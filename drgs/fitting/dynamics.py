@@ -6,6 +6,9 @@ open only if photographs need what it lets through. Once it is closed nothing is
 fifth of the stage gates stay open, as the field must learn what it can do; at three fifths all open again for a
 twentieth, so that what was closed before a field or a photograph could tell moves after all.
 
+What the field cannot bring to where it is at a time, for no Gaussian shows it or it goes too far at once, is
+born there for a time (births.py, lives.py).
+
 Adam alone moves a gate as far by a tiny gradient as by a large one. Here its epsilon is of the size of the penalty's
 own gradient: where photographs hardly tell whether a Gaussian moves, their noise does not decide about its gate.
 
