@@ -215,8 +215,9 @@ def test_mask_keeps_the_outside_empty(dataset, tmp_path):
     assert not any(f.is_object for f in load_frames(data.views, 100, "valid"))
 
 
-def test_alpha_keeps_what_is_transparent_empty(dataset, tmp_path):
-    """Where photographs are transparent nothing is fitted: mean opacity there < 0.1 (measured: 0.04).
+def test_alpha_keeps_what_is_transparent_empty(dataset, tmp_path, caplog):
+    """Where photographs are transparent nothing is fitted: mean opacity there < 0.1 (measured: 0.04). The fit says what
+    color is behind them.
 
     Black Gaussians before a black background are what colors alone do not forbid: with --mask ignore it is 0.84.
     """
@@ -230,7 +231,8 @@ def test_alpha_keeps_what_is_transparent_empty(dataset, tmp_path):
     opacity = {}
     for mask in ("auto", "ignore"):
         options = config(max_steps=120, mask=mask, initial_opacity=0.5, opacity_weight=0.0)
-        result = fit(data, tmp_path / mask, options, progress=False)
+        with caplog.at_level("INFO", "drgs"):
+            result = fit(data, tmp_path / mask, options, progress=False)
         frames = load_frames(data.split()[1], SIZE * SIZE)
         empty = [frame.empty() for frame in frames]
         shown = [drgs.render(result.gaussians, frame.camera, FAST).alpha for frame in frames]
@@ -239,6 +241,7 @@ def test_alpha_keeps_what_is_transparent_empty(dataset, tmp_path):
         )
         assert result.run.config()["masks"] == ["alpha" if mask == "auto" else "none"]
     assert opacity["auto"] < 0.1 < opacity["ignore"]
+    assert "by masks or alpha: 0 0 0 is behind them (--background; readers of D-NeRF's" in caplog.text
     np.testing.assert_array_equal(frames[0].target(), frames[0].image())  # all of it is compared
 
 
