@@ -52,9 +52,9 @@ from drgs.fitting.semantic_record import SemanticRecord, check_same_teacher
 from drgs.fitting.skybox import visible_share
 from drgs.fitting.stages import moving_labels
 from drgs.fitting.start import motion_of, start
+from drgs.fitting.telling import told
 from drgs.fitting.threads import fewer_torch_threads, one_thread
 from drgs.fitting.trainer import StepResult, Trainer
-from drgs.fitting.transients import line_of
 from drgs.guards import interrupts
 from drgs.guards.memory import is_out_of_memory
 from drgs.guards.outputs import claim
@@ -309,8 +309,8 @@ def _fit(
         **_skybox_summary(trainer),
         **({"transients": trainer.transients.summary(trainer.frames)} if trainer.transients.found else {}),
     )
-    told: dict[str, Any] = {"peak_memory": peak_memory(), **({"motion": moved} if moved else {})}
-    run.log("done", step=trainer.step_index, seconds=loop.seconds, mean=written["mean"], **told)
+    done: dict[str, Any] = {"peak_memory": peak_memory(), **({"motion": moved} if moved else {})}
+    run.log("done", step=trainer.step_index, seconds=loop.seconds, mean=written["mean"], **done)
     return FitResult(g, written, run, loop.seconds)
 
 
@@ -466,11 +466,8 @@ class _Loop:
                 step = trainer.step()
                 self.seconds += time.perf_counter() - began
                 done = trainer.step_index
-                for event in step.events:
-                    if event["event"] == "transients" and event["found"]:
-                        bar.note(f"step {done - 1}: {line_of(event)}")
-                    if event["event"] == "resolution":
-                        bar.note(f"step {done - 1}: photographs of {event['width']}x{event['height']}")
+                for line in told(step.events):
+                    bar.note(f"step {done - 1}: {line}")
                 self._log(step)
                 if step.psnr is not None:
                     self._psnr = 0.98 * (self._psnr or step.psnr) + 0.02 * step.psnr

@@ -29,6 +29,8 @@ from drgs.integrator import render
 from drgs.sizes import reduced_size
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from drgs.cameras import Camera
     from drgs.ellipsoids import Scene
     from drgs.fitting.frames import Frame
@@ -74,6 +76,7 @@ class Births(NamedTuple):
         accelerations: (M, 3) what these change by in a unit of time.
         sizes: (M,) half of how far apart they are, world units.
         lasting: (M,) how well photographs of other times agree with where they are then, in [0, 1].
+        photographs: How many photographs show one of them, of all that were found.
     """
 
     points: torch.Tensor
@@ -83,10 +86,17 @@ class Births(NamedTuple):
     accelerations: torch.Tensor
     sizes: torch.Tensor
     lasting: torch.Tensor
+    photographs: int
 
     def take(self, index: torch.Tensor) -> Births:
         """Some of them."""
-        return Births(*[x[index] for x in self])
+        return self._replace(**{name: getattr(self, name)[index] for name in self._fields[:-1]})
+
+    @classmethod
+    def together(cls, parts: Sequence[Births]) -> Births:
+        """All of them, at least one."""
+        tensors = {name: torch.cat([getattr(part, name) for part in parts]) for name in cls._fields[:-1]}
+        return parts[0]._replace(**tensors, photographs=sum(part.photographs for part in parts))
 
 
 @dataclasses.dataclass
@@ -157,9 +167,7 @@ def find_births(
                     _turn(turn, i, looks, near[i], far, fastest, generator)
                 if turn == _TURNS - 1:
                     bar.advance()
-    found = [_found(look) for look in looks]
-    whole = Births(*[torch.cat(x) for x in zip(*found, strict=True)])
-    whole = _bent(whole, extent, step)
+    whole = _bent(Births.together([_found(look) for look in looks]), extent, step)
     count = len(whole.points)
     if count <= most:
         return whole
@@ -181,6 +189,7 @@ def _found(look: _Look) -> Births:
         accelerations=torch.zeros_like(look.velocity[good]),
         sizes=depth * (math.sqrt(pixels) / 2 / float(look.camera.K[0, 0])),
         lasting=look.lasting[good],
+        photographs=int(good.any()),
     )
 
 

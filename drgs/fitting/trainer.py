@@ -447,7 +447,15 @@ class Trainer:
             return []
         found = find_births(self.photographs(), self.scene(), self.config.settings, self.extent, most, self._generator)
         self.motion.give_birth(self.rows, found)
-        return [{"event": "births", "found": len(found.points), "gaussians": len(self.rows)}]
+        return [
+            {
+                "event": "births",
+                "found": len(found.points),
+                "photographs": found.photographs,
+                "of": len(self.frames),
+                "gaussians": len(self.rows),
+            }
+        ]
 
     def _fitted_scene(self) -> Scene:
         """What a step renders and differentiates."""
