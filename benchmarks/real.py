@@ -43,9 +43,9 @@ FITS: dict[str, tuple[str, dict]] = {
     "bonsai": ("bonsai", BONSAI),
     "bonsai, rates of 3DGS": ("bonsai", {**BONSAI, **RATES_OF_3DGS}),
     "bonsai, 9,000 steps": ("bonsai", {**BONSAI, "max_gaussians": 120_000, "max_steps": 9_000}),
-    "bonsai, 30,000 steps": (
+    "bonsai, 27,000 steps": (
         "bonsai",
-        {**BONSAI, "max_gaussians": 200_000, "max_steps": 30_000, "num_downscales": 2, "renderers": ("fast",)},
+        {**BONSAI, "max_gaussians": 200_000, "max_steps": 27_000, "num_downscales": 2, "renderers": ("fast",)},
     ),
     "lego": ("lego", LEGO),
     "lego, for fast": ("lego", {**LEGO, "renderers": ("fast",)}),
