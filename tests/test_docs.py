@@ -244,8 +244,7 @@ def test_the_site_is_searched_from_files(site):
         page = browser.new_page(viewport={"width": 1300, "height": 900})
         page.goto((site / "index.html").as_uri())
         page.evaluate("document.querySelector('[data-md-toggle=search]').click()")
-        page.wait_for_timeout(500)  # it slides in
-        page.keyboard.type("crossval")
+        page.locator(".md-search__input").press_sequentially("crossval")  # once it has slid in
         page.wait_for_selector(".md-search-result__item a", state="attached")
         links = page.locator(".md-search-result__item a").evaluate_all("found => found.map(x => x.href)")
         browser.close()
