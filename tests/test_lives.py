@@ -269,6 +269,19 @@ def test_nothing_is_born_where_nothing_is_missing(tmp_path):
     assert not len(found.points)
 
 
+def test_exposure_is_nothing_that_moves(tmp_path):
+    """Photographs that are darker show nothing else where what is rendered is made as dark."""
+    frames = load_frames(filmed(tmp_path / "data", 6, way=0.0).views[:6], 10**6)
+    for frame in frames:
+        frame.pixels = 0.6 * frame.image()
+    still, found = together(room(), ball(0.5, 0.0)), []
+    for exposure in (None, lambda out, frame: dataclasses.replace(out, rgb=0.6 * out.rgb)):
+        draw = torch.Generator().manual_seed(0)
+        found.append(len(find_births(frames, still, FAST, 3.0, 500, draw, exposure).points))
+    assert found[0] > 0
+    assert found[1] == 0
+
+
 def config(**fields) -> FitConfig:
     short = {"renderers": ("fast",), "max_steps": 240, "max_gaussians": 200, "sh_degree": 1, "save_every": 1000}
     rates = {"means_rate": (1e-3, 1e-4), "dc_rate": 0.02, "static_share": 0.2, "initial_opacity": 0.8}

@@ -29,11 +29,12 @@ from drgs.integrator import render
 from drgs.sizes import reduced_size
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from drgs.cameras import Camera
     from drgs.ellipsoids import Scene
     from drgs.fitting.frames import Frame
+    from drgs.integrator import Output
     from drgs.settings import RenderSettings
 
 __all__ = ["Births", "find_births"]
@@ -136,7 +137,13 @@ class _Look:
 
 
 def find_births(
-    frames: list[Frame], scene: Scene, settings: RenderSettings, extent: float, most: int, generator: torch.Generator
+    frames: list[Frame],
+    scene: Scene,
+    settings: RenderSettings,
+    extent: float,
+    most: int,
+    generator: torch.Generator,
+    exposure: Callable[[Output, Frame], Output] | None = None,
 ) -> Births:
     """Look for what photographs show and the scene does not.
 
@@ -147,6 +154,7 @@ def find_births(
         extent: Extent of the scene, world units.
         most: How many places are returned at most, drawn at random from those that are found.
         generator: Generator of all random choices.
+        exposure: What a photograph shows of a rendering; None: the rendering.
     """
     means = scene.at(frames[0].camera.time).means.detach()  # how far things are is a constant
     places = torch.from_numpy(np.stack([frame.camera.center for frame in frames])).to(means)
@@ -155,7 +163,7 @@ def find_births(
     usual = _usual(frames)
     with Bar("looking for what moves", 2 * len(frames)) as bar:
         for frame, still in zip(frames, usual, strict=True):
-            looks.append(_look(frame, still, scene, settings, generator))
+            looks.append(_look(frame, still, scene, settings, generator, exposure))
             bar.advance()
         times = np.array([look.time for look in looks])
         step = spacing([look.time for look in looks])
@@ -250,13 +258,20 @@ def _usual(frames: list[Frame]) -> list[torch.Tensor | None]:
 
 
 def _look(
-    frame: Frame, usual: torch.Tensor | None, scene: Scene, settings: RenderSettings, generator: torch.Generator
+    frame: Frame,
+    usual: torch.Tensor | None,
+    scene: Scene,
+    settings: RenderSettings,
+    generator: torch.Generator,
+    exposure: Callable[[Output, Frame], Output] | None,
 ) -> _Look:
     """A photograph beside its rendering, and the pixels whose depth is to be searched."""
     width, height = reduced_size(frame.camera, _PIXELS)
     camera = frame.camera.resized(width, height)
     with torch.no_grad():  # looked at
         out = render(colors_only(scene, camera.time), camera, settings, outputs=("depth",))
+        if exposure is not None:
+            out = exposure(out, frame)
     rgb = out.rgb.cpu().clamp(0, 1).permute(2, 0, 1)
     image = _reduced(frame)
     assert out.depth is not None  # asked for

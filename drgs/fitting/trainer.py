@@ -445,7 +445,15 @@ class Trainer:
         most = round(MOST_BORN * self.config.density.max_gaussians) - self.reserved
         if most <= 0:
             return []
-        found = find_births(self.photographs(), self.scene(), self.config.settings, self.extent, most, self._generator)
+        found = find_births(
+            self.photographs(),
+            self.scene(),
+            self.config.settings,
+            self.extent,
+            most,
+            self._generator,
+            self.parts.exposure,
+        )
         self.motion.give_birth(self.rows, found)
         return [
             {
