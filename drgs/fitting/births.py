@@ -161,7 +161,7 @@ def find_births(
     far = float(torch.cdist(places, means).quantile(_FAR, dim=1).max())
     looks = []
     usual = _usual(frames)
-    with Bar("looking for what moves", 2 * len(frames)) as bar:
+    with Bar("looking for what moves", (1 + _TURNS) * len(frames)) as bar:
         for frame, still in zip(frames, usual, strict=True):
             looks.append(_look(frame, still, scene, settings, generator, exposure))
             bar.advance()
@@ -173,8 +173,7 @@ def find_births(
             for i, look in enumerate(looks):
                 if len(look.seeds):
                     _turn(turn, i, looks, near[i], far, fastest, generator)
-                if turn == _TURNS - 1:
-                    bar.advance()
+                bar.advance()
     whole = _bent(Births.together([_found(look) for look in looks]), extent, step)
     count = len(whole.points)
     if count <= most:
