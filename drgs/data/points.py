@@ -18,6 +18,7 @@ from drgs.data.guesses import (
     subset,
 )
 from drgs.data.guided import Matches, detect
+from drgs.data.hull import Hull
 from drgs.data.matching import nearby_pairs
 from drgs.data.views import View
 from drgs.display.progress import Bar
@@ -91,6 +92,10 @@ def initial_points(
             source = f"triangulated from {len(views)} given poses, {found} points"
             return points, colors, f"{source}; {len(points)} with guesses where there are none"
         tried = f" (triangulation gave {found})"
+        hull = Hull.of(views)
+        room = None if hull is None else hull.points(min(max_points, _MAX_RANDOM), rng)
+        if room is not None:
+            return *room, f"random where none of {len(views)} cameras sees the background, {len(room[0])} points{tried}"
     points, colors = points_anywhere(views, min(max_points, _MAX_RANDOM), rng)
     return points, colors, f"random where {len(views)} cameras look, {len(points)} points{tried}"
 
@@ -120,14 +125,20 @@ def triangulated_points(
     found = len(points)
     if found < _MIN_TRIANGULATED:
         return points[:0], colors[:0], found
+    hull = Hull.of(views)
+    if hull is not None:
+        # Two photographs agreed about what a third one says is not there.
+        there = ~hull.look(points)[1]
+        points, colors, shown = points[there], colors[there], shown[:, there]
     # What no two views show would stay empty: density control does not leave what there is. Guesses are as dense as
     # what is triangulated, at most as many, but together they are enough; and the budget is shared by area.
     share = empty_share(views, points, shown)
     # Where all is empty, the share of what is not is 0.
-    as_dense = found * min(1.0, share / max(1 - share, 1e-9))
-    guesses = round(min(max(_ENOUGH - found, as_dense), share * max_points))
-    keep = subset(found, max_points - guesses, rng)
-    more, more_colors = points_beside(views, points, shown, guesses, rng)
+    as_dense = len(points) * min(1.0, share / max(1 - share, 1e-9))
+    guesses = round(min(max(_ENOUGH - len(points), as_dense), share * max_points))
+    keep = subset(len(points), max_points - guesses, rng)
+    room = None if hull is None else hull.points(guesses, rng)
+    more, more_colors = room or points_beside(views, points, shown, guesses, rng)
     return np.concatenate([points[keep], more]), np.concatenate([colors[keep], more_colors]), found
 
 

@@ -1,0 +1,103 @@
+"""Initial points where photographs do not show the background: a ball before nothing, filmed from far away."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+from drgs.cameras import Camera, intrinsics, look_at
+from drgs.data import View, initial_points
+from drgs.data.hull import Hull
+
+RADIUS = 1.0
+DISTANCE = 60.0
+SIZE = 96
+
+
+def around(folder, count=6, behind=(0.0, 0.0, 0.0), ball=(0.6, 0.5, 0.4), away=0.0):
+    """Photographs of a ball, which spans half of each image, from a ring of cameras with long lenses.
+
+    `away` moves the ball to the side, by turns to the one and the other: then silhouettes meet nowhere.
+    """
+    focal = SIZE / 4 * DISTANCE / RADIUS
+    views = []
+    for index in range(count):
+        angle = 2 * np.pi * index / count
+        eye = DISTANCE * np.array([np.sin(angle), 0.2 * (-1) ** index, np.cos(angle)])
+        camera = Camera(intrinsics(focal, focal, SIZE / 2, SIZE / 2), look_at(eye, (0, 0, 0), (0, 1, 0)), SIZE, SIZE)
+        middle = np.array([SIZE / 2 + away * (-1) ** index, SIZE / 2 + away * (-1) ** index])
+        rows, columns = np.mgrid[:SIZE, :SIZE] + 0.5
+        inside = np.hypot(columns - middle[0], rows - middle[1]) < SIZE / 4
+        image = np.where(inside[..., None], np.asarray(ball), np.asarray(behind))
+        path = folder / f"{index}.png"
+        assert cv2.imwrite(str(path), np.round(image[..., ::-1] * 255).astype(np.uint8))
+        views.append(View(camera, f"{index}", image_path=path, background=behind))
+    return views
+
+
+@pytest.mark.parametrize("behind", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0)])
+def test_points_are_where_the_ball_is(tmp_path, behind):
+    """Six silhouettes, of cameras sixty radii away: rays are nearly parallel, and no pixel says how far away it is."""
+    points, colors, source = initial_points(around(tmp_path, behind=behind), max_points=3000)
+    assert source.startswith("random where none of 6 cameras sees the background, 3000 points")
+    # The hull of six silhouettes reaches a little beyond the ball, and all of the ball is in it.
+    far = np.linalg.norm(points, axis=1)
+    assert far.max() < 1.4 * RADIUS
+    assert (far < RADIUS).mean() > 0.8
+    assert np.abs(points.mean(axis=0)).max() < 0.1
+    np.testing.assert_allclose(colors, np.broadcast_to((0.6, 0.5, 0.4), colors.shape), atol=2 / 255)
+
+
+def test_places_are_looked_at_in_all_photographs(tmp_path):
+    """What a place looks like, and that nothing is behind a camera."""
+    hull = Hull.of(around(tmp_path))
+    colors, is_empty = hull.look(np.array([[0, 0, 0], [0, 1.5, 0], [0, 9.0, 0], [0, 0.4 * DISTANCE, 2 * DISTANCE]]))
+    assert is_empty.tolist() == [False, True, False, False]
+    assert np.isfinite(colors[..., 0]).sum(axis=0).tolist() == [6, 6, 0, 1]
+    np.testing.assert_allclose(hull.center, 0, atol=1e-6)
+
+
+def test_nothing_is_said_where_photographs_do_not_tell(tmp_path):
+    """Two views, views of several times, next to no background, cameras that look apart; silhouettes that meet nowhere
+    leave no room, and points are guessed as before.
+    """
+    views = around(tmp_path)
+    assert Hull.of(views) is not None
+    assert Hull.of(views[:2]) is None
+    assert Hull.of(around(tmp_path, behind=(0.5, 0.5, 0.5), ball=(0.0, 0.0, 0.0))) is not None
+    for view in views:
+        view.background = (0.3, 0.0, 0.0)
+    assert Hull.of(views) is None
+    apart = around(tmp_path, away=SIZE / 4 + 4)
+    assert Hull.of(apart).points(1000, np.random.default_rng(0)) is None
+    source = initial_points(apart, max_points=100)[2]
+    assert source.startswith("random where 6 cameras look")
+
+
+def test_views_of_several_times_say_nothing(tmp_path):
+    """Where something moves a place is empty at one time and not at another."""
+    views = around(tmp_path)
+    for index, view in enumerate(views):
+        view.camera = dataclasses.replace(view.camera, time=float(index % 2))
+    assert Hull.of(views) is None
+    for view in views:
+        view.camera = dataclasses.replace(view.camera, time=0.5)
+    assert Hull.of(views) is not None
+
+
+def test_matches_that_a_third_photograph_denies_are_left_out(tmp_path, monkeypatch):
+    """Two photographs agree about a place in front of the ball, which others show as empty."""
+    right, wrong = np.random.default_rng(0).normal(size=(2, 60, 3))
+    right *= 0.5 * RADIUS / np.linalg.norm(right, axis=1, keepdims=True)
+    wrong *= 1.8 * RADIUS / np.linalg.norm(wrong, axis=1, keepdims=True)
+    found = np.concatenate([right, wrong])
+    monkeypatch.setattr(
+        "drgs.data.points._triangulated",
+        lambda views, *_: (found, np.ones((120, 3), np.float32), np.ones((len(views), 120), bool)),
+    )
+    points, _, source = initial_points(around(tmp_path), max_points=3000)
+    assert source == f"triangulated from 6 given poses, 120 points; {len(points)} with guesses where there are none"
+    assert {tuple(point) for point in right} <= {tuple(point) for point in points}
+    assert not {tuple(point) for point in wrong} & {tuple(point) for point in points}
+    assert np.linalg.norm(points, axis=1).max() < 1.4 * RADIUS
