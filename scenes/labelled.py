@@ -16,10 +16,11 @@ def build(parts, classes, lights=None):
         parts: Arguments of `scenes.shape` of each part, whose names are classes; the k-th one has the identifier
             `part{k:03d}`.
         classes: Names of the classes, of which labels are the numbers from 1.
-        lights: Dict of what else is in the scene, as `mi.load_dict` takes it.
+        lights: Dict of what else is in the scene, as `mi.load_dict` takes it; a shape that is called as a class is of
+            that class.
     Returns:
         The Mitsuba scene, and (numbers,) uint8 labels by Dr.Jit's number of a shape, as `scenes.first_hits` gives it;
-        0 for lights and for none.
+        0 for other lights and for none.
     """
     mi = runtime.mitsuba()
     import drjit as dr
@@ -38,6 +39,8 @@ def build(parts, classes, lights=None):
     table = np.zeros(max(numbers.values()) + 1, np.uint8)
     for k, (name, *_) in enumerate(parts):
         table[numbers[f"part{k:03d}"]] = classes.index(name) + 1
+    for name in set(lights or {}) & set(classes):
+        table[numbers[name]] = classes.index(name) + 1
     return scene, table
 
 

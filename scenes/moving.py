@@ -16,7 +16,7 @@ import numpy as np
 from drgs.scenes import fabrics, grid, mix, noise, ramp, revolve, spline, tube
 from drgs.scenes.furniture import GLAZE, MATTE, METAL, SATIN
 
-__all__ = ["MOVING", "Mover", "jelly", "mug", "orange", "tongs", "towel"]
+__all__ = ["MOVING", "Mover", "jelly", "mug", "orange", "rigid", "rotation", "tongs", "towel"]
 
 MOVING = ("mug", "orange", "tongs", "jelly", "towel")
 ORANGE = 0.044  # radius in meters
@@ -43,7 +43,7 @@ class Mover:
     two_sided: bool = False
 
 
-def _rotation(vector):
+def rotation(vector):
     """(3, 3) of a rotation vector in radians."""
     import cv2
 
@@ -57,7 +57,7 @@ def _posed(mesh, pose):
     return points @ rotation.T + shift, faces, uv, normals @ rotation.T
 
 
-def _rigid(mesh, pose):
+def rigid(mesh, pose):
     """`at` of a mesh whose pose is a function of the time."""
     return lambda time: _posed(mesh, pose(time))
 
@@ -83,10 +83,10 @@ def mug(rng, spot, color, accent):
     def pose(time):
         angle = np.radians(start + 130 * slide(time))
         shift = np.array([*(spot + radii * (np.cos(angle), np.sin(angle))), 0.0])
-        return _rotation(np.radians(start + 110 * spin(time)) * _UP), shift
+        return rotation(np.radians(start + 110 * spin(time)) * _UP), shift
 
-    yield Mover("mug", _rigid(body, pose), GLAZE, _glaze(rng, color, accent))
-    yield Mover("mug", _rigid(handle, pose), GLAZE, accent)
+    yield Mover("mug", rigid(body, pose), GLAZE, _glaze(rng, color, accent))
+    yield Mover("mug", rigid(handle, pose), GLAZE, accent)
 
 
 def _glaze(rng, color, accent, height=256, width=512):
@@ -126,9 +126,9 @@ def orange(rng, start, end):
 
     def pose(time):
         along = way_length * (0.5 + 0.5 * roll(time))
-        return _rotation(along / ORANGE * axis), np.array([*(start + along * way), ORANGE])
+        return rotation(along / ORANGE * axis), np.array([*(start + along * way), ORANGE])
 
-    yield Mover("orange", _rigid(ball, pose), SATIN, _peel(rng))
+    yield Mover("orange", rigid(ball, pose), SATIN, _peel(rng))
 
 
 def _peel(rng, height=256, width=512):
@@ -154,7 +154,7 @@ def tongs(rng, spot, accent):
     """Tongs of two arms on a pin that close on what lies at `spot` (x, y), open, and are lifted a little meanwhile."""
     turn = np.radians(rng.uniform(-25, 25))
     lean = np.radians(rng.uniform(12, 26) * (1 if rng.random() < 0.5 else -1))
-    base = _rotation(turn * _UP) @ _rotation((lean, 0, 0))
+    base = rotation(turn * _UP) @ rotation((lean, 0, 0))
     grasp = _wave(rng, 1.6, 2.2)
     lift = _wave(rng, 0.8, 1.1)
     rock = _wave(rng, 0.7, 1.0)
@@ -162,17 +162,17 @@ def tongs(rng, spot, accent):
     closed = np.arcsin((LEMON + 0.004) / _ARM)
 
     def pose(time):
-        rotation = _rotation(0.12 * rock(time) * _UP) @ base
-        return rotation, tip + rotation @ (0, 0, 0.97 * _ARM) + (0, 0, 0.014 * (1 + lift(time)))
+        tilt = rotation(0.12 * rock(time) * _UP) @ base
+        return tilt, tip + tilt @ (0, 0, 0.97 * _ARM) + (0, 0, 0.014 * (1 + lift(time)))
 
     def arm(side):
         mesh = _arm(side)
         half = np.radians(10.5)
 
         def at(time):
-            open_by = _rotation((0, -side * (closed + half * (1 + grasp(time))), 0))
-            rotation, shift = pose(time)
-            return _posed(mesh, (rotation @ open_by, shift))
+            open_by = rotation((0, -side * (closed + half * (1 + grasp(time))), 0))
+            tilt, shift = pose(time)
+            return _posed(mesh, (tilt @ open_by, shift))
 
         return at
 
@@ -184,7 +184,7 @@ def tongs(rng, spot, accent):
         yield Mover("tongs", arm(side), METAL, steel)
     around = np.linspace(0, np.pi, 20)
     ring = np.stack([0.012 * np.cos(around), 0 * around, 0.012 * np.sin(around) + 0.004], 1)
-    yield Mover("tongs", _rigid(tube(ring, 0.006), pose), METAL, (90, 92, 96))
+    yield Mover("tongs", rigid(tube(ring, 0.006), pose), METAL, (90, 92, 96))
 
 
 def _arm(side):

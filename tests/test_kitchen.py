@@ -11,7 +11,7 @@ import pytest
 from json_page import OF_CAPTURE, check
 
 from drgs import cli, scenes
-from drgs.scenes import kitchen, moving, tabletop, teacher, videos
+from drgs.scenes import filmed, kitchen, labelled, moving, tabletop, teacher, videos
 from drgs.scenes.colmap import project
 
 WIDTH, HEIGHT, CAMERAS, TIMES = 32, 24, 3, 3
@@ -27,7 +27,7 @@ def stage():
     material = scenes.material
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scenes, "material", lambda bsdf, *rest: material({"type": "diffuse"}, *rest))
-        return kitchen.Stage(0)
+        return filmed.Stage(kitchen.PLAY, 0)
 
 
 @pytest.fixture(scope="module")
@@ -41,12 +41,12 @@ def made(stage, tmp_path_factory):
             raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(kitchen, "Stage", lambda seed: stage)
+        patch.setattr(filmed, "Stage", lambda play, seed: stage)
         with pytest.raises(KeyboardInterrupt):
             kitchen.generate(folder, **SMALL, progress=stop)
         assert [path.name for path in folder.iterdir()] == [".drgs.scene"]
-        trace = kitchen._Recording._trace
-        patch.setattr(kitchen._Recording, "_trace", lambda *args: traced.append(args[1:]) or trace(*args))
+        trace = filmed._Recording._trace
+        patch.setattr(filmed._Recording, "_trace", lambda *args: traced.append(args[1:]) or trace(*args))
         with pytest.MonkeyPatch.context() as broken:
             broken.setattr(videos, "write", lambda *args: stop(4, CAMERAS * TIMES))
             with pytest.raises(KeyboardInterrupt):
@@ -76,8 +76,8 @@ def frames(made):
 def parts(seed):
     """(names of all classes that are there, `Mover`s) of a seed."""
     all_parts = list(kitchen.parts(seed))
-    movers = [part for part in all_parts if isinstance(part, kitchen.Mover)]
-    return {part.name if isinstance(part, kitchen.Mover) else part[0] for part in all_parts}, movers
+    movers = [part for part in all_parts if isinstance(part, moving.Mover)]
+    return {part.name if isinstance(part, moving.Mover) else part[0] for part in all_parts}, movers
 
 
 def cameras(made):
@@ -124,7 +124,7 @@ def test_videos_are_exact(made, frames):
 def test_poses_are_the_cameras_of_the_pictures(made, stage, frames):
     """Rays through the pixels of poses_bounds.npy's cameras meet the classes of the labels, between the bounds."""
     K, poses, bounds = cameras(made)
-    assert np.allclose(poses, kitchen.arc(CAMERAS, 0), atol=1e-12)
+    assert np.allclose(poses, kitchen.PLAY.arc(CAMERAS, 0), atol=1e-12)
     stage.set(0.5)
     for c in range(CAMERAS):
         depth, numbers = scenes.first_hits(stage.scene, K, poses[c], WIDTH, HEIGHT)
@@ -139,14 +139,14 @@ def test_poses_are_the_cameras_of_the_pictures(made, stage, frames):
 @pytest.mark.parametrize("seed", [0, 1])
 def test_cameras_face_the_table(seed):
     """cam00 is in the middle of an arc of 80 to 100 degrees; all stand right way up and see what moves."""
-    poses = kitchen.arc(15, seed)
+    poses = kitchen.PLAY.arc(15, seed)
     eyes = poses[:, :3, 3]
-    azimuth = np.degrees(np.arctan2(eyes[:, 0], -eyes[:, 1] + kitchen._TARGET[1]))
+    azimuth = np.degrees(np.arctan2(eyes[:, 0], -eyes[:, 1] + 0.05))
     assert abs(azimuth[0]) < 1
     assert (np.diff(azimuth[1:]) > 0).all()
     assert 80 < np.ptp(azimuth) < 100
     assert (poses[:, 2, 1] < -0.7).all()  # their downward axis points down
-    K = kitchen.intrinsics(240, 180)
+    K = labelled.intrinsics(240, 180, kitchen.PLAY.fov_x)
     seen = []
     for mover in parts(seed)[1]:
         for time in (0.0, 0.4, 1.0):
@@ -160,7 +160,11 @@ def test_cameras_face_the_table(seed):
 
 def test_labels_agree_with_the_things(stage):
     """Vertices of a thing that nothing hides lie on pixels of its class, at every time, or one pixel beside them."""
-    K, poses, found = kitchen.intrinsics(120, 90), kitchen.arc(15, 0), dict.fromkeys(kitchen.MOVING, 0)
+    K, poses, found = (
+        labelled.intrinsics(120, 90, kitchen.PLAY.fov_x),
+        kitchen.PLAY.arc(15, 0),
+        dict.fromkeys(kitchen.MOVING, 0),
+    )
     for time in (0.0, 0.6):
         stage.set(time)
         for pose in poses[[0, 4]]:
@@ -274,12 +278,12 @@ def test_sparse_points_of_frame_0(made, frames):
 
     dataset = load_colmap(made / "frame0")
     assert [view.name for view in dataset.views] == ["cam00", "cam01", "cam02"]
-    for view, pose in zip(dataset.views, kitchen.arc(CAMERAS, 0), strict=True):
+    for view, pose in zip(dataset.views, kitchen.PLAY.arc(CAMERAS, 0), strict=True):
         assert np.allclose(view.camera.c2w, pose, atol=1e-6)
     lines = (made / "frame0" / "sparse" / "0" / "images.txt").read_text().split("\n")
     assert lines[0].endswith("cam00.png")
     assert lines[1] == ""
-    K, poses = kitchen.intrinsics(WIDTH, HEIGHT), kitchen.arc(CAMERAS, 0)
+    K, poses = labelled.intrinsics(WIDTH, HEIGHT, kitchen.PLAY.fov_x), kitchen.PLAY.arc(CAMERAS, 0)
     pixels, z = project(K, poses[1], dataset.points)
     x, y = np.clip(pixels.astype(int), 0, (WIDTH - 1, HEIGHT - 1)).T
     color = frames[0][1, 0][y, x].astype(float)
@@ -291,7 +295,7 @@ def test_sparse_points_of_frame_0(made, frames):
 
 def test_seeds(stage, made, tmp_path, monkeypatch):
     """The same seed gives the same files to the bit, in one call or three; others give other things and motions."""
-    monkeypatch.setattr(kitchen, "Stage", lambda seed: stage)
+    monkeypatch.setattr(filmed, "Stage", lambda play, seed: stage)
     kitchen.generate(tmp_path / "set", **SMALL)
     files = sorted(path.relative_to(made) for path in made.rglob("*") if path.is_file() and path.name != ".drgs.jsonl")
     assert all((tmp_path / "set" / name).read_bytes() == (made / name).read_bytes() for name in files)
@@ -300,12 +304,12 @@ def test_seeds(stage, made, tmp_path, monkeypatch):
     for a, b in zip(movers, others, strict=True):
         assert a.name == b.name
         assert np.abs(a.at(0.5)[0] - b.at(0.5)[0]).max() > 0.01
-    assert not np.array_equal(kitchen.arc(5, 0), kitchen.arc(5, 1))
+    assert not np.array_equal(kitchen.PLAY.arc(5, 0), kitchen.PLAY.arc(5, 1))
 
 
 def test_command(stage, tmp_path, monkeypatch, capsys):
     """`drgs scene kitchen` writes a data set, says what to do next, and keeps a finished one."""
-    monkeypatch.setattr(kitchen, "Stage", lambda seed: stage)
+    monkeypatch.setattr(filmed, "Stage", lambda play, seed: stage)
     out = tmp_path / "set"
     command = ["scene", "kitchen", "-o", str(out), "--size", "32x24", "--cameras", "2", "--times", "1", "--spp", "1"]
     command += ["--teacher-size", "8x6"]
@@ -314,7 +318,7 @@ def test_command(stage, tmp_path, monkeypatch, capsys):
     assert "16 classes, 5 of them move, teacher right at" in said
     assert f"next: drgs fit {out} -o RUN\n" in said
     assert len(list((out / "rgb_feature_langseg").iterdir())) == 2
-    monkeypatch.setattr(kitchen, "Stage", lambda seed: pytest.fail("made again"))
+    monkeypatch.setattr(filmed, "Stage", lambda play, seed: pytest.fail("made again"))
     assert cli.main([*command, "--quiet"]) == 0
     assert capsys.readouterr().out == ""
 

@@ -96,26 +96,26 @@ class Demo(Common):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Scene(Common):
-    """Make a data set by path tracing: a room or a kitchen in motion, a still life, or one as a phone captures it."""
+    """Make a data set by path tracing: a room, a kitchen or a hall in motion, a still life, or one as of a phone."""
 
-    name: Positional[Literal["room", "kitchen", "still_life", "capture"]]
-    """Room and kitchen have classes, points and a teacher, the kitchen moves; capture has what real captures have."""
+    name: Positional[Literal["room", "kitchen", "hall", "still_life", "capture"]]
+    """All but the last two have classes, points and a teacher; kitchen and hall move; capture is as a phone's."""
     output: OutputPath
     """Folder for the data set; an interrupted command is continued there."""
     size: str | None = None
-    """WIDTHxHEIGHT of the images in pixels; default 320x240, 240x180 of capture and kitchen (even numbers)."""
+    """WIDTHxHEIGHT of the images in pixels; default 320x240; 240x180 (capture, kitchen), 160x120 (hall)."""
     views: int | None = None
     """How many images; default 75 (room), 32 (still_life) or 28 (capture)."""
     cameras: int | None = None
-    """How many cameras film (kitchen); default 15. cam00, in the middle of their arc, is the test view."""
+    """How many cameras film (kitchen, hall); default 15, 12. cam00, in the middle of their arc, is the test view."""
     times: int | None = None
-    """How many frames each camera films (kitchen); default 40."""
+    """How many frames each camera films (kitchen, hall); default 40, 12."""
     seed: int = 0
     """Of shapes, textures, motions, cameras, light paths and all errors that are made on purpose."""
     spp: int | None = None
-    """Light paths a pixel; default 25 (room), 16 (kitchen), 30 (still_life), 25 (capture)."""
+    """Light paths a pixel; default 25 (room), 16 (kitchen, hall), 30 (still_life), 25 (capture)."""
     teacher_size: str | None = None
-    """WIDTHxHEIGHT of the teacher's feature maps; default 80x60 (room), 60x45 (kitchen)."""
+    """WIDTHxHEIGHT of the teacher's feature maps; default 80x60 (room), 60x45 (kitchen), 40x30 (hall)."""
     test_every: int | None = None
     """One in how many views is for testing (room); default 5, which is 15 of 75 views."""
     exposure: Literal["auto", "fixed"] | None = None

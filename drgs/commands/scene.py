@@ -19,9 +19,9 @@ __all__ = ["maker_of", "run"]
 
 _ONLY = {  # options that not every scene has
     "--views": ("capture", "room", "still_life"),
-    "--cameras": ("kitchen",),
-    "--times": ("kitchen",),
-    "--teacher-size": ("room", "kitchen"),
+    "--cameras": ("kitchen", "hall"),
+    "--times": ("kitchen", "hall"),
+    "--teacher-size": ("room", "kitchen", "hall"),
     "--test-every": ("room",),
     "--exposure": ("capture",),
     "--wall": ("capture",),
