@@ -146,7 +146,7 @@ class _Lookup(torch.autograd.Function):
         by_rows = by_parts = None
         if ctx.needs_input_grad[0]:
             each = slope[:, None] * _weights(parts)[..., None]
-            by_rows = torch.zeros_like(rows).index_put_((corners.flatten(),), each.flatten(0, 1), accumulate=True)
+            by_rows = torch.zeros_like(rows).index_add_(0, corners.flatten(), each.flatten(0, 1))
         if ctx.needs_input_grad[2]:
             moved = [_bag(rows, corners, _weights(parts, axis)) for axis in range(parts.shape[1])]
             by_parts = torch.stack([(slope * x).sum(1) for x in moved], 1)

@@ -137,7 +137,7 @@ class Rows:
             state = {"T": self.m.lib.Float(1), "rest": self.rest(k)}
         if self.masks:
             alive = alive & (self.masks[k] > 0)
-        return {**state, "alive": dr.select(alive, self.m.lib.UInt32(1), 0), **self.sink.init()}
+        return {**state, "alive": dr.select(alive, self.m.lib.UInt32(1), 0), **self.sink.init(k)}
 
     def shade(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
         """One hit of each of `rays`."""
@@ -226,7 +226,7 @@ class Diagonal:
         self.summed = summed
         self.needs_color = bands > 0
 
-    def init(self) -> dict:
+    def init(self, k: int) -> dict:
         """Nothing is kept per ray."""
         return {}
 
@@ -278,7 +278,7 @@ class Blocks:
         self.weights = weights
         self.mode = mode
 
-    def init(self) -> dict:
+    def init(self, k: int) -> dict:
         """Nothing is kept per ray."""
         return {}
 
@@ -326,7 +326,7 @@ class Variance:
         self.light = light
         self.plain = plain
 
-    def init(self) -> dict:
+    def init(self, k: int) -> dict:
         """The sum along a ray."""
         return {"variance": type(self.buffer)(0)}
 

@@ -26,7 +26,7 @@ Reference:
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -47,6 +47,7 @@ from drgs.information.choices import NETWORK_ESTIMATES, NetworkEstimate
 from drgs.information.complement import Eliminated
 from drgs.information.elimination import eliminated_of
 from drgs.information.network_groups import NETWORK_GROUPS, network_groups
+from drgs.information.network_rows import NetworkRows
 from drgs.information.nuisances import Nuisances
 from drgs.information.pullback import Pullback
 from drgs.runtime import alone
@@ -175,12 +176,15 @@ class _View:
 
     Attributes:
         call: The call of the view.
+        scene, semantics: What it shows, and the metric of the features that are rows.
         scales: (C,) what the call's channels are multiplied by, colors, then semantic channels; with a mask
             (pixels, C).
         eliminated: What the view's own unknowns explain of the rows, which are freed of it; None: nothing.
     """
 
     call: Call
+    scene: DeformableScene
+    semantics: SemanticMetric | None
     scales: torch.Tensor
     eliminated: Eliminated | None = None
 
@@ -220,23 +224,26 @@ class _View:
         # Detached: Dr.Jit differentiates through `deformed`, of which these are only the values now.
         call = Call(seen.detach(), camera, settings, frozenset(), scene=deformed)
         eliminated = eliminated_of(call, scales, nuisances) if nuisances is not None and nuisances.names else None
-        return cls(call, scales, eliminated)
+        return cls(call, scene, semantics, scales, eliminated)
 
     @property
     def rows(self) -> int:
         """C, rows of a pixel."""
         return self.scales.shape[-1]
 
-    def pullback(self, groups: Groups) -> Pullback:
-        """J^T of it; see `pulled`."""
-        return Pullback(self.call, [name for own in groups.values() for name in own])
+    def pullback(self, groups: Groups) -> Callable[[torch.Tensor], Iterator[Information]]:
+        """J^T: of each of (K, pixels, C) rows, group -> (P,) slopes."""
+        names = [name for own in groups.values() for name in own]
+        assert self.call.camera is not None  # as of every view
+        told = NetworkRows.of(self.scene, self.call.camera, self.call.settings, self.semantics, names)
+        pull = told or _each(Pullback(self.call, names))
 
-    def pulled(self, pull: Pullback, groups: Groups, rows: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Group -> (P,) slopes along (pixels, C) rows."""
-        own = rows if self.eliminated is None else self.eliminated.root(rows)
-        scaled = (own * self.scales).float()  # as cotangents of images are
-        slopes = pull(scaled[:, :3], scaled[:, 3:] if self.rows > 3 else None)
-        return {group: torch.cat([slopes[name].flatten() for name in own]) for group, own in groups.items()}
+        def pulled(rows: torch.Tensor) -> Iterator[Information]:
+            own = rows if self.eliminated is None else torch.stack([self.eliminated.root(x) for x in rows])
+            for slopes in pull((own * self.scales).float()):  # as cotangents of images are
+                yield {group: torch.cat([slopes[name].flatten() for name in own]) for group, own in groups.items()}
+
+        return pulled
 
     def push(self, tangents: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """(K, pixels, C) float64 tangents of the rows, along (K, ...) tangents of phi by name."""
@@ -250,6 +257,16 @@ class _View:
         largest = max(self.call.pixels * self.rows, sum(_size(own) for own in groups.values()))
         step = max(1, min(_BATCH, _FLOATS // largest))
         return iter([min(step, count - start) for start in range(0, count, step)])
+
+
+def _each(pull: Pullback) -> Callable[[torch.Tensor], Iterator[dict[str, torch.Tensor]]]:
+    """J^T of a view by whatever the parameters change, an image at a time."""
+
+    def pulled(images: torch.Tensor) -> Iterator[dict[str, torch.Tensor]]:
+        for image in images:
+            yield pull(image[:, :3], image[:, 3:] if image.shape[1] > 3 else None)
+
+    return pulled
 
 
 class _Reduced:
@@ -283,9 +300,11 @@ class _Reduced:
 
 def _diagonal(view: _View, groups: Groups, probes: int, generator: torch.Generator) -> Iterator[Information]:
     pull = view.pullback(groups)
-    for _ in range(probes):
-        slopes = view.pulled(pull, groups, _signs(generator, view.call.pixels, view.rows))
-        yield {name: x.square() for name, x in slopes.items()}
+    for count in view.batches(groups, probes):
+        total: Information = {}  # of a few, in their precision; what all add up to is float64
+        for slopes in pull(_signs(generator, count, view.call.pixels, view.rows)):
+            total = {name: x.square() if name not in total else total[name].addcmul_(x, x) for name, x in slopes.items()}
+        yield total
 
 
 def _trace_reverse(view: _View, groups: Groups, probes: int, generator: torch.Generator) -> Iterator[Information]:
@@ -305,8 +324,8 @@ def _paper(view: _View, groups: Groups, probes: int, generator: torch.Generator)
         tangents: dict[str, torch.Tensor] = {}
         for own in groups.values():
             tangents |= _unflat(own, _signs(generator, count, _size(own)))
-        for rows in view.push(tangents):
-            yield {name: x.square().sum() for name, x in view.pulled(pull, groups, rows).items()}
+        for slopes in pull(view.push(tangents)):
+            yield {name: x.square().sum() for name, x in slopes.items()}
 
 
 _ESTIMATORS = {

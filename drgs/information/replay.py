@@ -41,6 +41,7 @@ class Walk(NamedTuple):
 
     Attributes:
         first: It is the traversal whose colors weigh.
+        start: Row of its first semantic channel.
         weights: Weights of its channels: three colors, then semantic channels.
         channels: What it composited.
         part, finals: The rays, and their final states.
@@ -48,6 +49,7 @@ class Walk(NamedTuple):
     """
 
     first: bool
+    start: int
     weights: list[float]
     channels: Channels
     part: Part
@@ -95,21 +97,21 @@ class Replay:
         self.along_ray = settings.sh_direction == "ray"
         self.color = False
         self.extras = None
+        self.moved_color: list[list[Float]] | None = None  # (channel, axis) dc/dmu, where colors depend on the mean
         self.light: torch.Tensor | Any = None  # of SH along each ray, once `sums` or `sh_spread` was called
         if not geometry:
             return
-        moved_color = None
         if not self.along_ray:  # there colors do not depend on the mean, but on the pixel
-            self.lit, self.basis, moved_color = self._colors(p)
+            self.lit, self.basis, self.moved_color = self._colors(p)
             dr.eval(self.lit, self.basis)
-        self.color = moved_color is not None
+        self.color = self.moved_color is not None
         self.extras = extras(
             lib,
             self.compositor.model.response,
             p["logit_opacities"],
             self.compositor.traversal.projected,
             self._moved_records(),
-            moved_color,
+            self.moved_color,
         )
         dr.eval(self.extras)
 
@@ -166,7 +168,7 @@ class Replay:
             dr.disable_grad(inputs[name])
         return moved
 
-    def _walks(self, weights: Sequence[float]) -> Iterator[Walk]:
+    def walks(self, weights: Sequence[float]) -> Iterator[Walk]:
         """Each part of each traversal.
 
         The first has the colors and a slice of the semantic channels. Each other slice has the colors beside it, too,
@@ -185,7 +187,7 @@ class Replay:
             tabled = None if numbers > _TABLED else numbers
             own = [*(weights if number == 0 else [0.0] * 3), *[gamma] * count]
             for at in done:
-                yield Walk(number == 0, own, channels, *along_lists(self.lib, *at, tabled, kernel))
+                yield Walk(number == 0, 3 + number * _BESIDE, own, channels, *along_lists(self.lib, *at, tabled, kernel))
 
     def _rows(
         self, channels: Channels, part: Part, finals: list[dict], sink: Sink | Any = None, table: Table | None = None
@@ -196,7 +198,7 @@ class Replay:
             masks = [dr.gather(self.lib.Float, self.mask, *at) for at in zip(part.flat, part.inside, strict=True)]
         return Rows(self.compositor.model, channels, self.extras, sink, finals, self.color, masks, table)
 
-    def _replay(self, walk: Walk, sink: Sink) -> list[dict]:
+    def run(self, walk: Walk, sink: Sink) -> list[dict]:
         """Hand the Jacobian's rows of a part to a sink: final states of its shared rays."""
         return walk.part.run(self._rows(walk.channels, walk.part, walk.finals, sink, walk.table))
 
@@ -205,10 +207,10 @@ class Replay:
     ) -> torch.Tensor:
         """(N, width) float64: what `sink_of(walk, reduce mode)` sums up in its `buffer`, over all walks."""
         total = torch.zeros(self.count, width, dtype=torch.float64)
-        for walk in self._walks(weights):
+        for walk in self.walks(weights):
             sink = sink_of(walk, walk.part.reduction)
             # A buffer is float32, which one traversal fills; what several add up to is float64.
-            dr.eval(self._replay(walk, sink), sink.buffer)
+            dr.eval(self.run(walk, sink), sink.buffer)
             found = _torch(sink.buffer).reshape(self.count, -1)
             total[:, : found.shape[1]] += found
         return total
@@ -262,11 +264,11 @@ class Replay:
         buffer = self._weights(table)
         image = dr.zeros(lib.Float, self.call.pixels)
         light = None if self.light is None else self._weights(self.light)
-        for walk in self._walks(weights):
+        for walk in self.walks(weights):
             sink = Variance(
                 buffer, walk.weights, light if walk.first else None, walk.first and "features" in information
             )
-            for state, at, inside in zip(self._replay(walk, sink), walk.part.flat, walk.part.inside, strict=True):
+            for state, at, inside in zip(self.run(walk, sink), walk.part.flat, walk.part.inside, strict=True):
                 dr.scatter_add(image, state["variance"], at, inside)
             dr.eval(image)
         # Sums of weights that lambda = 0 makes huge may be inf, which a picture's scale could not hold.

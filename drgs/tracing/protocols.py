@@ -66,8 +66,8 @@ class Sink(Protocol):
 
     needs_color: bool
 
-    def init(self) -> dict:
-        """What is kept per ray."""
+    def init(self, k: int) -> dict:
+        """What is kept along shared ray k."""
 
     def take(self, lib: Lib, index: UInt32, hits: Mask, rows: list, states: list[dict]) -> list[dict]:
         """Add the rows of Gaussian `index`, one a shared ray; `hits`: lanes that have any."""

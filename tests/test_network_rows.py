@@ -1,0 +1,140 @@
+"""J^T of a view by a deformation network, from rows that are written down hit by hit, against a traversal for each
+image: the adjoint of the compositor, which has its own tests against float64.
+"""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from scenes_random import camera, gaussians
+from test_network_information import TIME, swarm
+
+from drgs import fisher
+from drgs.dynamics.lives import Lives
+from drgs.information.network_rows import NetworkRows
+from drgs.information.pullback import Pullback
+from drgs.information.semantics import SemanticMetric
+from drgs.settings import RenderSettings
+from drgs.tracing.call import Call
+
+SIZE = (21, 13)  # no multiple of a tile
+K = 3
+
+
+def made(n=40, coefficients=4, features=0, seed=0, **options):
+    rng = np.random.default_rng(seed)
+    g = gaussians(rng, n, coefficients, scale=0.25).detach()
+    g = g.replace(quats=g.quats * torch.from_numpy(rng.uniform(0.5, 3, (n, 1))).float())  # of any length
+    if features:
+        g = g.replace(features=torch.from_numpy(rng.normal(size=(n, features))).float())
+    cam = camera(rng, SIZE)
+    return swarm(g, **options), dataclasses.replace(cam, time=TIME, w2c=cam.w2c.detach())
+
+
+def both(scene, cam, settings, semantics=None):
+    """Slopes of phi along random images, written down and by a traversal for each."""
+    names = [name for name in scene.parameters() if name.startswith("phi.")]
+    seen = scene.at(TIME).detach()
+    channels = 3
+    if semantics is None:
+        seen, deformed = seen.replace(features=None), scene
+    else:
+        from drgs.information.network import _Reduced
+
+        deformed = _Reduced(scene, semantics.directions(seen.features))
+        seen = deformed.reduced(seen)
+        channels += seen.features.shape[1]
+    images = torch.randn(K, cam.width * cam.height, channels, generator=torch.Generator().manual_seed(1))
+    pull = Pullback(Call(seen, cam, settings, frozenset(), scene=deformed), names)
+    want = [pull(x[:, :3], x[:, 3:] if channels > 3 else None) for x in images]
+    rows = NetworkRows.of(scene, cam, settings, semantics, names)
+    return list(rows(images)), want
+
+
+def close(found, want):
+    for one, other in zip(found, want, strict=True):
+        assert one.keys() == other.keys()
+        for name, x in one.items():
+            assert float((x - other[name]).abs().max()) <= 2e-5 * float(other[name].abs().max()) + 1e-12, name
+
+
+@pytest.mark.parametrize("preset", ["exact", "fast", "gsplat", "3dgut"])
+def test_slopes_are_those_of_a_traversal_each(preset):
+    """Also of colors that depend on the mean, and where some Gaussians stand still."""
+    motion = torch.where(torch.arange(40) % 3 == 0, -1.0, 1.0)
+    scene, cam = made(motion=motion)
+    found, want = both(scene, cam, RenderSettings.preset(preset))
+    close(found, want)
+    for group in ("grid", "mlp"):
+        assert any(float(x.abs().max()) > 0 for name, x in want[0].items() if group in name)
+
+
+def test_through_a_world_and_along_rays():
+    """Traversal bvh, and SH that are evaluated along each ray."""
+    scene, cam = made(seed=1)
+    for settings in (
+        RenderSettings.preset("exact", traversal="bvh"),
+        RenderSettings.preset("exact", sh_direction="ray"),
+    ):
+        close(*both(scene, cam, settings))
+
+
+def test_many_channels_of_features():
+    """More semantic channels than one traversal carries beside the colors."""
+    scene, cam = made(features=24, seed=2)
+    mixed = torch.randn(24, 24, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    metric = SemanticMetric(mixed @ mixed.T, weight=0.5, estimate="exact")
+    close(*both(scene, cam, RenderSettings.preset("fast"), metric))
+
+
+def test_those_that_live_for_a_time():
+    """What is there for a time is as opaque as it is then."""
+    scene, cam = made(seed=3)
+    n = len(scene)
+    lives = Lives(
+        torch.linspace(0, 1, n), torch.full((n,), -1.0), 0.1 * torch.ones(n, 3), torch.zeros(n, 3), torch.zeros(n)
+    )
+    scene.lives = lives
+    close(*both(scene, cam, RenderSettings.preset("fast")))
+
+
+def test_nothing_in_sight():
+    """A camera that looks away: slopes of 0, and of the right shapes."""
+    scene, cam = made()
+    w2c = np.array(cam.w2c.tolist())
+    w2c[:3] = np.diag([1.0, -1.0, -1.0]) @ w2c[:3]
+    away = dataclasses.replace(cam, w2c=w2c)
+    names = ["phi.grid.0", "phi.mlp.means.3.weight"]
+    rows = NetworkRows.of(scene, away, RenderSettings.preset("exact"), None, names)
+    for slopes in rows(torch.ones(2, away.width * away.height, 3)):
+        assert {name: x.shape for name, x in slopes.items()} == {n: scene.parameters()[n].shape for n in names}
+        assert all(float(x.abs().max()) == 0 for x in slopes.values())
+
+
+class Tinted:
+    """A scene of one's own, whose parameter changes colors, not places."""
+
+    def __init__(self, start, tint):
+        self.start = start
+        self.tint = tint
+
+    def parameters(self):
+        return {**self.start.parameters(), "phi.mlp.tint": self.tint}
+
+    def at(self, time):
+        return self.deform(self.parameters(), time)
+
+    def deform(self, parameters, time):
+        fields = {name: x for name, x in parameters.items() if not name.startswith("phi.")}
+        return self.start.replace(**{**fields, "sh": fields["sh"] * parameters["phi.mlp.tint"]})
+
+
+def test_parameters_that_change_colors_are_asked_by_traversals():
+    """Rows are of the geometry; what reaches the image otherwise still has its information."""
+    scene, cam = made(seed=4)
+    tinted = Tinted(scene.gaussians, torch.ones(3))
+    settings = RenderSettings.preset("exact")
+    assert NetworkRows.of(tinted, cam, settings, None, ["phi.mlp.tint"]) is None
+    found = fisher.network(tinted, cam, settings, probes=2)
+    assert float(found["mlp"].min()) > 0
