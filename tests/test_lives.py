@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from drgs.files import load_state, save_state
 from drgs.fitting.births import find_births
 from drgs.fitting.config import recorded_config
 from drgs.fitting.frames import load_frames
+from drgs.fitting.lives import BIRTHS, Lasting
 from drgs.fitting.records import load_run
 from drgs.fitting.stages import shows_first_time, spacing
 from drgs.integrator import render, render_jvp
@@ -388,6 +390,17 @@ def test_what_the_static_stage_shows(tmp_path):
     assert not shows_first_time(one)
     assert shows_first_time(six)
     assert shows_first_time([view for view in six if view.camera.time == 0])
+
+
+def test_only_lives_that_other_times_confirm_are_lengthened():
+    """One that is shorter than the time between two photographs is left as it is."""
+    widths = torch.tensor([0.05, 0.3]).log().requires_grad_()
+    rows = SimpleNamespace(tensors={BIRTHS: torch.zeros(2), LIVES[1]: widths})
+    loss = Lasting(rows, 0.1, 2.0)(None, None, None)
+    assert float(loss) == pytest.approx(2 * 0.1 / 0.3 / 2)
+    loss.backward()
+    assert float(widths.grad[0]) == 0
+    assert float(widths.grad[1]) == pytest.approx(-2 * 0.1 / 0.3 / 2)
 
 
 def test_time_between_photographs():

@@ -7,8 +7,9 @@ there, and photographs of other times do not reach them.
 
 A life that few photographs see is fitted to these alone, and shows from other cameras what it likes. What keeps lives
 long makes neighbors in time agree: the loss has `life_weight` times the mean over Gaussians of the time between two
-photographs over the width of the life. A life as long as ten times all photographs together has ended as one
-(`drgs.dynamics.lives.LASTING`): the Gaussian is always there.
+photographs over the width of the life. One that is shorter than that time is left alone: no other time has confirmed
+where it would be then, and what shows there at the wrong place is faded by the photographs that see it. A life as long
+as ten times all photographs together has ended as one (`drgs.dynamics.lives.LASTING`): the Gaussian is always there.
 """
 
 from __future__ import annotations
@@ -154,7 +155,9 @@ def _widths(found: Births, times: Sequence[float]) -> torch.Tensor:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Lasting:
-    """What keeps lives long: the mean over Gaussians of the time between photographs over the width of a life."""
+    """What keeps lives long: the mean over Gaussians of the time between photographs over the width of a life, where
+    that is below 1.
+    """
 
     rows: GaussianRows
     spacing: float
@@ -166,4 +169,6 @@ class Lasting:
         """See `LossTerm`; None where all Gaussians are always there."""
         if BIRTHS not in self.rows.tensors:
             return None
-        return self.weight * self.spacing * (-self.rows.tensors[LIVES[1]]).exp().mean()
+        parts = self.spacing * (-self.rows.tensors[LIVES[1]]).exp()
+        # Which are long enough to be lengthened is a choice, which has no derivative.
+        return self.weight * torch.where(parts.detach() < 1, parts, 0).mean()

@@ -51,8 +51,8 @@ class MotionConfig(Record):
         l1_time_weight: Weight of the L1 distance of the field's planes of time from 1, at which they change nothing.
         lives: Gaussians that are there for a time, born where photographs of one time show what those of the static
             stage do not (auto), or none (off).
-        life_weight: Weight of the mean, over Gaussians, of the time between photographs over the width of a life: the
-            larger, the longer they live.
+        life_weight: Weight of the mean, over Gaussians, of the time between photographs over the width of a life, where
+            that is below 1: the larger, the longer they live.
     Reference:
         [1] Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", CVPR 2024, and its code.
     """
