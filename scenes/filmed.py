@@ -12,7 +12,7 @@ layout of Neu3D:
   text_embeddings.npy, (classes, 512), and how often the teacher is right in teacher.json,
 - frame0/: a COLMAP data set of frame 0: images/camNN.png, sparse/0 (model, text; points: `scenes.colmap`; cam00 has a
   pose, but no point comes from it nor is observed by it),
-- truth.json, where the play has one: what is where in each frame,
+- motion.json, where the play has one: what is where in each frame (docs/run-files.md),
 - params.json.
 """
 
@@ -53,7 +53,7 @@ class Play:
         lights: Function of the module `mitsuba`: what else is in the scene, as `mi.load_dict` takes it; one that is
             called as a class is of that class.
         light_at: Function of the time: parameters of lights, as `mi.traverse` names them, and their values.
-        truth: Function of the time: what truth.json says of a frame beside its time; None writes no such file.
+        truth: Function of the time: what motion.json says of a frame beside its time; None writes no such file.
         arc: Function of the number of cameras and the seed: camera-to-world matrices (cameras, 4, 4).
         fov_x: Degrees across the image width.
         exposure: Factor of the light before it is encoded.
@@ -245,8 +245,8 @@ class _Recording:
             (folder / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n")
         if self.play.truth is not None:
             moments = [k / max(self.times - 1, 1) for k in range(self.times)]
-            truth = [{"time": moment, **self.play.truth(moment)} for moment in moments]
-            (folder / "truth.json").write_text(json.dumps(truth, indent=1) + "\n")
+            truth = {"frames": [{"time": moment, **self.play.truth(moment)} for moment in moments]}
+            (folder / "motion.json").write_text(json.dumps(truth, indent=1) + "\n")
         bounds = [(0.9 * depth.min(), 1.1 * depth.max()) for _, depth, _ in first]
         rows = videos.llff_rows(self.K, self.poses, self.width, self.height, np.array(bounds))
         np.save(folder / "poses_bounds.part.npy", rows)

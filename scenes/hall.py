@@ -5,8 +5,8 @@ Between two of the default's 12 times a ball flies five of its diameters, to and
 goes on; a door opens and shows a niche that was hidden. A seed decides colors, textures and what stands around. World:
 meters, +z up, the floor at z = 0, the wall at y = 0; cameras look at it from -y. cam00 is in the middle of the arc.
 
-Files: `scenes.filmed`; truth.json has of each frame the time, where the ball's center is in meters (its radius is
-`BALL`), how far the door is open in degrees, and whether the lamp is on.
+Files: `scenes.filmed`, and motion.json, which has of each frame where the ball's center is (its radius is `BALL`), how
+far the door is open, and whether the lamp is on.
 """
 
 from __future__ import annotations
@@ -187,7 +187,7 @@ def _light_at(time):
 
 
 def _truth(time):
-    """What a frame's entry of truth.json says beside its time."""
+    """What a frame's entry of motion.json says beside its time."""
     return {"ball": ball_at(time).tolist(), "door": opening_at(time), "lamp": bool(lamp_at(time))}
 
 

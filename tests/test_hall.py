@@ -7,6 +7,7 @@ import json
 
 import numpy as np
 import pytest
+from json_page import check
 
 from drgs import cli, scenes
 from drgs.data import load
@@ -66,8 +67,10 @@ def test_the_ball_flies_five_diameters_a_frame():
 
 
 def test_truth_is_what_labels_show(made, stage):
-    """The ball is labelled where truth.json has it; the niche appears with the door's angle; all are listed."""
-    truth = json.loads((made / "truth.json").read_text())
+    """The ball is labelled where motion.json has it; the niche appears with the door's angle; all are listed."""
+    content = json.loads((made / "motion.json").read_text())
+    check("motion.json", content)
+    truth = content["frames"]
     assert [entry["time"] for entry in truth] == [0, 0.25, 0.5, 0.75, 1]
     assert [entry["lamp"] for entry in truth] == [False, False, True, True, True]
     assert truth[0]["door"] == 0

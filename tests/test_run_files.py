@@ -196,7 +196,7 @@ def test_every_writer_has_its_section():
         ):
             found.add(path.relative_to(ROOT / "drgs").as_posix())
     assert found == {*_WRITERS, *_OTHERS}
-    made = {"params.json", "teacher.json", "truth.json"}  # by scenes/
+    made = {"params.json", "teacher.json", "truth.json", "motion.json"}  # by scenes/
     assert set().union(*_WRITERS.values()) | made == titles()
 
 

@@ -303,7 +303,8 @@ def _diagonal(view: _View, groups: Groups, probes: int, generator: torch.Generat
     for count in view.batches(groups, probes):
         total: Information = {}  # of a few, in their precision; what all add up to is float64
         for slopes in pull(_signs(generator, count, view.call.pixels, view.rows)):
-            total = {name: x.square() if name not in total else total[name].addcmul_(x, x) for name, x in slopes.items()}
+            for name, x in slopes.items():
+                total[name] = total[name].addcmul_(x, x) if name in total else x.square()
         yield total
 
 

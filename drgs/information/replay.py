@@ -187,7 +187,8 @@ class Replay:
             tabled = None if numbers > _TABLED else numbers
             own = [*(weights if number == 0 else [0.0] * 3), *[gamma] * count]
             for at in done:
-                yield Walk(number == 0, 3 + number * _BESIDE, own, channels, *along_lists(self.lib, *at, tabled, kernel))
+                known = along_lists(self.lib, *at, tabled, kernel)
+                yield Walk(number == 0, 3 + number * _BESIDE, own, channels, *known)
 
     def _rows(
         self, channels: Channels, part: Part, finals: list[dict], sink: Sink | Any = None, table: Table | None = None
