@@ -31,9 +31,25 @@ from drgs.guards.inputs import Masks, camera_list, check_any_scene, mask_list
 from drgs.information.cache import Cache
 from drgs.information.choices import POLICIES, check_named
 from drgs.information.pool import Pick, Pool, Selection, Workers
+from drgs.information.refining import Refine
 from drgs.information.scoring import Scoring
 
-__all__ = ["CRITERIA", "METHODS", "POLICIES", "Cache", "Pick", "Pool", "Scoring", "Selection", "policy_named", "select"]
+__all__ = [
+    "CRITERIA",
+    "METHODS",
+    "POLICIES",
+    "Cache",
+    "Pick",
+    "Pool",
+    "Refine",
+    "Scoring",
+    "Selection",
+    "policy_named",
+    "select",
+]
+
+_INFORMED = ("fisher", "fisherrf", "coverage")
+"""Policies that score a camera by what its view tells."""
 
 # One for the process: a new one each call, or the same seed again, would draw the same places of the list every time.
 _GENERATOR = torch.Generator().manual_seed(0)
@@ -55,6 +71,7 @@ def select(
     progress: Callable[[int, int], object] | None = None,
     information: Callable[[Camera], Information] | None = None,
     workers: Workers | None = None,
+    refine: Refine | None = None,
     **fields: Any,
 ) -> Selection:
     """Pick k cameras. No image of a candidate is needed.
@@ -89,6 +106,8 @@ def select(
             `coverage`, {"blocks": (N, 13, 13)} for criterion `block_logdet`.
         workers: Processes that compute what single views tell, here or on other machines
             (`drgs.cluster.connect.opened`); scores and picks are made here, of the same bits.
+        refine: Move each pick to where its view tells more; of `fisher`, `fisherrf` and `coverage`, whose scores add
+            up (no z-scores). `Pick.camera` is where to.
         **fields: Fields of `Scoring`, in place of `scoring`: `criterion`, `settings`, `method`, `prior`, `weights`,
             `groups`, `blocks`, `semantics`, `network`, `combine`, `probes`; None is the default.
     Raises:
@@ -114,6 +133,13 @@ def select(
     criterion_named(scored.criterion, "select")  # else the first view's information would be computed before
     if information is not None:
         _check_beside(policy, scored)
+    if refine is not None:
+        must_be("select", "refine", refine, Refine, "e.g. drgs.select.Refine(evaluations=40)")
+        if policy in POLICIES and policy not in _INFORMED:
+            raise ValueError(
+                f"select: refine must be None with policy {policy}, got some; use {', '.join(_INFORMED)}, which score "
+                "any camera"
+            )
     pool = Pool(
         scene=gaussians,
         candidates=candidates,
@@ -128,6 +154,7 @@ def select(
         progress=progress,
         information=information,
         workers=workers,
+        refine=refine,
     )
     selection = _returned(policy, pool, chosen(pool))
     selection.seconds = time.perf_counter() - started
@@ -173,9 +200,8 @@ def _returned(policy: str, pool: Pool, found: object) -> Selection:
 
 def _check_beside(policy: str, scoring: Scoring) -> None:
     """Refuse what means nothing beside information of one's own, which would be dropped in silence."""
-    asks = ("fisher", "fisherrf", "coverage")
-    if policy in POLICIES and policy not in asks:
-        raise ValueError(f"select: information must be None with policy {policy}, got some; use {', '.join(asks)}")
+    if policy in POLICIES and policy not in _INFORMED:
+        raise ValueError(f"select: information must be None with policy {policy}, got some; use {', '.join(_INFORMED)}")
     if scoring.combine is not None or scoring.network != "ratio":
         raise ValueError(
             "select: combine and network must be left out with information, got "

@@ -177,6 +177,10 @@ class Select(Choosing, Clustered, Comparing):
     """A data set or a run (those of its views that are not known), a cameras.json or selection.json, orbit, or dome."""
     k: Annotated[int, arg(aliases=["-k"])] = 1
     """Views to pick, each given the ones before."""
+    refine: int = 0
+    """Move each pick to where its view tells more, by scoring so many further cameras at most; 0: it stays."""
+    refine_box: str | None = None
+    """X0,Y0,Z0,X1,Y1,Z1: where cameras may be moved to, world units; default the box around candidates and known."""
     output: OutputPath = Path("out/select.json")
     """The JSON file."""
     preset: Preset = "fast"

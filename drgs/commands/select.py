@@ -17,7 +17,7 @@ from drgs.display.progress import Bar
 from drgs.files import SCHEMA, write_json
 from drgs.guards.outputs import check_file
 from drgs.information.criteria import criterion_named
-from drgs.select import Selection, policy_named, select
+from drgs.select import Refine, Selection, policy_named, select
 
 if TYPE_CHECKING:
     from drgs.commands.options import Select
@@ -36,6 +36,7 @@ def run(args: Select) -> None:
     """`drgs select SCENE --candidates ...`."""
     check_counts(args)
     settings = args.settings()  # refuses what cannot be, before anything is read
+    refine = _refine(args)
     check_file(args.output, "select", [args.scene, args.train or "", args.candidates])
     wanted = args.scoring()  # before files are read, too
     policy_named(args.policy)
@@ -60,10 +61,15 @@ def run(args: Select) -> None:
             rng=torch.Generator().manual_seed(args.seed),
             progress=bar.update,
             workers=workers,
+            refine=refine,
         )
     shown = [{"index": i, "name": camera.name} for i, camera in enumerate(candidates)]
     timely = [{**one, "time": camera.time} for one, camera in zip(shown, candidates, strict=True)]
     cameras = [{"camera": described(camera)} for camera in candidates]
+    picks = selection.picks_json(shown, cameras)
+    for record, pick in zip(picks, selection.picks, strict=True):
+        if pick.camera is not None:
+            record |= {"camera": described(pick.camera), "start": pick.start}
     report = {
         "schema": SCHEMA,
         "command": "select",
@@ -80,7 +86,7 @@ def run(args: Select) -> None:
         "pixels": known.pixels,
         "known": {"source": known.source, "names": [camera.name for camera in known.cameras]},
         "source": source,
-        "picks": [{"rank": rank, **pick} for rank, pick in enumerate(selection.picks_json(shown, cameras), 1)],
+        "picks": [{"rank": rank, **pick} for rank, pick in enumerate(picks, 1)],
         "candidates": selection.candidates_json(timely, cameras),
         "left_out": selection.left_out,
         "notes": selection.notes,
@@ -90,6 +96,29 @@ def run(args: Select) -> None:
     write_json(args.output, report)
     if not args.quiet:
         print_picks(report, selection, args.output)
+
+
+def _refine(args: Select) -> Refine | None:
+    """How far picks are moved, as the options say.
+
+    Raises:
+        ValueError: If a number is out of range, or the box is none.
+    """
+    if not args.refine:
+        if args.refine_box is not None:
+            raise ValueError(
+                "--refine-box must have --refine COUNT, without which picks stay; add it, e.g. --refine 40"
+            )
+        return None
+    box = None
+    if args.refine_box is not None:
+        try:
+            box = tuple(float(x) for x in args.refine_box.split(","))
+        except ValueError:
+            raise ValueError(
+                f"--refine-box must be six numbers with commas between, got {args.refine_box!r}; correct it"
+            ) from None
+    return Refine(evaluations=args.refine, box=box)
 
 
 def print_picks(report: dict, selection: Selection, output: Path) -> None:
@@ -110,6 +139,9 @@ def print_picks(report: dict, selection: Selection, output: Path) -> None:
         ("view", "score", "margin", *(f"{name}: z" if compared else f"{_SHORT.get(name, name)} %" for name in groups)),
         rows,
     )
+    for pick in selection.picks:
+        if pick.camera is not None and pick.start is not None:
+            print(f"{pick.name}: moved, its score is {pick.score:.4g} instead of {pick.start:.4g}")
     for note in selection.notes:
         print(f"note: {note}")
     known = report["known"]

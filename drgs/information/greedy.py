@@ -28,6 +28,7 @@ from drgs.information.combine import Combination
 from drgs.information.criteria import criterion_named
 from drgs.information.network_groups import NETWORK_GROUPS
 from drgs.information.pool import Pool, Question, Selection, ViewQuestion
+from drgs.information.refining import refined
 
 __all__ = ["AskedView", "InformationSource", "ViewInformation", "greedy"]
 
@@ -113,8 +114,13 @@ class ViewInformation:
         for view in views:
             yield self._finished(view, next(answers))
 
+    def again(self, most: int) -> Callable[[Camera], Information]:
+        """What asks further cameras, so many at most, one at a time."""
+        self.expect(most)
+        return lambda camera: next(self.each([AskedView(f"{camera.name}, moved", camera)]))
+
     def expect(self, more: int) -> None:
-        """So many views will be asked for once more, for `progress`."""
+        """So many more views will be asked for, for `progress`."""
         self._expected += more
 
     def _source(self, view: AskedView) -> InformationSource:
@@ -143,6 +149,8 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         combination: How a score is made of it; default by that scoring, all groups together.
     """
     combination = combination or Combination(pool.scoring)
+    if pool.refine is not None and combination.apart:
+        raise ValueError("select: refine must be None with combine zscore, which compares candidates; use combine sum")
     prior = pool.scoring.prior_of()
     if not combination.traced or combination.apart:  # a trace alone has no lambda
         _check_prior(pool, prior)
@@ -165,11 +173,21 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         order = sorted((i for i in left if i in fresh), key=lambda i: -gains[i].total)  # stable: ties by index
         best = order[0]
         margin = gains[best].total - gains[order[1]].total if len(order) > 1 else None
-        selection.picks.append(pool.pick(best, gains[best].total, gains[best].parts, margin))
+        pick, told = pool.pick(best, gains[best].total, gains[best].parts, margin), kept.get(best)
+        if pool.refine is not None:
+            score = combination.scorer(H, everything)
+            asked = information.again(pool.refine.evaluations)
+            camera, gain, moved, count = refined(pool, pool.candidates[best], gains[best], score, asked, pool.refine)
+            selection.evaluations += count
+            pick = dataclasses.replace(pick, score=gain.total, parts=gain.parts, camera=camera, start=pick.score)
+            told = told if moved is None else moved
+        selection.picks.append(pick)
         if len(selection.picks) == pool.k:
             return selection
         left.remove(best)
-        _add(H, kept.pop(best))
+        kept.pop(best)
+        assert told is not None  # kept, as more than one is picked
+        _add(H, told)
         fresh = set()  # the other scores are bounds now
         selection.evaluations += _refresh(gains, left, fresh, falling, combination.scorer(H, everything), kept)
         for i, gain in zip(left, combination.compared([gains[i] for i in left]), strict=True):

@@ -15,6 +15,7 @@ from drgs.ellipsoids import Scene
 from drgs.gain import Information
 from drgs.information.cache import Cache, camera_key, value_key
 from drgs.information.choices import Combine
+from drgs.information.refining import Refine
 from drgs.information.scoring import Scoring
 
 __all__ = ["Pick", "Pool", "Question", "Selection", "ViewQuestion", "Workers"]
@@ -32,6 +33,8 @@ class Pick:
         margin: This score minus the next best one's at that time; None when nothing else was left or the policy ranks
             nothing. With several threads sums differ in their last digits, so that ties and near-ties may fall
             differently from run to run.
+        camera: Where it was moved to, and what `score` and `parts` are of; None: nobody asked for that.
+        start: Score of the candidate itself, if it was to be moved; `margin` is of it.
     """
 
     index: int
@@ -39,6 +42,8 @@ class Pick:
     score: float
     parts: dict[str, float]
     margin: float | None
+    camera: Camera | None = None
+    start: float | None = None
 
 
 @dataclasses.dataclass
@@ -168,6 +173,7 @@ class Pool:
         progress: Called with (views done, views) after each view whose information is known.
         information: Camera -> Information, in place of what `drgs.fisher` computes.
         workers: Processes that compute information; None: this one.
+        refine: How far picks are moved to where they tell more; None: not at all.
     """
 
     scene: Scene
@@ -183,6 +189,7 @@ class Pool:
     progress: Callable[[int, int], object] | None = None
     information: Callable[[Camera], Information] | None = None
     workers: Workers | None = None
+    refine: Refine | None = None
 
     def answers(self, question: Question, cameras: Iterable[Camera]) -> Iterator[Information]:
         """What views say to one question, one after another; see `told`."""

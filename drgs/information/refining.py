@@ -1,0 +1,185 @@
+"""A candidate moved to where its view tells more, within bounds.
+
+A list of candidates is a sample of the places where a camera can be; the best of them is near a better one. From there
+the camera goes along its own axes and turns about two of them, one motion at a time, each kept where the score is
+higher, in steps that are halved when none is: the pattern search of Hooke and Jeeves (1961). It needs scores alone, of
+which one costs as much as that of a candidate; a gradient by differences would need ten for each step, and the score
+has corners wherever a Gaussian enters the image.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drgs.cameras import Camera
+from drgs.guards.arguments import ArgumentError, kind_of
+
+if TYPE_CHECKING:
+    from drgs.gain import Gain, Information
+    from drgs.information.pool import Pool
+
+__all__ = ["Refine", "refined"]
+
+_AXES = ("right", "down", "forward")
+_HALVED = 4  # times, after which the steps are a 16th of the first
+_HIGHER = 1e-6  # relative: what rounding may change of a score
+_SOLID = 0.5  # opacity from which on a Gaussian is in the way
+_NEAREST = 10  # of them that stand nearest; fewer may be floaters
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Refine:
+    """How far and how long a pick is moved.
+
+    Attributes:
+        evaluations: Views that are scored for each pick, at most.
+        box: Lowest and highest x, y and z of the camera's center, world units: (x0, y0, z0, x1, y1, z1); None: of the
+            box around all candidates and known views.
+        turn: How far the camera's axis may turn from the candidate's, degrees.
+    Raises:
+        ValueError: If a value is out of range.
+    """
+
+    evaluations: int = 40
+    box: tuple[float, ...] | None = None
+    turn: float = 15.0
+
+    def __post_init__(self) -> None:
+        if type(self.evaluations) is not int or self.evaluations < 1:
+            raise ArgumentError(
+                f"Refine: evaluations must be a whole number >= 1, got {kind_of(self.evaluations)}; try 40"
+            )
+        if not 0 <= self.turn <= 90:
+            raise ArgumentError(f"Refine: turn must be in [0, 90] degrees, got {self.turn!r}; try 15")
+        if self.box is not None:
+            object.__setattr__(self, "box", tuple(float(x) for x in self.box))
+            low, high = np.array(self.box[:3]), np.array(self.box[3:])
+            if len(self.box) != 6 or not np.isfinite(self.box).all() or (low > high).any():
+                raise ArgumentError(
+                    f"Refine: box must be x0, y0, z0, x1, y1, z1, lowest before highest, got {self.box}; correct it"
+                )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Bounds:
+    """Where a camera may be.
+
+    Attributes:
+        low, high: (3,) corners of the box, world units.
+        forward: (3,) the axis that it must not leave by more than `turn` degrees.
+        turn: That.
+        solid: (M, 3) Gaussians that it must not come nearer to than any of the pool's cameras is.
+        clearance: Distance to the tenth of these that is nearest.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+    forward: np.ndarray
+    turn: float
+    solid: np.ndarray
+    clearance: float
+
+    @classmethod
+    def of(cls, pool: Pool, camera: Camera, refine: Refine) -> _Bounds:
+        """Those of a candidate of a pool."""
+        centers = np.stack([x.center for x in (*pool.candidates, *pool.train)])
+        seen = pool.scene.at(camera.time)
+        means = seen.means.detach().double().cpu().numpy() + np.asarray(seen.origin)
+        solid = means[(seen.logit_opacities.detach().sigmoid() > _SOLID).cpu().numpy()]
+        low, high = (centers.min(0), centers.max(0)) if refine.box is None else np.split(np.array(refine.box), 2)
+        clearance = min((_distance(solid, center) for center in centers), default=0.0)
+        return cls(low, high, camera.c2w[:3, 2], refine.turn, solid, clearance)
+
+    def hold(self, camera: Camera, start: Camera) -> bool:
+        """Whether a camera keeps them; a candidate outside of the box may stay outside, not go further out."""
+        beyond = lambda x: np.maximum(np.maximum(self.low - x, x - self.high), 0).max()  # noqa: E731
+        if beyond(camera.center) > beyond(start.center) + 1e-9 * np.abs(self.high - self.low).max():
+            return False
+        cosine = float(np.clip(camera.c2w[:3, 2] @ self.forward, -1, 1))
+        if math.degrees(math.acos(cosine)) > self.turn + 1e-6:
+            return False
+        return _distance(self.solid, camera.center) >= min(self.clearance, _distance(self.solid, start.center))
+
+
+def _distance(solid: np.ndarray, center: np.ndarray) -> float:
+    """To the tenth nearest Gaussian; infinite where there are fewer."""
+    if len(solid) < _NEAREST:
+        return math.inf
+    return float(np.partition(np.linalg.norm(solid - center, axis=1), _NEAREST - 1)[_NEAREST - 1])
+
+
+def refined(
+    pool: Pool,
+    start: Camera,
+    gain: Gain,
+    score: Callable[[Information], Gain],
+    ask: Callable[[Camera], Information],
+    refine: Refine,
+) -> tuple[Camera, Gain, Information | None, int]:
+    """A candidate moved to where it tells more.
+
+    Args:
+        pool: The views that it was chosen among.
+        start, gain: The candidate, and what it tells.
+        score: Gain of a view's information against that of the known views.
+        ask: Information of a view.
+        refine: How far and how long.
+    Returns:
+        The camera, its gain and its information (None where it has not moved), and how many views were scored.
+    """
+    bounds = _Bounds.of(pool, start, refine)
+    shift = _shift(pool.candidates)
+    best, most, told = start, gain, None
+    asked = 0
+    motions = [(kind, axis, sign) for kind in ("go", "turn") for axis in _AXES for sign in (1, -1)]
+    motions = [x for x in motions if x[:2] != ("turn", "forward")]  # a roll shows the same place
+    for halved in range(_HALVED + 1):
+        rose = True
+        while rose:
+            rose = False
+            for kind, axis, sign in motions:
+                size = sign * (shift if kind == "go" else math.radians(refine.turn) / 2) / 2**halved
+                camera = _moved(best, kind, _AXES.index(axis), size)
+                while size and asked < refine.evaluations and bounds.hold(camera, start):
+                    information = ask(camera)
+                    own = score(information)
+                    asked += 1
+                    if own.total <= most.total + _HIGHER * abs(most.total):
+                        break
+                    best, most, told, rose = camera, own, information, True
+                    camera = _moved(best, kind, _AXES.index(axis), size)
+            if asked >= refine.evaluations:
+                return best, most, told, asked
+    return best, most, told, asked
+
+
+def _shift(cameras: Sequence[Camera]) -> float:
+    """Half of how far candidates are from the next one, the median; 0 where all are in one place."""
+    centers = np.unique(np.stack([x.center for x in cameras]).round(9), axis=0)
+    if len(centers) < 2:
+        return 0.0
+    apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
+    np.fill_diagonal(apart, np.inf)
+    return float(np.median(apart.min(1))) / 2
+
+
+def _moved(camera: Camera, kind: str, axis: int, size: float) -> Camera:
+    """A camera that went along one of its axes, or turned about it, by world units or radians."""
+    back = np.eye(4)  # from its new axes to those it had, inverted
+    if kind == "go":
+        back[axis, 3] = -size
+    else:
+        a, b = (k for k in range(3) if k != axis)
+        back[a, a] = back[b, b] = math.cos(size)
+        back[a, b], back[b, a] = math.sin(size), -math.sin(size)
+    poses = ("w2c", "w2c_end") if camera.is_rolling else ("w2c",)
+    return dataclasses.replace(camera, **{name: back @ np.array(_rigid(getattr(camera, name))) for name in poses})
+
+
+def _rigid(pose: object) -> list:
+    return pose.tolist() if hasattr(pose, "tolist") else pose  # type: ignore[return-value]
