@@ -177,7 +177,10 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         if pool.refine is not None:
             score = combination.scorer(H, everything)
             asked = information.again(pool.refine.evaluations)
-            camera, gain, moved, count = refined(pool, pool.candidates[best], gains[best], score, asked, pool.refine)
+            start = pool.candidates[best]
+            camera, gain, moved, count = refined(
+                pool.scene, pool.candidates, pool.train, start, gains[best], score, asked, pool.refine
+            )
             selection.evaluations += count
             pick = dataclasses.replace(pick, score=gain.total, parts=gain.parts, camera=camera, start=pick.score)
             told = told if moved is None else moved

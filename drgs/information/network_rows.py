@@ -211,7 +211,7 @@ class _Written:
     """A sink that writes the rows of these hits down.
 
     Args:
-        firsts: Where the first hit of each ray goes, one array a shared ray.
+        firsts: Number of the first hit of each ray, one array a shared ray.
         total: How many there are.
         width: How many of their last channels are wanted.
     """

@@ -33,8 +33,8 @@ class Pick:
         margin: This score minus the next best one's at that time; None when nothing else was left or the policy ranks
             nothing. With several threads sums differ in their last digits, so that ties and near-ties may fall
             differently from run to run.
-        camera: Where it was moved to, and what `score` and `parts` are of; None: nobody asked for that.
-        start: Score of the candidate itself, if it was to be moved; `margin` is of it.
+        camera: The candidate's camera as it was moved, of which `score` and `parts` are; None where nothing is moved.
+        start: Score of the candidate itself, which `margin` is of; None likewise.
     """
 
     index: int

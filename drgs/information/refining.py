@@ -20,8 +20,8 @@ from drgs.cameras import Camera
 from drgs.guards.arguments import ArgumentError, kind_of
 
 if TYPE_CHECKING:
+    from drgs.ellipsoids import Scene
     from drgs.gain import Gain, Information
-    from drgs.information.pool import Pool
 
 __all__ = ["Refine", "refined"]
 
@@ -73,7 +73,7 @@ class _Bounds:
         low, high: (3,) corners of the box, world units.
         forward: (3,) the axis that it must not leave by more than `turn` degrees.
         turn: That.
-        solid: (M, 3) Gaussians that it must not come nearer to than any of the pool's cameras is.
+        solid: (M, 3) Gaussians that it must not come nearer to than any of the cameras is.
         clearance: Distance to the tenth of these that is nearest.
     """
 
@@ -85,15 +85,15 @@ class _Bounds:
     clearance: float
 
     @classmethod
-    def of(cls, pool: Pool, camera: Camera, refine: Refine) -> _Bounds:
-        """Those of a candidate of a pool."""
-        centers = np.stack([x.center for x in (*pool.candidates, *pool.train)])
-        seen = pool.scene.at(camera.time)
+    def of(cls, scene: Scene, cameras: Sequence[Camera], start: Camera, refine: Refine) -> _Bounds:
+        """Those of a candidate, of which there are more, among `cameras`."""
+        centers = np.stack([x.center for x in cameras])
+        seen = scene.at(start.time)
         means = seen.means.detach().double().cpu().numpy() + np.asarray(seen.origin)
         solid = means[(seen.logit_opacities.detach().sigmoid() > _SOLID).cpu().numpy()]
         low, high = (centers.min(0), centers.max(0)) if refine.box is None else np.split(np.array(refine.box), 2)
         clearance = min((_distance(solid, center) for center in centers), default=0.0)
-        return cls(low, high, camera.c2w[:3, 2], refine.turn, solid, clearance)
+        return cls(low, high, start.c2w[:3, 2], refine.turn, solid, clearance)
 
     def hold(self, camera: Camera, start: Camera) -> bool:
         """Whether a camera keeps them; a candidate outside of the box may stay outside, not go further out."""
@@ -114,7 +114,9 @@ def _distance(solid: np.ndarray, center: np.ndarray) -> float:
 
 
 def refined(
-    pool: Pool,
+    scene: Scene,
+    candidates: Sequence[Camera],
+    known: Sequence[Camera],
     start: Camera,
     gain: Gain,
     score: Callable[[Information], Gain],
@@ -124,7 +126,8 @@ def refined(
     """A candidate moved to where it tells more.
 
     Args:
-        pool: The views that it was chosen among.
+        scene: The scene.
+        candidates, known: The cameras that it was chosen among, and those of known views.
         start, gain: The candidate, and what it tells.
         score: Gain of a view's information against that of the known views.
         ask: Information of a view.
@@ -132,8 +135,8 @@ def refined(
     Returns:
         The camera, its gain and its information (None where it has not moved), and how many views were scored.
     """
-    bounds = _Bounds.of(pool, start, refine)
-    shift = _shift(pool.candidates)
+    bounds = _Bounds.of(scene, [*candidates, *known], start, refine)
+    shift = _shift(candidates)
     best, most, told = start, gain, None
     asked = 0
     motions = [(kind, axis, sign) for kind in ("go", "turn") for axis in _AXES for sign in (1, -1)]
