@@ -301,7 +301,7 @@ class _Reduced:
 def _diagonal(view: _View, groups: Groups, probes: int, generator: torch.Generator) -> Iterator[Information]:
     pull = view.pullback(groups)
     for count in view.batches(groups, probes):
-        total: Information = {}  # of a few, in their precision; what all add up to is float64
+        total: dict[str, torch.Tensor] = {}  # of a few, in their precision; what all add up to is float64
         for slopes in pull(_signs(generator, count, view.call.pixels, view.rows)):
             for name, x in slopes.items():
                 total[name] = total[name].addcmul_(x, x) if name in total else x.square()
