@@ -50,12 +50,33 @@ def test_points_are_where_the_ball_is(tmp_path, behind):
 
 
 def test_places_are_looked_at_in_all_photographs(tmp_path):
-    """What a place looks like, and that nothing is behind a camera."""
+    """How many show a place, of those that none shows as empty; and that nothing is behind a camera."""
     hull = Hull.of(around(tmp_path))
-    colors, is_empty = hull.look(np.array([[0, 0, 0], [0, 1.5, 0], [0, 9.0, 0], [0, 0.4 * DISTANCE, 2 * DISTANCE]]))
-    assert is_empty.tolist() == [False, True, False, False]
-    assert np.isfinite(colors[..., 0]).sum(axis=0).tolist() == [6, 6, 0, 1]
+    places = np.array([[0, 0, 0], [0, 1.5, 0], [0, 9.0, 0], [0, 0.4 * DISTANCE, 2 * DISTANCE]])
+    assert hull.room(places).tolist() == [6, -1, 0, 1]
+    assert hull.is_denied(places).tolist() == [False, True, False, False]
+    np.testing.assert_allclose(hull.colors(places[:1]), [(0.6, 0.5, 0.4)], atol=2 / 255)
     np.testing.assert_allclose(hull.center, 0, atol=1e-6)
+
+
+def test_edges_deny_nothing(tmp_path):
+    """Points of a surface, as exact as matches are, are at the edge of some silhouette of many: all stay."""
+    hull = Hull.of(around(tmp_path, count=60))
+    way = np.random.default_rng(0).normal(size=(500, 3))
+    surface = RADIUS * way / np.linalg.norm(way, axis=1, keepdims=True)
+    pixel = 4 * RADIUS / SIZE
+    assert not hull.is_denied(surface * (1 + 0.7 * pixel / RADIUS)).any()
+    assert hull.is_denied(surface * (1 + 5 * pixel / RADIUS)).all()
+
+
+def test_how_far_it_is_is_told(tmp_path):
+    """Stages with what is done of them: many photographs take seconds."""
+    told = []
+    views = around(tmp_path)
+    hull = Hull.of(views, lambda *stage: told.append(stage))
+    hull.points(100, np.random.default_rng(0), lambda *stage: told.append(stage))
+    assert told[:6] == [("silhouettes", number, 6) for number in range(1, 7)]
+    assert told[-1] == ("room for points", 100, 100)
 
 
 def test_nothing_is_said_where_photographs_do_not_tell(tmp_path):

@@ -92,8 +92,8 @@ def initial_points(
             source = f"triangulated from {len(views)} given poses, {found} points"
             return points, colors, f"{source}; {len(points)} with guesses where there are none"
         tried = f" (triangulation gave {found})"
-        hull = Hull.of(views)
-        room = None if hull is None else hull.points(min(max_points, _MAX_RANDOM), rng)
+        hull = Hull.of(views, progress)
+        room = None if hull is None else hull.points(min(max_points, _MAX_RANDOM), rng, progress)
         if room is not None:
             return *room, f"random where none of {len(views)} cameras sees the background, {len(room[0])} points{tried}"
     points, colors = points_anywhere(views, min(max_points, _MAX_RANDOM), rng)
@@ -125,10 +125,10 @@ def triangulated_points(
     found = len(points)
     if found < _MIN_TRIANGULATED:
         return points[:0], colors[:0], found
-    hull = Hull.of(views)
+    hull = Hull.of(views, progress)
     if hull is not None:
-        # Two photographs agreed about what a third one says is not there.
-        there = ~hull.look(points)[1]
+        # Two photographs agreed about what two others say is not there.
+        there = ~hull.is_denied(points)
         points, colors, shown = points[there], colors[there], shown[:, there]
     # What no two views show would stay empty: density control does not leave what there is. Guesses are as dense as
     # what is triangulated, at most as many, but together they are enough; and the budget is shared by area.
@@ -137,7 +137,7 @@ def triangulated_points(
     as_dense = len(points) * min(1.0, share / max(1 - share, 1e-9))
     guesses = round(min(max(_ENOUGH - len(points), as_dense), share * max_points))
     keep = subset(len(points), max_points - guesses, rng)
-    room = None if hull is None else hull.points(guesses, rng)
+    room = None if hull is None else hull.points(guesses, rng, progress)
     more, more_colors = room or points_beside(views, points, shown, guesses, rng)
     return np.concatenate([points[keep], more]), np.concatenate([colors[keep], more_colors]), found
 
