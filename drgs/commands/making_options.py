@@ -96,10 +96,10 @@ class Demo(Common):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Scene(Common):
-    """Make a data set by path tracing: a room, a kitchen or a hall in motion, a still life, or one as of a phone."""
+    """Make a data set by path tracing: a room, a kitchen or hall in motion, a still life, or one like a phone's."""
 
     name: Positional[Literal["room", "kitchen", "hall", "still_life", "capture"]]
-    """All but the last two have classes, points and a teacher; kitchen and hall move; capture is as a phone's."""
+    """Room, kitchen and hall have classes, points and a teacher, the latter two move; capture is like a phone's."""
     output: OutputPath
     """Folder for the data set; an interrupted command is continued there."""
     size: str | None = None

@@ -37,6 +37,8 @@ __all__ = ["NetworkRows"]
 _FIELDS = {"means": 0, "quats": 3, "log_scales": 6, "logit_opacities": 9}
 """Fields of Gaussians -> where the geometry of a row has theirs; rotations in place of quats."""
 
+_MOST = 1 << 23  # hits of a traversal that are written down: about 1 GB, sorted
+
 
 class NetworkRows:
     """J^T of a view by parameters of its scene."""
@@ -60,7 +62,8 @@ class NetworkRows:
         semantics: SemanticMetric | None,
         names: Sequence[str],
     ) -> NetworkRows | None:
-        """That of a view; None where these parameters reach the image by more than the geometry of its Gaussians.
+        """That of a view; None where these parameters reach the image by more than the geometry of its Gaussians, or
+        hits are too many to be written down.
 
         Args:
             scene: The scene; where it knows which of its Gaussians `moving`, (N,) bool, says move, the others are not
@@ -80,7 +83,13 @@ class NetworkRows:
         lib = replay.lib
         flags = lib.UInt32(to_drjit(lib, which.float().to(replay.call.home)).array)
         dr.eval(flags)
-        hits = [hit for walk in replay.walks((1.0, 1.0, 1.0)) if (hit := _written(replay, walk, flags)) is not None]
+        hits = []
+        for walk in replay.walks((1.0, 1.0, 1.0)):
+            firsts, each = _counted(replay, walk, flags)
+            if int(each.sum()) > _MOST:
+                return None
+            if each.any():
+                hits.append(_written(replay, walk, flags, firsts, each))
         return cls(fields, hits, which.nonzero()[:, 0].to(replay.call.home), replay)
 
     def __call__(self, images: torch.Tensor) -> Iterator[dict[str, torch.Tensor]]:
@@ -155,34 +164,36 @@ def _row_width(channels: int) -> int:
     return GEOMETRY + channels + 1
 
 
-def _written(replay: Replay, walk: Walk, flags: UInt32) -> _Hits | None:
-    """The hits of some Gaussians, those whose flag is not 0, in one traversal; None if there are none."""
+def _counted(replay: Replay, walk: Walk, flags: UInt32) -> tuple[list[UInt32], torch.Tensor]:
+    """Number of the first hit of each ray on the Gaussians whose flag is not 0, one array a shared ray; and how many
+    each ray has, of all shared rays one after the other.
+    """
     lib = replay.lib
-    channels = slice(0, walk.channels.outputs) if walk.first else slice(walk.start, walk.start + walk.channels.channels)
-    width = channels.stop - channels.start
-    states = replay.run(walk, _Counted(lib, flags))
-    counts = [state["count"] for state in states]
+    counts = [state["count"] for state in replay.run(walk, _Counted(lib, flags))]
     dr.eval(counts)
     each = torch.cat([x.torch().to(torch.int64) for x in counts])
-    ends = each.cumsum(0)
-    total = int(ends[-1]) if len(ends) else 0
-    if not total:
-        return None
-    firsts = [lib.UInt32(lib.Int32(x.int())) for x in (ends - each).split([dr.width(x) for x in counts])]
-    sink = _Written(lib, flags, firsts, total, width)
+    firsts = (each.cumsum(0) - each).split([dr.width(x) for x in counts])
+    return [_integers(lib, x) for x in firsts], each
+
+
+def _written(replay: Replay, walk: Walk, flags: UInt32, firsts: list[UInt32], each: torch.Tensor) -> _Hits:
+    """The hits that `_counted` has counted, by Gaussian."""
+    lib = replay.lib
+    channels = slice(0, walk.channels.outputs) if walk.first else slice(walk.start, walk.start + walk.channels.channels)
+    sink = _Written(lib, flags, firsts, int(each.sum()), channels.stop - channels.start)
     dr.eval(replay.run(walk, sink), sink.rows, sink.owners)
-    flat = torch.cat([(x + dr.zeros(lib.UInt32, dr.width(c))).torch().to(torch.int64)
-                      for x, c in zip(walk.part.flat, counts, strict=True)])  # fmt: skip
-    pixels = flat.repeat_interleave(each)
+    rays = [x + dr.zeros(lib.UInt32, dr.width(first)) for x, first in zip(walk.part.flat, firsts, strict=True)]
+    pixels = torch.cat([x.torch().to(torch.int64) for x in rays]).repeat_interleave(each)
     owners = sink.owners.torch().to(torch.int64)
     order = torch.argsort(owners, stable=True)
     names, lengths = torch.unique_consecutive(owners[order], return_counts=True)
     starts = torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
-    rows = sink.rows.torch().reshape(total, -1)[order]
-    integers = lambda x: lib.UInt32(lib.Int32(x.int()))  # noqa: E731
-    return _Hits(
-        channels, walk.first, to_drjit(lib, rows.reshape(-1)).array, integers(pixels[order]), names, integers(starts)
-    )
+    rows = to_drjit(lib, sink.rows.torch().reshape(len(owners), -1)[order].reshape(-1)).array
+    return _Hits(channels, walk.first, rows, _integers(lib, pixels[order]), names, _integers(lib, starts))
+
+
+def _integers(lib: Lib, x: torch.Tensor) -> UInt32:
+    return lib.UInt32(lib.Int32(x.int()))
 
 
 class _Counted:

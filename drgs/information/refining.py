@@ -181,8 +181,4 @@ def _moved(camera: Camera, kind: str, axis: int, size: float) -> Camera:
         back[a, a] = back[b, b] = math.cos(size)
         back[a, b], back[b, a] = math.sin(size), -math.sin(size)
     poses = ("w2c", "w2c_end") if camera.is_rolling else ("w2c",)
-    return dataclasses.replace(camera, **{name: back @ np.array(_rigid(getattr(camera, name))) for name in poses})
-
-
-def _rigid(pose: object) -> list:
-    return pose.tolist() if hasattr(pose, "tolist") else pose  # type: ignore[return-value]
+    return dataclasses.replace(camera, **{name: back @ np.array(getattr(camera, name).tolist()) for name in poses})
