@@ -8,6 +8,7 @@ import json
 import numpy as np
 import pytest
 from json_page import check
+from plain_stage import plain_stage
 
 from drgs import cli, scenes
 from drgs.data import load
@@ -27,11 +28,7 @@ def parts(seed):
 
 @pytest.fixture(scope="module")
 def stage():
-    """The Mitsuba scene of seed 0; nothing shines in it, because tables of glossy materials take seconds."""
-    material = scenes.material
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scenes, "material", lambda bsdf, *rest: material({"type": "diffuse"}, *rest))
-        return filmed.Stage(hall.PLAY, 0)
+    return plain_stage(hall.PLAY)
 
 
 @pytest.fixture(scope="module")

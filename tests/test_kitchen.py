@@ -9,6 +9,7 @@ import json
 import numpy as np
 import pytest
 from json_page import OF_CAPTURE, check
+from plain_stage import plain_stage
 
 from drgs import cli, scenes
 from drgs.scenes import filmed, kitchen, labelled, moving, tabletop, teacher, videos
@@ -23,11 +24,7 @@ MOVING = [NUMBERS[name] for name in kitchen.MOVING]
 
 @pytest.fixture(scope="module")
 def stage():
-    """The Mitsuba scene of seed 0; nothing shines in it, because tables of glossy materials take seconds."""
-    material = scenes.material
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scenes, "material", lambda bsdf, *rest: material({"type": "diffuse"}, *rest))
-        return filmed.Stage(kitchen.PLAY, 0)
+    return plain_stage(kitchen.PLAY)
 
 
 @pytest.fixture(scope="module")

@@ -69,6 +69,8 @@ class Hull:
         focus = Focus.of(cameras) if len(views) >= _FEWEST_VIEWS else None
         if focus is None or len({camera.time for camera in cameras}) > 1:
             return None
+        if progress:
+            progress("silhouettes", 0, len(views))
         some = views[:: -(-len(views) // _SOME)]
         if np.mean([_is_behind(view, view.image(*_size(view.camera))).mean() for view in some]) < _LEAST_EMPTY:
             return None
