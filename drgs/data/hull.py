@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from drgs.cameras import Camera
@@ -22,8 +21,7 @@ _LEAST_EMPTY = 0.2  # share of the pixels that show the background; below it, it
 _BACKGROUND = 0.06  # largest difference of a channel from its color: a sensor's noise, a compressed edge
 _SOME = 8  # photographs that say whether there is a background at all
 _WIDTH = 400  # pixels; averages of several are less noisy
-_EDGE = 2  # of these, that a silhouette may be off: poses and triangulated points are not exact, edges are soft
-_AGREED = 2  # photographs that must deny what two others have agreed about
+_DENIED = 0.1  # of the photographs that show a place, part that may deny what two have agreed about: edges are soft
 _ROUND = 50_000  # places at a time
 _ROUNDS = 40
 _FEWEST_FOUND = 100  # of all rounds; fewer say that silhouettes do not agree
@@ -40,7 +38,6 @@ class Hull:
         cameras: Those of the images below, without lenses.
         images: (H, W, 3) each.
         is_empty: (H, W) bool each, which pixels show the background.
-        is_clear: (H, W) bool each, which of these are more than two pixels from any that do not.
         counts: (H, W) bool each, which pixels are inside the view's mask.
         center: (3,) where the cameras look, world.
         reach: Half the diagonal of what a camera sees at that distance, world units.
@@ -49,7 +46,6 @@ class Hull:
     cameras: list[Camera]
     images: list[np.ndarray]
     is_empty: list[np.ndarray]
-    is_clear: list[np.ndarray]
     counts: list[np.ndarray]
     center: np.ndarray
     reach: float
@@ -74,20 +70,18 @@ class Hull:
         some = views[:: -(-len(views) // _SOME)]
         if np.mean([_is_behind(view, view.image(*_size(view.camera))).mean() for view in some]) < _LEAST_EMPTY:
             return None
-        smaller, images, is_empty, is_clear, counts, reaches = [], [], [], [], [], []
+        smaller, images, is_empty, counts, reaches = [], [], [], [], []
         for number, (view, camera) in enumerate(zip(views, cameras, strict=True)):
             size = _size(camera)
             smaller.append(camera.resized(*size))
             images.append(view.image(*size))
             is_empty.append(_is_behind(view, images[-1]))
-            around = np.ones((2 * _EDGE + 1, 2 * _EDGE + 1), np.uint8)
-            is_clear.append(cv2.erode(is_empty[-1].astype(np.uint8), around, borderType=cv2.BORDER_REPLICATE) > 0)
             mask = view.mask(*size)
             counts.append(np.ones(size[::-1], bool) if mask is None else mask > MASK_KEEP)
             reaches.append(np.linalg.norm(camera.center - focus.center) * np.hypot(*size) / 2 / smaller[-1].K[0, 0])
             if progress:
                 progress("silhouettes", number + 1, len(views))
-        return cls(smaller, images, is_empty, is_clear, counts, focus.center, float(np.median(reaches)))
+        return cls(smaller, images, is_empty, counts, focus.center, float(np.median(reaches)))
 
     def room(self, places: np.ndarray) -> np.ndarray:
         """(P,) how many photographs show each of places (P, 3), where none of these shows the background; else -1."""
@@ -103,16 +97,17 @@ class Hull:
         return number
 
     def is_denied(self, places: np.ndarray) -> np.ndarray:
-        """(P,) bool, whether two photographs or more show nothing but the background at places (P, 3) and around them.
+        """(P,) bool, whether more than a tenth of the photographs that show places (P, 3) show the background there.
 
-        For places that others agree about: of a hundred photographs some show each point of a surface at the edge of
-        its silhouette, where a pixel decides.
+        For places that two others agree about: of a hundred photographs some show each point of a surface at the edge
+        of its silhouette, where a pixel decides.
         """
-        denials = np.zeros(len(places), np.int64)
+        denials, number = np.zeros((2, len(places)))
         for index in range(len(self.cameras)):
             shown, columns, rows = self._pixels(index, places)
-            denials[shown] += self.is_clear[index][rows, columns]
-        return denials >= _AGREED
+            number[shown] += 1
+            denials[shown] += self.is_empty[index][rows, columns]
+        return denials > _DENIED * number
 
     def colors(self, places: np.ndarray) -> np.ndarray:
         """(P, 3) float32 medians of what photographs show at places (P, 3), each of which one shows."""

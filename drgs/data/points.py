@@ -127,7 +127,7 @@ def triangulated_points(
         return points[:0], colors[:0], found
     hull = Hull.of(views, progress)
     if hull is not None:
-        # Two photographs agreed about what two others say is not there.
+        # Two photographs agreed about what others say is not there.
         there = ~hull.is_denied(points)
         points, colors, shown = points[there], colors[there], shown[:, there]
     # What no two views show would stay empty: density control does not leave what there is. Guesses are as dense as
