@@ -7,6 +7,8 @@ is a `Scoring`; its criteria are in information/criteria.py.
     fisher      `criterion` of the Fisher information (gain.py)
     fisherrf    `eig` of what FisherRF's rasterizer computes, no rotations
     moments     variance of the features along the rays (Magic Moments), averaged over pixels
+    blur        least sharp rendering
+    renderers   variance of the colors between renderers of the same Gaussians, averaged over pixels
     coverage    sum_i Wc_i / (W_i + lambda), W = sum over pixels of w^2: how much is seen that was seen little
     farthest    the camera center farthest from those there are; of several times, the center and the time
     uniform     evenly spaced among the views sorted by name; of several times, among the times and the cameras

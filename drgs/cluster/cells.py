@@ -20,7 +20,7 @@ from drgs.cluster.payloads import Missing, opened_payload
 from drgs.files import atomic_write
 from drgs.guards.locks import InUse, host_of
 from drgs.guards.writing import is_full
-from drgs.studies.cells import FAILURES, Study, result_line, run_cell
+from drgs.studies.cells import FAILURES, Study, out_of_race, result_line, run_cell
 from drgs.studies.rows import Cell, append_row, is_done, read_study
 
 if TYPE_CHECKING:
@@ -48,7 +48,8 @@ def run_cells_on(
     """Work through cells on a cluster, one at a time on each worker; rows are appended here, as they come.
 
     A fit that fails is told and left for the next call; the others go on. On Ctrl-C, workers of this machine end;
-    those of a cluster that was joined finish the cell that they have, and its row is found by the next call.
+    those of a cluster that was joined finish the cell that they have, and its row is found by the next call. All cells
+    are handed out at once: who has left a race (`drgs.studies.race`) is asked when the call begins.
 
     Args:
         cluster: The workers.
@@ -67,16 +68,19 @@ def run_cells_on(
     runs = runs.resolve()
     runs.mkdir(parents=True, exist_ok=True)
     there = read_study(rows)
-    left = [
+    out = {protocol: out_of_race(study, there, protocol) for protocol in {cell.protocol for cell in cells}}
+    for sentence in (x for found in out.values() for x in found.values()):
+        say(sentence)
+    open_cells = [
         (number, cell)
         for number, cell in enumerate(cells, 1)
-        if not is_done(study.name, cell, there, study.measured_later)
+        if cell.policy not in out[cell.protocol] and not is_done(study.name, cell, there, study.measured_later)
     ]
-    if not left:
+    if not open_cells:
         return [], {}
     with _token(runs) as token:
         _check_shared(cluster, token)
-        return _Round(cluster, study, left, len(cells), runs, rows, token, say).all()
+        return _Round(cluster, study, open_cells, len(cells), runs, rows, token, say).all()
 
 
 @contextlib.contextmanager

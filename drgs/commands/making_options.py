@@ -132,12 +132,13 @@ class Scene(Common):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Reproduce(Common, Clustered):
-    """Repeat a table of arXiv 2512.22771 on made scenes or on your data: fits by every policy, means, intervals."""
+    """Compare policies on made scenes or on your data, as arXiv 2512.22771 does: fits by each, means, intervals."""
 
     what: Positional[ExperimentName]
-    """Policies on static scenes, or where things move (dynamic); lambda (prior), or what the score counts (blocks)."""
+    """Policies on static scenes, or where things move (dynamic); lambda (prior), or what the score counts (blocks);
+    policies by color alone, to 20 views (captures)."""
     output: OutputPath
-    """Folder for scenes, runs, rows.jsonl, tables and figures, of all four; what is finished there is kept."""
+    """Folder for scenes, runs, rows.jsonl, tables and figures, of all of these; what is finished there is kept."""
     data: Annotated[tuple[Path, ...], arg(metavar="DATA"), UseAppendAction] = ()
     """A data set to take in place of the made scenes; may be repeated."""
     scale: StudyScale = "small"

@@ -42,7 +42,7 @@ Criterion = Literal["v_opt", "eig", "logdet", "trace_cov", "block_logdet"]
 
 CRITERION_NAMES: tuple[Criterion, ...] = typing.get_args(Criterion)
 
-Policy = Literal["fisher", "fisherrf", "coverage", "moments", "farthest", "uniform", "random"]
+Policy = Literal["fisher", "fisherrf", "coverage", "moments", "blur", "renderers", "farthest", "uniform", "random"]
 """The names of `POLICIES` that are this package's."""
 
 POLICY_NAMES: tuple[Policy, ...] = typing.get_args(Policy)
@@ -54,7 +54,9 @@ POLICIES: Registry[Callable[[Any], Any]] = Registry(
         "fisher": "drgs.policies.informed:fisher",
         "fisherrf": "drgs.policies.informed:fisherrf",
         "coverage": "drgs.policies.informed:coverage",
-        "moments": "drgs.policies.informed:moments",
+        "moments": "drgs.policies.pictures:moments",
+        "blur": "drgs.policies.pictures:blur",
+        "renderers": "drgs.policies.pictures:renderers",
         "farthest": "drgs.policies.spread:farthest",
         "uniform": "drgs.policies.spread:uniform",
         "random": "drgs.policies.spread:random",

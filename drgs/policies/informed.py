@@ -8,22 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import torch
-
-from drgs.gain import Information
 from drgs.information.blocks import CoverageQuestion, DiagonalQuestion, SceneBlocks
 from drgs.information.combine import Asked, Combination, Questions, asked_of
 from drgs.information.greedy import InformationSource, ViewInformation, greedy
 from drgs.information.pool import Pool, Selection
 
-if TYPE_CHECKING:
-    from drgs.cameras import Camera
-    from drgs.ellipsoids import Scene
-    from drgs.settings import RenderSettings
-
-__all__ = ["coverage", "fisher", "fisherrf", "moments"]
+__all__ = ["coverage", "fisher", "fisherrf"]
 
 _FEW_PROBES = 8  # of a network's information, below which 1 / H is far too large on average
 
@@ -101,34 +93,3 @@ def _scored(pool: Pool, **fields: Any) -> Pool:
 def _without_rotations(groups: Mapping[str, float]) -> dict[str, float]:
     """What is said of groups that FisherRF's rasterizer knows."""
     return {name: x for name, x in groups.items() if name != "rotations"}
-
-
-def moments(pool: Pool) -> Selection:
-    """Largest variance of the features along the rays, on average over pixels; of colors where there are no features.
-
-    It needs no training views, and picks do not change it: k picks are the k best, whatever they share.
-    """
-    scores = []
-    for number, found in enumerate(pool.answers(_Moments(pool.scoring.settings), pool.candidates), 1):
-        scores.append(float(found["moments"]))
-        if pool.progress:
-            pool.progress(number, len(pool.candidates))
-    order = sorted(range(len(scores)), key=lambda i: -scores[i])  # stable: ties by index
-    picks = []
-    for place, i in enumerate(order[: pool.k]):
-        margin = scores[i] - scores[order[place + 1]] if place + 1 < len(order) else None
-        picks.append(pool.pick(i, scores[i], margin=margin))
-    notes = ["moments rank candidates one by one: picks do not take each other into account"] if pool.k > 1 else []
-    return Selection(picks, scores, evaluations=len(scores), notes=notes)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Moments:
-    """The mean over a view's pixels of the variance along their rays, as a question."""
-
-    settings: RenderSettings
-
-    def __call__(self, scene: Scene, camera: Camera, mask: torch.Tensor | None) -> Information:
-        from drgs.information.maps import moments_map  # loads Dr.Jit, which other policies need not have
-
-        return {"moments": moments_map(scene.at(camera.time), camera, self.settings).double().mean()}

@@ -31,13 +31,14 @@ from drgs.guards.writing import is_full
 from drgs.machine import forget_peak_memory
 from drgs.metrics import Lpips
 from drgs.studies.protocols import PROTOCOLS
+from drgs.studies.race import decided
 from drgs.studies.rows import Cell, append_row, is_done, read_study
 from drgs.train import fit
 
 if TYPE_CHECKING:
     from drgs.data import Dataset
 
-__all__ = ["FAILURES", "Metric", "Study", "distinct_seeds", "result_line", "run_cell", "run_cells"]
+__all__ = ["FAILURES", "Metric", "Study", "distinct_seeds", "out_of_race", "result_line", "run_cell", "run_cells"]
 
 FAILURES = (ValueError, OSError, ArithmeticError, RuntimeError, MemoryError)
 """What a fit raises that cannot be done; the next one may do."""
@@ -99,6 +100,7 @@ class Study:
         reference: Label of the policy that the others are compared with.
         comparisons: More pairs (policy, reference) to be compared.
         lpips: Weights of a backbone: every row then has LPIPS, those of finished runs, too.
+        race: A policy has no more fits once its difference from the reference is known (`drgs.studies.race`).
     """
 
     name: str
@@ -109,6 +111,7 @@ class Study:
     reference: str
     comparisons: tuple[tuple[str, str], ...] = ()
     lpips: Path | None = None
+    race: bool = False
 
     @property
     def measured_later(self) -> tuple[str, ...]:
@@ -257,8 +260,17 @@ def run_cells(
     """
     taken = list[Cell]()
     failed = dict[Cell, str]()
+    told = set[str]()
     for number, cell in enumerate(cells, 1):
-        if is_done(study.name, cell, read_study(rows), study.measured_later):
+        known = read_study(rows)
+        if is_done(study.name, cell, known, study.measured_later):
+            continue
+        out = out_of_race(study, known, cell.protocol)
+        for sentence in out.values():
+            if sentence not in told:
+                say(sentence)
+                told.add(sentence)
+        if cell.policy in out:
             continue
         say(f"{number} of {len(cells)}: {cell.name}")
         try:
@@ -275,6 +287,13 @@ def run_cells(
         append_row(rows, row)
         say(result_line(study, cell, row))
     return taken, failed
+
+
+def out_of_race(study: Study, rows: Iterable[Mapping[str, Any]], protocol: str) -> dict[str, str]:
+    """Policies that have left a study's race, and a sentence each that says why; none where there is no race."""
+    if not study.race:
+        return {}
+    return decided([row for row in rows if row["study"] == study.name], study.reference, protocol)
 
 
 def result_line(study: Study, cell: Cell, row: Mapping[str, Any]) -> str:

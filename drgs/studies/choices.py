@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
-__all__ = ["ExperimentName", "ProtocolName", "StudyScale"]
+__all__ = ["ExperimentName", "ProtocolName", "StudyName", "StudyScale"]
 
-ExperimentName = Literal["static", "dynamic", "prior", "blocks"]
+ExperimentName = Literal["static", "dynamic", "prior", "blocks", "captures"]
+StudyName = Literal["static", "dynamic", "captures"]
 ProtocolName = Literal["paper", "blind", "fisherrf", "nbv-gym"]
 StudyScale = Literal["tiny", "small", "paper"]

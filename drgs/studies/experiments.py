@@ -1,11 +1,12 @@
-"""The experiments of arXiv 2512.22771, one a table of the paper: policies, scenes, sizes, and the paper's own numbers.
+"""The experiments: those of arXiv 2512.22771, one a table of the paper, and one of our own; their policies and sizes.
 
     static     policies on static scenes with labels
     dynamic    policies where things move: one camera at each later time
     prior      lambda, where things move
     blocks     what the criterion counts, where things move
+    captures   policies on photographs, by color alone, from 2 views to 20; not the paper's
 
-The last three are of one study: they share cells. Their policies' labels are names in rows, and stay.
+`dynamic`, `prior` and `blocks` are of one study: they share cells. Policies' labels are names in rows, and stay.
 """
 
 from __future__ import annotations
@@ -13,12 +14,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from drgs.fitting.config import FitConfig, Schedule, SelectionConfig
 from drgs.information.prior import Prior
 from drgs.studies.cells import Metric, Study
-from drgs.studies.choices import ExperimentName, StudyScale
+from drgs.studies.choices import ExperimentName, StudyName, StudyScale
 from drgs.studies.made import Sizes, made_folder
 
 __all__ = ["EXPERIMENTS", "SIZES", "Experiment", "PaperNumbers", "fisher_policy", "metrics_of", "study_of"]
@@ -30,6 +31,7 @@ _BASELINES = ("random", "uniform", "farthest", "moments", "fisherrf")
 _JOINT = "geometry+semantic, eig"
 _DEFAULT = "geometry+semantic+backdrop, v_opt"
 _MOVING_DEFAULT = "joint+backdrop, v_opt"
+_COLOR_DEFAULT = "geometry+backdrop, v_opt"
 
 
 def fisher_policy(criterion: str, *blocks: str, prior: float | None = None) -> dict[str, Any]:
@@ -49,6 +51,8 @@ _POLICIES: Mapping[str, Mapping[str, Any] | None] = {
     "joint": fisher_policy("eig", *_EVERYTHING),
     **{f"joint, lambda {x}": fisher_policy("eig", *_EVERYTHING, prior=float(x)) for x in ("0", "1e-7", "1e-5")},
     _MOVING_DEFAULT: {"policy": "fisher"},
+    **{name: {"policy": name} for name in ("blur", "renderers")},
+    _COLOR_DEFAULT: {"policy": "fisher"},
     "all views": None,
 }
 
@@ -59,20 +63,22 @@ class Experiment:
 
     Attributes:
         title, told: What it shows.
-        study: `static` or `dynamic`: whose cells they are.
+        study: Whose cells they are.
         policies: Label -> what the table calls it.
         reference: The label that the others are compared with.
         paper: Label -> the paper's numbers, as far as its text states them.
         source: Place in the paper, and its data.
+        race: Its study is one, see `Study`; and units take two splits of a data set in turn.
     """
 
     title: str
     told: str
-    study: Literal["static", "dynamic"]
+    study: StudyName
     policies: Mapping[str, str]
     reference: str
     paper: Mapping[str, PaperNumbers]
     source: str
+    race: bool = False
 
 
 _NAMES = {name: name for name in _BASELINES} | {"moments": "Magic Moments", "fisherrf": "FisherRF"}
@@ -136,6 +142,21 @@ EXPERIMENTS: Mapping[ExperimentName, Experiment] = {
         {"joint": {"psnr": 28.62}},
         _NEU3D,
     ),
+    "captures": Experiment(
+        "Policies on captures",
+        "Two views, one more every so many steps until 20; color of held-out views, no features.",
+        "captures",
+        {
+            **{name: name for name in ("random", "uniform", "farthest", "blur", "renderers")},
+            "fisherrf": "FisherRF",
+            "geometry": "geometry, eig",
+            _COLOR_DEFAULT: "drgs: with backdrop, v_opt",
+        },
+        _COLOR_DEFAULT,
+        {},
+        "",
+        race=True,
+    ),
 }
 """The paper's numbers are those that its text states: PSNR of its own criterion, of FisherRF and of Magic Moments (by
 their distances), and of every lambda."""
@@ -166,6 +187,33 @@ SIZES: Mapping[tuple[str, StudyScale], Sizes] = {
     ),
     ("static", "paper"): Sizes(
         FitConfig(renderers=("fast",), max_steps=7000), (320, 240), (80, 60), every=200, views=84
+    ),
+    ("captures", "tiny"): Sizes(
+        _fit(max_pixels=1_200, max_steps=150, max_gaussians=500, semantics="ignore"),
+        (40, 30),
+        (20, 15),
+        every=20,
+        add=3,
+        measure=(3,),
+        views=24,
+    ),
+    ("captures", "small"): Sizes(
+        _fit(max_pixels=10_800, max_gaussians=8_000, max_steps=1400, semantics="ignore"),
+        (160, 120),
+        (40, 30),
+        every=40,
+        add=18,
+        measure=(3, 4, 6, 8, 10, 12),
+        views=84,
+    ),
+    ("captures", "paper"): Sizes(
+        FitConfig.of(renderers=("fast",), max_steps=7000, semantics="ignore"),
+        (320, 240),
+        (80, 60),
+        every=200,
+        add=18,
+        measure=(3, 4, 6, 8, 10, 12),
+        views=84,
     ),
     ("dynamic", "tiny"): Sizes(
         _fit(
@@ -199,13 +247,15 @@ SIZES: Mapping[tuple[str, StudyScale], Sizes] = {
 nineteenth on those that move, features and decoder go five times as fast, and there the field, too."""
 
 
-def metrics_of(study: Literal["static", "dynamic"], lpips: bool = False) -> tuple[Metric, ...]:
+def metrics_of(study: StudyName, lpips: bool = False) -> tuple[Metric, ...]:
     """What a row holds; those of labels are None where a data set has none."""
     color = [Metric("ssim", "SSIM"), Metric("psnr", "PSNR", 2), Metric("flip", "FLIP", larger=False)]
     if lpips:
         color.append(Metric("lpips", "LPIPS", larger=False))
     if study == "dynamic":
         color.append(Metric("psnr_moving", "PSNR, moving pixels", 2, optional=True))
+    if study == "captures":
+        return tuple(color)
     labels = {"pixel_accuracy": "pixel accuracy", "class_accuracy": "class-mean accuracy", "miou": "mIoU"}
     return (
         *color,
@@ -214,7 +264,7 @@ def metrics_of(study: Literal["static", "dynamic"], lpips: bool = False) -> tupl
 
 
 def study_of(
-    study: Literal["static", "dynamic"],
+    study: StudyName,
     scale: StudyScale,
     made: Path,
     given: Mapping[str, Path] | None = None,
@@ -234,13 +284,16 @@ def study_of(
     sizes = SIZES[study, scale]
     own = [label for x in EXPERIMENTS.values() if x.study == study for label in x.policies]
     schedule: Schedule = "times" if study == "dynamic" else "auto"
-    selection = SelectionConfig(add=sizes.add, every=sizes.every, info_pixels=sizes.info_pixels, schedule=schedule)
+    selection = SelectionConfig(
+        add=sizes.add, every=sizes.every, info_pixels=sizes.info_pixels, schedule=schedule, measure=sizes.measure
+    )
     return Study(
         name=f"{study}-{scale}",
         folder=made_folder(study, sizes, made / scale, given or {}),
         policies=policies or {label: _POLICIES[label] for label in dict.fromkeys(own)},
         fit=sizes.fit.replace(selection=selection),
         metrics=metrics_of(study, lpips is not None),
-        reference="random",
+        reference=next(x.reference for x in EXPERIMENTS.values() if x.study == study),
+        race=any(x.race for x in EXPERIMENTS.values() if x.study == study),
         lpips=lpips,
     )

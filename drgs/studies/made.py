@@ -6,10 +6,10 @@ import dataclasses
 import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Literal
 
 from drgs.display.progress import Bar
 from drgs.fitting.config import FitConfig
+from drgs.studies.choices import StudyName
 
 __all__ = ["MADE_SPLIT", "Sizes", "made_folder"]
 
@@ -26,6 +26,7 @@ class Sizes:
         image, teacher: (width, height) of images and of a teacher's maps.
         every: Steps between two picks; None: by the number of steps, where things move.
         add: Views to be picked; None: 10, or one at each later time.
+        measure: Numbers of views at which the held-out views are measured, before the end.
         views: Views of a room.
         cameras: Cameras of a kitchen; it has as many times as the fit takes.
         info_pixels: Pixels of the views that information is computed from; None: those of the fit.
@@ -36,20 +37,21 @@ class Sizes:
     teacher: tuple[int, int]
     every: int | None = None
     add: int | None = None
+    measure: tuple[int, ...] = ()
     views: int = 0
     cameras: int = 0
     info_pixels: int | None = None
 
 
 def made_folder(
-    study: Literal["static", "dynamic"], sizes: Sizes, made: Path, given: Mapping[str, Path]
+    study: StudyName, sizes: Sizes, made: Path, given: Mapping[str, Path]
 ) -> Callable[[str, tuple[int, int]], Path]:
     """Scene and split -> folder of the data set, as `Study.folder`; other processes can be sent it."""
     return functools.partial(_made, study, sizes, made, dict(given))
 
 
 def _made(
-    study: Literal["static", "dynamic"],
+    study: StudyName,
     sizes: Sizes,
     made: Path,
     given: Mapping[str, Path],
@@ -65,7 +67,7 @@ def _made(
     (w, h) = sizes.teacher
     size = {"width": width, "height": height, "teacher_width": w, "teacher_height": h, "seed": _number(scene)}
     with Bar(f"path tracing {scene}") as bar:
-        if study == "static":
+        if study != "dynamic":
             return room.generate(made / scene, views=sizes.views, test_every=split[0], progress=bar.update, **size)
         times = sizes.fit.data.times
         return kitchen.generate(made / scene, cameras=sizes.cameras, times=times, progress=bar.update, **size)

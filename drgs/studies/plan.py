@@ -91,18 +91,21 @@ def plan_of(
         study, policies={label: study.policies[label] for label in wanted}, fit=study.fit.replace(**own)
     )
     study.fit.replace(test_every=split[0], test_offset=split[1])  # refuses numbers that cannot be
-    units = []
+    splits = [split]
+    if experiment.race and split[0]:
+        splits.append((split[0], (split[1] + split[0] // 2) % split[0]))
+    turns = list[list]()
     notes = list[str]()
     lacking = set[tuple[str, str]]()
     for scene, path in scenes.items():
         dataset = data.load(
             path, test_every=split[0], test_offset=split[1], lazy=True, points=False, times=study.fit.data.times
         )
-        found = _units_of(study, scene, dataset, moves, split, seeds, protocol)
-        units += found
+        turns.append(_units_of(study, scene, dataset, moves, splits, seeds, protocol))
         told, missing = _missing(study, scene, dataset)
         notes += told
         lacking |= {(scene, label) for label in missing}
+    units = [turn[k] for k in range(seeds) for turn in turns]  # seeds outermost, as of scenes that are made
     if not given and moves:
         units = [(f"kitchen-{seed}", _CAMERA, "first", protocol, 0) for seed in range(1, seeds + 1)]
     elif not given:
@@ -113,9 +116,15 @@ def plan_of(
 
 
 def _units_of(
-    study: Study, scene: str, dataset: data.Dataset, moves: bool, split: tuple[int, int], seeds: int, protocol: str
+    study: Study,
+    scene: str,
+    dataset: data.Dataset,
+    moves: bool,
+    splits: Sequence[tuple[int, int]],
+    seeds: int,
+    protocol: str,
 ) -> list:
-    """Those of a data set that was given."""
+    """Those of a data set that was given; they take the splits in turn, unless its files state one."""
     if dataset.is_dynamic != moves:
         want, is_one = ("several times", "one") if moves else ("one time", "several")
         raise ValueError(f"{dataset.path}: must show a scene at {want}, shows {is_one}; choose another experiment")
@@ -131,11 +140,15 @@ def _units_of(
             )
         return [(scene, cameras[0], "first", protocol, seed) for seed in range(seeds)]
     names = sorted(view.name for view in (*train, *test, *dataset.absent))
-    every, offset = split
+    every, offset = splits[0]
     asked = set(names[offset::every] if every else ()) - {view.name for view in dataset.absent}
-    held_out = split if {view.name for view in test} == asked else _UNKNOWN
-    drawn = distinct_seeds(study, scene, held_out, seeds, protocol)
-    return [(scene, held_out, "seed", protocol, seed) for seed in drawn]
+    own = splits if {view.name for view in test} == asked else [_UNKNOWN]
+    units = dict[int, tuple]()
+    for place, held_out in enumerate(own):
+        turns = range(place, seeds, len(own))
+        drawn = distinct_seeds(study, scene, held_out, len(turns), protocol) if turns else []
+        units |= {k: (scene, held_out, "seed", protocol, seed) for k, seed in zip(turns, drawn, strict=True)}
+    return [units[k] for k in range(seeds)]
 
 
 def _missing(study: Study, scene: str, dataset: data.Dataset) -> tuple[list[str], list[str]]:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from drgs.studies.cells import Metric, Study
+from drgs.studies.cells import Metric, Study, out_of_race
 from drgs.studies.experiments import Experiment
 from drgs.studies.protocols import PROTOCOLS
-from drgs.studies.statistics import Unit, estimate, unit_of, values_of
-from drgs.studies.tables import comparison_table, explained, markdown_table, paragraph, unlike_units
+from drgs.studies.statistics import Unit, estimate, unit_of, values_of, view_counts
+from drgs.studies.tables import comparison_table, curves, explained, markdown_table, paragraph, unlike_units
 
 __all__ = ["best_of_units", "results_page", "results_rows"]
 
@@ -53,6 +54,10 @@ def results_page(
             parts.append(f"Against {named[experiment.reference]}, within units:")
             parts.append(comparison_table(study, mine, pairs, names=named))
             parts.append(paragraph(explained(study, mine, pairs)))
+        if counts := view_counts(mine):
+            first = [metric for metric in study.metrics if metric.key == _BEST_BY]
+            parts.append(curves(dataclasses.replace(study, metrics=tuple(first)), mine, counts))
+        parts += out_of_race(study, mine, protocol).values()
     if any(experiment.paper.get(label) for label in labels):
         parts.append(
             paragraph(

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 __all__ = [
+    "FEWEST",
     "Effect",
     "Unit",
     "at_views",
@@ -38,8 +39,10 @@ __all__ = [
 Unit = tuple[str, tuple[int, int], tuple[str, ...]]
 """Scene, split, and what was given before the first pick."""
 
+FEWEST = 6
+"""Units from which on there is a verdict: five that all agree do so by chance in one of 16 studies (two-sided)."""
+
 _DRAWS = 10_000
-_QUANTILES = 0.025, 0.975
 # Count -> share of 95 % intervals that hold the true mean: of scenes with one unit, or of units of one scene; of scenes
 # with 3 to 5 units that differ as much as their units do, from 8 on half as much.
 _HELD = {2: 0.50, 3: 0.75, 4: 0.79, 5: 0.83, 6: 0.86, 8: 0.88, 10: 0.89, 12: 0.90, 15: 0.92}
@@ -55,7 +58,7 @@ class Effect:
 
     Attributes:
         mean: Mean of the scenes' means.
-        low, high: Its 95 % interval.
+        low, high: Its interval, of 95 % unless another share was asked for.
         detectable: How large a true difference has to be for a t test of so many scenes' means (of one scene: of its
             units) to tell it from 0 in 4 of 5 studies, with 5 % of false alarms; None with a single mean.
         units, scenes: How many there are.
@@ -119,12 +122,13 @@ def differences(rows: Sequence[Mapping[str, Any]], metric: str, policy: str, ref
     return {unit: value - theirs[unit] for unit, value in ours.items() if unit in theirs}
 
 
-def estimate(values: Mapping[Unit, float], draws: int = _DRAWS) -> Effect:
+def estimate(values: Mapping[Unit, float], draws: int = _DRAWS, share: float = 0.95) -> Effect:
     """Mean over scenes of the means over their units, and how certain it is.
 
     Args:
         values: Unit -> difference, at least one.
         draws: Draws of the bootstrap, the same ones every time.
+        share: Of the drawn means, within the interval.
     """
     scenes: dict[str, list[float]] = {}
     for unit, value in values.items():
@@ -137,7 +141,7 @@ def estimate(values: Mapping[Unit, float], draws: int = _DRAWS) -> Effect:
     )
     drawn = rng.integers(count, size=(draws, count))
     resampled = np.take_along_axis(means, drawn[None], axis=0)[0].mean(1)
-    low, high = np.quantile(resampled, _QUANTILES)
+    low, high = np.quantile(resampled, ((1 - share) / 2, (1 + share) / 2))
     return Effect(
         mean=float(np.mean([np.mean(x) for x in scenes.values()])),
         low=float(low),

@@ -13,6 +13,7 @@ from drgs.files import atomic_write
 from drgs.studies.cells import Metric, Study
 from drgs.studies.protocols import PROTOCOLS
 from drgs.studies.statistics import (
+    FEWEST,
     Effect,
     Unit,
     at_views,
@@ -26,6 +27,7 @@ from drgs.studies.statistics import (
 
 __all__ = [
     "comparison_table",
+    "curves",
     "explained",
     "fill_between",
     "markdown_table",
@@ -35,8 +37,6 @@ __all__ = [
 ]
 
 StudyRows = Sequence[Mapping[str, Any]]
-
-_FEWEST = 6  # units: five that all agree do so by chance in one of 16 studies (sign test, both sides)
 
 
 def study_report(study: Study, rows: StudyRows, level: int = 3) -> str:
@@ -74,7 +74,7 @@ def study_report(study: Study, rows: StudyRows, level: int = 3) -> str:
                 table += "\n\n" + verdicts
             parts += [f"{below} Other pairs", table]
         if counts := view_counts(mine):
-            parts += [f"{below} Against the number of views", _curves(study, mine, counts)]
+            parts += [f"{below} Against the number of views", curves(study, mine, counts)]
         parts += [f"{below} Every unit", _points(study, mine)]
     if len(protocols) > 1:
         parts += [f"{'#' * level} `paper` against `blind`", _leaked(study, rows)]
@@ -186,7 +186,7 @@ def explained(study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]]) -
     units = len({unit for values in intervals for unit in values})
     if not intervals:
         return "Differences within a unit; of a single one there is no interval, and no verdict."
-    judged = sum(len(values) >= _FEWEST for values in intervals)
+    judged = sum(len(values) >= FEWEST for values in intervals)
     held = coverage(scenes, units)
     told = (
         f"**Gain** and **loss**: the interval excludes 0. Were all policies equal, about {judged * (1 - held):.1f} of "
@@ -249,7 +249,7 @@ def unlike_units(rows: StudyRows) -> str:
     return "Means of rows with different units do not compare; the differences within units do."
 
 
-def _curves(study: Study, rows: StudyRows, counts: Sequence[int]) -> str:
+def curves(study: Study, rows: StudyRows, counts: Sequence[int]) -> str:
     """Of each metric: policies against numbers of views, on average over scenes; below, what is left of differences."""
     told = (
         "Measured with so many views, on the way just before the next one is picked, with the last number at the end; "
@@ -317,7 +317,7 @@ def _difference(metric: Metric, found: Effect) -> str:
 
 def _verdict(metric: Metric, found: Effect) -> str:
     """`gain`, `loss`, or nothing where the interval holds 0 or is of too few units."""
-    if found.units < _FEWEST or found.low <= 0 <= found.high:
+    if found.units < FEWEST or found.low <= 0 <= found.high:
         return ""
     return "gain" if (found.mean > 0) == metric.larger else "loss"
 
@@ -333,7 +333,7 @@ def _verdicts(study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]]) -
             one = found[metric.key]
             if one and (word := _verdict(metric, one)):
                 words[word].append(metric.title)
-        if not any(one and one.units >= _FEWEST for one in found.values()):
+        if not any(one and one.units >= FEWEST for one in found.values()):
             continue
         told = [f"{verbs[word]} {', '.join(names)}" for word, names in words.items() if names]
         lines.append(

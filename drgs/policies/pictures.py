@@ -1,0 +1,121 @@
+"""Policies that look at what candidates show, each by itself: no training view is needed, nothing is differentiated.
+
+Picks do not change the scores: k picks are the k best, whatever they share.
+
+Reference:
+    [1] Pech-Pacheco et al.: Diatom autofocusing in brightfield microscopy: a comparative study, 2000.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import torch
+
+from drgs.information.pool import Pool, Question, Selection
+from drgs.settings import RenderSettings
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.ellipsoids import Scene
+    from drgs.gain import Information
+
+__all__ = ["blur", "moments", "renderers"]
+
+_COMPARED = ("exact", "fast", "gsplat", "3dgut")
+_LUMA = (0.299, 0.587, 0.114)  # of R, G and B, ITU-R BT.601
+_BLACK = 1e-12  # added to a sharpness, which is 0 of a picture of one color
+
+
+def moments(pool: Pool) -> Selection:
+    """Largest variance of the features along the rays, on average over pixels; of colors where there are no features.
+
+    "Magic Moments"; see `drgs.information.maps`.
+    """
+    return _ranked(pool, "moments", _Moments(pool.scoring.settings))
+
+
+def blur(pool: Pool) -> Selection:
+    """Least sharp rendering: smallest variance of the Laplacian of the luma over the image [1].
+
+    The score is minus the logarithm of that variance. A view that is rendered without detail is taken to be a bad one;
+    whether detail is missing or was never there, this does not tell.
+    """
+    return _ranked(pool, "blur", _Blur(pool.scoring.settings))
+
+
+def renderers(pool: Pool) -> Selection:
+    """Largest variance of a pixel's color between renderers of the same Gaussians, on average over pixels and channels.
+
+    The presets `exact`, `fast`, `gsplat` and `3dgut`: they differ where Gaussians overlap, are large or near the
+    camera, which is where few photographs have said what they are.
+    """
+    return _ranked(pool, "renderers", _Renderers(pool.scoring.settings.background))
+
+
+def _ranked(pool: Pool, name: str, question: Question) -> Selection:
+    """The candidates that score highest, one by one."""
+    scores = []
+    for number, found in enumerate(pool.answers(question, pool.candidates), 1):
+        scores.append(float(found[name]))
+        if pool.progress:
+            pool.progress(number, len(pool.candidates))
+    order = sorted(range(len(scores)), key=lambda i: -scores[i])  # stable: ties by index
+    picks = []
+    for place, i in enumerate(order[: pool.k]):
+        margin = scores[i] - scores[order[place + 1]] if place + 1 < len(order) else None
+        picks.append(pool.pick(i, scores[i], margin=margin))
+    notes = [f"{name} ranks candidates one by one: picks do not take each other into account"] if pool.k > 1 else []
+    return Selection(picks, scores, evaluations=len(scores), notes=notes)
+
+
+# Functions that other processes can be sent; what loads Dr.Jit is imported when they are asked.
+
+
+@dataclasses.dataclass(frozen=True)
+class _Moments:
+    """The mean over a view's pixels of the variance along their rays."""
+
+    settings: RenderSettings
+
+    def __call__(self, scene: Scene, camera: Camera, mask: torch.Tensor | None) -> Information:
+        from drgs.information.maps import moments_map
+
+        return {"moments": moments_map(scene.at(camera.time), camera, self.settings).double().mean()}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Blur:
+    """How far a view is from sharp."""
+
+    settings: RenderSettings
+
+    def __call__(self, scene: Scene, camera: Camera, mask: torch.Tensor | None) -> Information:
+        shown = _shown(scene, camera, self.settings) @ torch.tensor(_LUMA, dtype=torch.float64)
+        inner = shown[1:-1, 1:-1]
+        laplacian = shown[:-2, 1:-1] + shown[2:, 1:-1] + shown[1:-1, :-2] + shown[1:-1, 2:] - 4 * inner
+        sharp = laplacian.var(correction=0) if laplacian.numel() else torch.zeros((), dtype=torch.float64)
+        return {"blur": -(sharp + _BLACK).log()}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Renderers:
+    """The mean over a view's pixels and channels of the variance between renderers."""
+
+    background: tuple[float, float, float]
+
+    def __call__(self, scene: Scene, camera: Camera, mask: torch.Tensor | None) -> Information:
+        shown = torch.stack(
+            [_shown(scene, camera, RenderSettings.preset(name, background=self.background)) for name in _COMPARED]
+        )
+        return {"renderers": shown.var(0, correction=0).mean()}
+
+
+def _shown(scene: Scene, camera: Camera, settings: RenderSettings) -> torch.Tensor:
+    """(H, W, 3) float64 colors of a view."""
+    from drgs.integrator import render
+
+    with torch.no_grad():
+        gaussians = scene.at(camera.time).detach().replace(features=None)
+        return render(gaussians, camera, settings, outputs=()).rgb.double().cpu()
