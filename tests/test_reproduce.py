@@ -73,7 +73,7 @@ def test_cells_of_made_scenes(name, tmp_path, monkeypatch):
     for scale in ("tiny", "small", "paper"):
         plan = plan_of(name, scale, tmp_path, seeds=2)
         labels = list(plan.experiment.policies)
-        scenes = {"static": 1 if scale == "tiny" else 2}.get(plan.experiment.study, 1)
+        scenes = 1 if scale == "tiny" or plan.experiment.study == "dynamic" else 2
         assert [cell.policy for cell in plan.cells] == 2 * scenes * labels
         assert len({cell.name for cell in plan.cells}) == len(plan.cells)
         assert len({repr(plan.study.config_of(cell)) for cell in plan.cells[: len(labels)]}) == len(labels)
