@@ -34,6 +34,7 @@ _NAMES = {
     "DynamicGaussians": "deform",
     "FitConfig": "train",
     "Gaussians": "ellipsoids",
+    "Planner": "planner",
     "Prior": "gain",
     "RenderSettings": "settings",
     "Scoring": "select",
@@ -79,6 +80,7 @@ _MODULES = frozenset(
         "meshing",
         "metrics",
         "oracle",
+        "planner",
         "plugin",
         "policies",
         "rasterize",
@@ -106,6 +108,7 @@ __all__ = [
     "DynamicGaussians",
     "FitConfig",
     "Gaussians",
+    "Planner",
     "Prior",
     "RenderSettings",
     "Scoring",
@@ -156,6 +159,7 @@ if TYPE_CHECKING:
     from drgs import meshing as meshing
     from drgs import metrics as metrics
     from drgs import oracle as oracle
+    from drgs import planner as planner
     from drgs import plugin as plugin
     from drgs import policies as policies
     from drgs import rasterize as rasterize
@@ -181,6 +185,7 @@ if TYPE_CHECKING:
     from drgs.fitting.records import load_run
     from drgs.gain import Prior
     from drgs.integrator import render, render_jvp
+    from drgs.planner import Planner
     from drgs.rasterize import rasterization
     from drgs.select import Scoring, Selection
     from drgs.select import select as select_views

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 
 from drgs.cameras import Camera
@@ -13,6 +15,7 @@ __all__ = [
     "MASK_KEEP",
     "back_project",
     "empty_share",
+    "points_along_rays",
     "points_anywhere",
     "points_beside",
     "scene_extent",
@@ -140,8 +143,27 @@ def points_anywhere(views: list[View], count: int, rng: np.random.Generator) -> 
     two if two look anywhere.
     """
     cameras = [view.camera.undistorted() for view in views]
-    distance = _focus_distance(cameras)
     masks = [view.mask() if view.mask_path is not None else None for view in views]
+    return points_along_rays(cameras, [view.image if view.has_image else None for view in views], masks, count, rng)
+
+
+def points_along_rays(
+    cameras: list[Camera],
+    images: Sequence[Callable[[], np.ndarray] | None],
+    masks: Sequence[np.ndarray | None],
+    count: int,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """`points_anywhere` of cameras without a lens: (P, 3) world points, at most `count`, and their (P, 3) colors.
+
+    Args:
+        cameras: The cameras that look.
+        images: What each of them sees, (H, W, 3) in [0, 1], when it is called; None: gray.
+        masks: (H, W) in [0, 1], where points may be; None: everywhere.
+        count: Number of points at most.
+        rng: Source of all random choices.
+    """
+    distance = _focus_distance(cameras)
     drawn = 8 * count
     points, colors = [], []
     for index, camera in enumerate(cameras):
@@ -155,9 +177,9 @@ def points_anywhere(views: list[View], count: int, rng: np.random.Generator) -> 
         # points.
         depth = 1.0 / rng.uniform(1 / (3 * distance), 2 / distance, number)
         points.append(back_project(camera, pixels, depth))
-        view = views[index]
+        image = images[index]
         gray = np.full((number, 3), 0.5, dtype=np.float32)
-        colors.append(view.image().reshape(-1, 3)[pixels] if view.has_image else gray)
+        colors.append(gray if image is None else image().reshape(-1, 3)[pixels])
     if not points:
         return np.empty((0, 3)), np.empty((0, 3), dtype=np.float32)
     points, colors = np.concatenate(points), np.concatenate(colors)

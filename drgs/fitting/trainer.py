@@ -189,6 +189,19 @@ class Trainer:
         self._queue = self._queue[:0]
         self._sample()
 
+    def drop_frame(self, name: str) -> None:
+        """Fit no longer to the photograph of that name; the epoch begins anew.
+
+        Raises:
+            ValueError: If there is no such photograph, or no other one.
+        """
+        left = [frame for frame in self.frames if frame.name != name]
+        if not left or len(left) == len(self.frames):
+            raise ValueError(f"fit: {name!r} must be one of two photographs or more, is not; keep it")
+        self.frames = left
+        self._queue = self._queue[:0]
+        self._sample()
+
     def reschedule(self, max_steps: int) -> None:
         """Let the fit end at another step; schedules go by the share of the steps that is done, so that they go on.
 

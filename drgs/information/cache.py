@@ -78,9 +78,7 @@ class Cache:
     def find(self, scene: Scene, key: Hashable) -> Information | None:
         """What is stored under a key for this scene, which is a hit; None if nothing is."""
         with self._lock:
-            if self._scene is None or not self._scene.is_still(scene):
-                self.invalidate()
-                self._scene = _State(scene)
+            self._look_at(scene)
             if key not in self._answers:
                 return None
             self._answers.move_to_end(key)
@@ -99,17 +97,30 @@ class Cache:
             self.misses += 1
             if self._scene is None or not self._scene.is_still(scene):
                 return
-            if (before := self._answers.pop(key, None)) is not None:  # computed twice, by two calls at a time
-                self.bytes -= size_of(before)
-            if (size := size_of(answer)) > self.max_bytes:
-                self.evictions += 1
-                return
-            self._answers[key] = answer
-            self.bytes += size
-            while self.bytes > self.max_bytes:
-                _, oldest = self._answers.popitem(last=False)
-                self.bytes -= size_of(oldest)
-                self.evictions += 1
+            self._store(key, answer)
+
+    def _look_at(self, scene: Scene) -> None:
+        """Forget everything if it is another scene than last time."""
+        if self._scene is None or not self._scene.is_still(scene):
+            self.invalidate()
+            self._scene = _State(scene)
+
+    def _store(self, key: Hashable, answer: Information) -> None:
+        """Keep an answer in place of one that is there, and let go of what there is no room for."""
+        self._forget(key)  # computed twice, by two calls at a time
+        if (size := size_of(answer)) > self.max_bytes:
+            self.evictions += 1
+            return
+        self._answers[key] = answer
+        self.bytes += size
+        while self.bytes > self.max_bytes:
+            self._forget(next(iter(self._answers)))
+            self.evictions += 1
+
+    def _forget(self, key: Hashable) -> None:
+        """Let go of an answer, if it is there."""
+        if (before := self._answers.pop(key, None)) is not None:
+            self.bytes -= size_of(before)
 
     def get(self, scene: Scene, key: Hashable, compute: Callable[[], Information]) -> Information:
         """What is stored under a key for this scene, else what `compute` returns, which is then kept."""

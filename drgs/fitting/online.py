@@ -1,0 +1,158 @@
+"""A fit whose photographs come one at a time, as a robot takes them: a trainer that begins with the first of them.
+
+Where a photograph has a depth map, it brings points wherever the Gaussians leave it open, or stand behind what it
+shows. Where none has, the fit begins with random points where two cameras look, and density control does the rest.
+"""
+
+from __future__ import annotations
+
+import logging
+import warnings
+
+import numpy as np
+import torch
+
+from drgs.cameras import Camera
+from drgs.data import scene_extent
+from drgs.data.guesses import points_along_rays, subset
+from drgs.data.resizing import resize_area
+from drgs.ellipsoids import Gaussians
+from drgs.fitting.config import FitConfig
+from drgs.fitting.frames import Frame
+from drgs.fitting.rows import GaussianRows
+from drgs.fitting.trainer import Trainer
+from drgs.integrator import render
+from drgs.sizes import at_most
+
+__all__ = ["OnlineFit"]
+
+_log = logging.getLogger(__name__)
+
+_FEWEST = 2  # photographs, where none has depth
+_OPEN = 0.5  # opacity below which a pixel is open
+_BEHIND = 0.1  # relative: how far behind what a depth map shows surfaces are wrong
+_SHARE = 0.25  # of the room that is left which one photograph may fill
+_GUESSED = 10_000  # random points at most
+
+
+class OnlineFit:
+    """Gaussians that are fitted to photographs as they come.
+
+    Attributes:
+        config: What every step does. Its schedules are of `max_steps`; when these are done, twice as many follow, from
+            the middle of the schedules on.
+        trainer: The fit; None until it has something to begin with.
+    """
+
+    def __init__(self, config: FitConfig) -> None:
+        """
+        Args:
+            config: For what stands still, without a selection.
+        Raises:
+            ValueError: If it is of another kind of fit.
+        """
+        if config.selection is not None:
+            raise ValueError("planner: config must have no selection, got one; the planner chooses")
+        self.config = config
+        self.trainer: Trainer | None = None
+        self._waiting: list[Frame] = []
+        self._rng = np.random.default_rng(config.seed)
+
+    def add(self, image: np.ndarray, camera: Camera, depth: np.ndarray | None = None) -> int:
+        """One more photograph; returns the number of Gaussians that it brings.
+
+        Args:
+            image: (H, W, 3), uint8 or in [0, 1].
+            camera: Its camera, of that size.
+            depth: (H, W) z-depth in world units, 0 or NaN where it is unknown; None: there is none.
+        """
+        seen = at_most(camera, self.config.data.max_pixels)
+        pixels = _reduced(image, seen)
+        frame = Frame(camera.name, seen, torch.from_numpy(pixels))
+        if self.trainer is not None:
+            self.trainer.add_frame(frame)
+            return 0 if depth is None else self._add_points(frame, depth)
+        self._waiting.append(frame)
+        if depth is not None:
+            points, colors = self._back_projected(frame, depth, np.ones(depth.shape, bool), self._room())
+            return self._begin(points, colors, dense=True)
+        if len(self._waiting) < _FEWEST:
+            return 0
+        cameras = [one.camera.undistorted() for one in self._waiting]
+        images = [lambda one=one: one.image().numpy() for one in self._waiting]
+        most = min(self.config.density.max_gaussians, _GUESSED)
+        points, colors = points_along_rays(cameras, images, [None] * len(cameras), most, self._rng)
+        return self._begin(points, colors, dense=False)
+
+    def drop(self, name: str) -> None:
+        """Fit no longer to a photograph; the Gaussians stay."""
+        if self.trainer is not None:
+            self.trainer.drop_frame(name)
+
+    def step(self) -> float | None:
+        """One step of the fit; returns the PSNR of the photograph it saw, dB, None where it is not finite."""
+        assert self.trainer is not None, "nothing to fit yet"
+        if self.trainer.step_index >= self.trainer.config.max_steps:
+            self.trainer.reschedule(2 * self.trainer.config.max_steps)
+        return self.trainer.step().psnr
+
+    def gaussians(self) -> Gaussians:
+        """A copy of the Gaussians, which further steps leave alone."""
+        assert self.trainer is not None, "nothing to show yet"
+        g = self.trainer.gaussians()
+        return g.replace(**{name: x.clone() for name, x in g.parameters().items()})
+
+    def _begin(self, points: np.ndarray, colors: np.ndarray, dense: bool) -> int:
+        if not len(points):
+            return 0
+        rows = GaussianRows.from_points(
+            torch.from_numpy(points), torch.from_numpy(colors), *self.config.density.start_of(dense)
+        )
+        extent = scene_extent([frame.camera for frame in self._waiting], points)
+        self.trainer = Trainer(self.config, self._waiting, rows, extent)
+        self._waiting = []
+        return len(points)
+
+    def _room(self) -> int:
+        """How many Gaussians a photograph may bring."""
+        there = 0 if self.trainer is None else len(self.trainer.rows)
+        return int(_SHARE * max(self.config.density.max_gaussians - there, 0))
+
+    def _add_points(self, frame: Frame, depth: np.ndarray) -> int:
+        """Gaussians where a depth map shows what the others do not."""
+        assert self.trainer is not None  # there are others
+        seen = frame.camera
+        with torch.no_grad():
+            out = render(self.trainer.gaussians(), seen, self.config.settings, outputs=("median_depth",))
+        assert out.median_depth is not None  # it was asked for
+        alpha, known = (resize_area(x.cpu().numpy(), *depth.shape[::-1]) for x in (out.alpha, out.median_depth))
+        wanted = (alpha < _OPEN) | ((depth > 0) & (depth < (1 - _BEHIND) * known))
+        share = wanted.mean()
+        most = min(self._room(), int(share * _SHARE * self.config.density.max_gaussians))
+        points, colors = self._back_projected(frame, depth, wanted, most)
+        if len(points):
+            self.trainer.add_points(
+                torch.from_numpy(points), torch.from_numpy(colors), *self.config.density.start_of(True)
+            )
+        return len(points)
+
+    def _back_projected(
+        self, frame: Frame, depth: np.ndarray, wanted: np.ndarray, most: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Points of wanted pixels whose depth is known, (P, 3), at most so many, and their colors (P, 3)."""
+        known = np.flatnonzero(wanted & np.isfinite(depth) & (depth > 0))
+        chosen = known[subset(len(known), most, self._rng)]
+        camera = frame.camera.resized(depth.shape[1], depth.shape[0])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of pixels that no ray belongs to, whose depth is unknown
+            rays = camera.pixel_directions().reshape(-1, 3)[chosen]
+        along = rays @ camera.c2w[:3, 2]
+        points = camera.center + rays * (depth.reshape(-1)[chosen].astype(np.float64) / along)[:, None]
+        colors = resize_area(frame.image().numpy(), depth.shape[1], depth.shape[0]).reshape(-1, 3)[chosen]
+        return points, np.ascontiguousarray(colors, dtype=np.float32)
+
+
+def _reduced(image: np.ndarray, camera: Camera) -> np.ndarray:
+    """(H, W, 3) 8 bits of an image at the size of a camera."""
+    values = image.astype(np.float32) / 255 if image.dtype == np.uint8 else image.astype(np.float32)
+    return (resize_area(values, camera.width, camera.height).clip(0, 1) * 255).round().astype(np.uint8)

@@ -1,0 +1,471 @@
+"""Where to look next, for a robot: photographs come one at a time, and so do questions.
+
+    planner = drgs.Planner()
+    planner.observe(image, camera, depth)      # (H, W, 3), drgs.Camera, (H, W) or None
+    planner.fit(seconds=0.5)
+    plan = planner.next(candidates, seconds=1.0)
+    plan.picks[0].camera, plan.changed         # where to go; how far what was known has changed since
+
+What lasts from call to call: the model, what each view tells about it, and the candidates. What a view tells is asked
+again once what it sees has changed by more than a bound (`drgs.information.drift`), so that a new photograph costs what
+is new. An answer within a time budget goes by what is known by then, and says how much that is.
+
+Nothing here knows ROS, threads of its own, or maps: all methods may be called from any thread, `observe` and `fit` from
+one while another asks.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import statistics
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from drgs.cameras import Camera
+from drgs.ellipsoids import Gaussians
+from drgs.fitting.config import FitConfig
+from drgs.fitting.online import OnlineFit
+from drgs.gain import Prior
+from drgs.guards.arguments import ArgumentError, kind_of, must_be
+from drgs.guards.inputs import camera_list
+from drgs.information.drift import DriftCache, Unanswered
+from drgs.information.pool import Pick, Selection
+from drgs.information.refining import Refine
+from drgs.select import Scoring, select
+from drgs.settings import RenderSettings
+from drgs.sizes import at_most
+
+__all__ = ["Cost", "Plan", "PlannedView", "Planner"]
+
+Cost = Sequence[float] | Callable[[Camera, Camera], float]
+"""What it costs to go to each candidate, in the caller's unit; or a function: from where, to where."""
+
+_COVERAGE = Scoring(settings=RenderSettings.preset("fast"), prior=Prior(1e-6))
+_FAST = Scoring(settings=RenderSettings.preset("fast"))
+_LATELY = 9  # times that are remembered of how long something took
+
+
+def default_config() -> FitConfig:
+    """What a planner's own model is fitted by: colors, small photographs, one renderer, seconds of steps."""
+    return FitConfig.of(
+        renderers=("fast",),
+        semantics="ignore",
+        exposure="off",
+        max_pixels=12_000,
+        max_gaussians=15_000,
+        max_steps=1_000,
+        sh_degree=1,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class PlannedView:
+    """A candidate that was picked.
+
+    Attributes:
+        index: Place in the list of candidates.
+        camera: The candidate.
+        score: What its view tells, as `drgs.select_views` scores it.
+        cost: What it costs to go there, in the caller's unit; 0 where nothing was said.
+        value: The score over `look` + cost; where nothing was said of costs, the score.
+    """
+
+    index: int
+    camera: Camera
+    score: float
+    cost: float
+    value: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """An answer, and what it rests on.
+
+    Attributes:
+        picks: In the order in which to go there; fewer than were asked for where the others are not known in time.
+        scores: Score of each candidate before the first pick; None of those that nothing was known of in time.
+        changed: Largest change, in [0, 1], of what a view sees since it was asked what it tells; 0: all is as of now.
+        computed: Views that were asked for this answer.
+        left_out: Known views that nothing is known of in time.
+        seconds: Wall time.
+    """
+
+    picks: list[PlannedView]
+    scores: list[float | None]
+    changed: float
+    computed: int
+    left_out: int
+    seconds: float
+
+
+class Planner:
+    """A model that grows with every photograph, and which of the places to go to would tell most about it.
+
+    Attributes:
+        max_views: Photographs that are kept. Of one more, the one goes whose loss costs least coverage.
+        info_pixels: Views are asked at no more pixels than these.
+        look: What a photograph itself costs, in the unit of costs.
+    """
+
+    def __init__(
+        self,
+        config: FitConfig | None = None,
+        *,
+        scene: Gaussians | None = None,
+        scoring: Scoring | None = None,
+        info_pixels: int = 2_700,
+        max_views: int = 64,
+        bound: float = 0.1,
+        look: float = 1.0,
+        max_bytes: int = 1 << 30,
+    ) -> None:
+        """
+        Args:
+            config: How the planner's own model is fitted; default `drgs.planner.default_config`.
+            scene: A model of the caller's own, in its place; see `scene`.
+            scoring: How views are scored; default as `drgs.select_views`, drawn by preset `fast`.
+            info_pixels, max_views, look: See the attributes.
+            bound: Largest change of what a view sees, in [0, 1], up to which what it tells is not asked again.
+            max_bytes: Bytes of what views tell that are kept at most.
+        Raises:
+            ValueError: If a number is out of range, or the model moves.
+        """
+        for name, value in {"info_pixels": info_pixels, "max_views": max_views}.items():
+            if type(value) is not int or value < 2:
+                raise ArgumentError(f"Planner: {name} must be a whole number >= 2, got {kind_of(value)}; raise it")
+        if not 0 <= bound <= 1:
+            raise ArgumentError(f"Planner: bound must be in [0, 1], got {bound!r}; try 0.1")
+        if not (math.isfinite(look) and look > 0):
+            raise ArgumentError(f"Planner: look must be a finite number > 0, got {look!r}; try 1")
+        self.info_pixels = info_pixels
+        self.max_views = max_views
+        self.look = float(look)
+        self._scoring = scoring or _FAST
+        self._fit = OnlineFit(config or default_config())
+        self._cache = DriftCache(bound, max_bytes)
+        self._known: list[Camera] = []  # at the size at which they are asked
+        self._here: Camera | None = None
+        self._pool: list[Camera] = []
+        self._cost: Cost | None = None
+        self._own: Gaussians | None = None
+        self._seen: Gaussians | None = None  # what was asked last, while nothing has changed
+        self._counted = 0
+        self._asked_in, self._answered_in = _Duration(), _Duration()
+        self._fitting = threading.RLock()
+        self._asking = threading.RLock()
+        if scene is not None:
+            self.scene = scene
+
+    @property
+    def scene(self) -> Gaussians | None:
+        """The model as it is now, which further steps leave alone; None before there is any.
+
+        A caller that maps by itself sets it, after every change, to Gaussians that keep their order: new ones come
+        last. `observe` then notes where a photograph was taken, and `fit` has nothing to do.
+        """
+        with self._fitting:
+            if self._own is not None:
+                return self._own
+            if self._seen is None and self._fit.trainer is not None:
+                self._seen = self._fit.gaussians()
+            return self._seen
+
+    @scene.setter
+    def scene(self, gaussians: Gaussians) -> None:
+        must_be("Planner", "scene", gaussians, Gaussians, "a scene that moves has none that could be planned for")
+        with self._fitting:
+            self._own = gaussians.detach()
+
+    @property
+    def views(self) -> list[str]:
+        """Names of the photographs that are kept."""
+        return [camera.name for camera in self._known]
+
+    def observe(self, image: np.ndarray | None, camera: Camera, depth: np.ndarray | None = None) -> int:
+        """A photograph that was taken; returns how many Gaussians it brought.
+
+        Args:
+            image: (H, W, 3) uint8, or floats in [0, 1]; None if the model is the caller's own.
+            camera: Where it was taken, of the image's size; unnamed ones are named by their number.
+            depth: (H, W) distance along the camera's axis, world units, 0 or NaN where unknown; None: there is none.
+        Raises:
+            ValueError: If shapes do not agree, values are out of range, or there is no image for the planner's model.
+        """
+        must_be("Planner.observe", "camera", camera, Camera, "drgs.Camera(K=..., w2c=..., width=..., height=...)")
+        with self._fitting:
+            camera = dataclasses.replace(camera, name=self._name(camera.name))
+            added = 0
+            if self._own is None:
+                added = self._fit.add(_checked_image(image, camera), camera, _checked_depth(depth, camera))
+                self._seen = None
+            self._counted += 1
+            self._here = camera
+            self._known = [*self._known, at_most(camera, self.info_pixels)]
+        if len(self._known) > self.max_views:
+            self._let_go()
+        return added
+
+    def fit(self, steps: int | None = None, seconds: float | None = None) -> int:
+        """Go on fitting the planner's model to what was observed; returns how many steps were made.
+
+        Another thread gets an answer between two of them.
+
+        Args:
+            steps: Number of steps, at most; default 20 where no time is given either.
+            seconds: Wall time after which no further step begins.
+        """
+        begun = time.monotonic()
+        most = 20 if steps is None and seconds is None else math.inf if steps is None else steps
+        done = 0
+        while done < most and (seconds is None or time.monotonic() - begun < seconds):
+            with self._fitting:
+                if self._own is not None or self._fit.trainer is None:
+                    return done
+                self._fit.step()
+                self._seen = None
+            done += 1
+        return done
+
+    def scores(self, candidates: Sequence[Camera], cost: Cost | None = None, *, seconds: float | None = None) -> Plan:
+        """What the view of each place would tell; these places are what `next` picks from, until there are others.
+
+        Args:
+            candidates: Where the camera could go.
+            cost: What it costs to go to each, >= 0; a function is called with the last place and the candidate.
+            seconds: Wall time for the answer; None: all is asked that has changed.
+        Returns:
+            A plan without picks.
+        """
+        pool = camera_list("Planner.scores", "candidates", candidates)
+        if not pool:
+            raise ValueError("Planner.scores: there must be at least one candidate, got none; give poses")
+        with self._asking:
+            self._pool = [at_most(camera, self.info_pixels) for camera in pool]
+            self._cost = cost
+            self._costs(list(range(len(pool))), self._here)  # refuses what is no cost
+            return self._plan(0, seconds)
+
+    def next(self, k: int = 1, *, seconds: float | None = None) -> Plan:
+        """The k places to go to next, of those that `scores` was given.
+
+        Each is the one of most value, score over `look` + cost, once the ones before it are known; costs that are a
+        function are counted from one to the next.
+
+        Args:
+            k: How many.
+            seconds: Wall time for the answer; what has changed, or was never asked, is asked as far as it lasts.
+        """
+        with self._asking:
+            if not (type(k) is int and 1 <= k <= len(self._pool)):
+                raise ValueError(
+                    f"Planner.next: k must be a whole number in 1..{len(self._pool)} candidates, got {k!r}; give "
+                    "candidates to Planner.scores"
+                )
+            return self._plan(k, seconds)
+
+    def refine(self, camera: Camera, refine: Refine | None = None) -> Pick:
+        """A place moved to where its view tells more, within bounds; see `drgs.select.Refine`.
+
+        Args:
+            camera: Where to begin, e.g. that of a pick.
+            refine: How far and how long; default 20 further views, in the box of all known views and candidates.
+        Returns:
+            `camera` is the place, at the size at which views are asked; `score` and `start` what it and the first tell.
+        """
+        must_be("Planner.refine", "camera", camera, Camera, "e.g. plan.picks[0].camera")
+        with self._asking:
+            scene, known = self._asked()
+            start = at_most(camera, self.info_pixels)
+            if refine is None or refine.box is None:
+                centers = np.stack([one.center for one in (*known, *self._pool, start)])
+                box = tuple(np.r_[centers.min(0), centers.max(0)].tolist())
+                refine = dataclasses.replace(refine or Refine(evaluations=20), box=box)
+            self._expect([*known, *self._pool, start])
+            found = select(scene, [start], known, 1, scoring=self._scoring, cache=self._cache, refine=refine)
+            return found.picks[0]
+
+    # -------------------------------------------------- what is known
+
+    def _name(self, name: str) -> str:
+        """The name of a photograph, or its number."""
+        name = name or f"view {self._counted}"
+        if name in self.views:
+            raise ValueError(f"Planner.observe: names must be different, got {name!r} again; leave them empty")
+        return name
+
+    def _let_go(self) -> None:
+        """Let go of the view that the others cover best."""
+        with self._asking, self._fitting:
+            if (scene := self.scene) is None:
+                return
+            known = self._known
+            self._expect([*known, *self._pool])
+            found = select(scene, known, [], len(known) - 1, "coverage", scoring=_COVERAGE, cache=self._cache)
+            (gone,) = set(range(len(known))) - {pick.index for pick in found.picks}
+            self._known = [camera for i, camera in enumerate(known) if i != gone]
+            if self._own is None:
+                self._fit.drop(known[gone].name)
+
+    def _asked(self) -> tuple[Gaussians, list[Camera]]:
+        """The model and the known views, together."""
+        with self._fitting:
+            scene = self.scene
+            if scene is None:
+                raise ValueError(
+                    "Planner: there must be a model to ask, there is none yet; observe a photograph with depth, or two"
+                )
+            return scene, list(self._known)
+
+    def _expect(self, cameras: Sequence[Camera]) -> None:
+        """Before an answer: of other cameras nothing is kept, and nothing has been given."""
+        self._cache.expect(cameras)
+        self._cache.given.clear()
+
+    # -------------------------------------------------- answers
+
+    def _plan(self, k: int, seconds: float | None) -> Plan:
+        """Ask what there is time for, and answer by what is known then."""
+        begun = time.monotonic()
+        scene, known = self._asked()
+        self._expect([*known, *self._pool])
+        calls = 1 if self._cost is None else max(k, 1)
+        until = math.inf if seconds is None else begun + seconds - self._answered_in.usual * calls
+        computed = self._ask(scene, known, until)
+        answering = time.monotonic()
+        self._cache.asks = False
+        try:
+            plan = self._answer(scene, known, k)
+        finally:
+            self._cache.asks = True
+        now = time.monotonic()
+        self._answered_in.note((now - answering) / calls)
+        return dataclasses.replace(plan, computed=computed, seconds=now - begun)
+
+    def _ask(self, scene: Gaussians, known: list[Camera], until: float) -> int:
+        """Ask the views that have changed most, known ones and candidates in turn, until a time; how many were."""
+        queues = []
+        for cameras in (known, self._pool):
+            changes = {i: self._cache.change(scene, camera) for i, camera in enumerate(cameras)}
+            stale = sorted((i for i in changes if changes[i] > self._cache.bound), key=lambda i: (-changes[i], -i))
+            queues.append([cameras[i] for i in stale])
+        turns = [camera for pair in itertools.zip_longest(*queues) for camera in pair if camera is not None]
+        alone = dataclasses.replace(self._scoring, prior=Prior(1.0))  # what a view tells does not depend on it
+        done = 0
+        for camera in turns:
+            began = time.monotonic()
+            if done and began + self._asked_in.usual > until:  # one at least, so that every call brings something
+                break
+            select(scene, [camera], [], 1, scoring=alone, cache=self._cache)
+            self._asked_in.note(time.monotonic() - began)
+            done += 1
+        return done
+
+    def _answer(self, scene: Gaussians, known: list[Camera], k: int) -> Plan:
+        """Scores and picks by what is kept."""
+        # Without costs all picks come of one call; with costs each is of another value than its score.
+        at_once = max(k, 1) if self._cost is None else 1
+        selection, places, there = self._selected(scene, list(range(len(self._pool))), known, at_once)
+        scores: list[float | None] = [None] * len(self._pool)
+        left_out = len(known) - len(there)
+        picks: list[PlannedView] = []
+        if selection is not None:
+            for i, score in zip(places, selection.scores, strict=True):
+                scores[i] = score
+            if self._cost is None:
+                found = [(places[pick.index], pick.score) for pick in selection.picks[:k]]
+                picks = [PlannedView(i, self._pool[i], score, 0.0, score) for i, score in found]
+        here = self._here
+        while self._cost is not None and selection is not None and len(picks) < k:
+            costs = self._costs(places, here)
+            values = [score / (self.look + cost) for score, cost in zip(selection.scores, costs, strict=True)]
+            best = int(np.argmax(values))
+            here = self._pool[places[best]]
+            picks.append(PlannedView(places[best], here, selection.scores[best], costs[best], values[best]))
+            there = [*there, here]
+            selection, places, there = self._selected(scene, [i for i in places if i != places[best]], there, 1)
+        return Plan(picks, scores, max(self._cache.given.values(), default=0.0), 0, left_out, 0.0)
+
+    def _selected(
+        self, scene: Gaussians, places: list[int], known: list[Camera], k: int
+    ) -> tuple[Selection | None, list[int], list[Camera]]:
+        """Scores of the candidates that something is known of, against known views likewise; both as they are left."""
+        while places:
+            pool = [self._pool[i] for i in places]
+            try:
+                found = select(scene, pool, known, min(k, len(pool)), scoring=self._scoring, cache=self._cache)
+            except Unanswered as lacking:
+                places = [i for i in places if self._cache.answered(lacking.question, self._pool[i])]
+                known = [camera for camera in known if self._cache.answered(lacking.question, camera)]
+            else:
+                return found, places, known
+        return None, places, known
+
+    def _costs(self, places: list[int], here: Camera | None) -> list[float]:
+        """What it costs to go from here to candidates."""
+        cost = self._cost
+        if cost is None or (callable(cost) and here is None):
+            return [0.0] * len(places)
+        if callable(cost):
+            assert here is not None
+            found = [float(cost(here, self._pool[i])) for i in places]
+        else:
+            if len(cost) != len(self._pool):
+                raise ValueError(
+                    f"Planner: costs must be {len(self._pool)}, one a candidate, got {len(cost)}; give the missing ones"
+                )
+            found = [float(cost[i]) for i in places]
+        bad = next((x for x in found if not (math.isfinite(x) and x >= 0)), None)
+        if bad is not None:
+            raise ValueError(f"Planner: costs must be finite and >= 0, got {bad}; leave out what cannot be reached")
+        return found
+
+
+class _Duration:
+    """How long something usually takes, as it was lately: a kernel that had to be compiled is not what is usual."""
+
+    def __init__(self) -> None:
+        self._seconds: deque[float] = deque(maxlen=_LATELY)
+
+    def note(self, seconds: float) -> None:
+        """It took so long."""
+        self._seconds.append(seconds)
+
+    @property
+    def usual(self) -> float:
+        """The median, seconds; 0 as long as nothing is known."""
+        return statistics.median(self._seconds) if self._seconds else 0.0
+
+
+def _spread(queue: list[Camera], count: int) -> list[Camera | None]:
+    """A queue, filled up."""
+    return [*queue, *[None] * (count - len(queue))]
+
+
+def _checked_image(image: np.ndarray | None, camera: Camera) -> np.ndarray:
+    shape = (camera.height, camera.width, 3)
+    if not isinstance(image, np.ndarray) or image.shape != shape:
+        got = f"shape {image.shape}" if isinstance(image, np.ndarray) else kind_of(image)
+        raise ValueError(
+            f"Planner.observe: image must be an array of shape {shape}, as its camera, got {got}; resize it"
+        )
+    if image.dtype != np.uint8 and not (np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1):
+        raise ValueError("Planner.observe: image must be uint8, or finite and in [0, 1], got others; scale it")
+    return image
+
+
+def _checked_depth(depth: np.ndarray | None, camera: Camera) -> np.ndarray | None:
+    if depth is None:
+        return None
+    shape = (camera.height, camera.width)
+    if not isinstance(depth, np.ndarray) or depth.shape != shape:
+        got = f"shape {depth.shape}" if isinstance(depth, np.ndarray) else kind_of(depth)
+        raise ValueError(
+            f"Planner.observe: depth must be an array of shape {shape}, as its camera, got {got}; resize it"
+        )
+    return np.nan_to_num(depth.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0).clip(min=0)
