@@ -15,13 +15,11 @@ from drgs.studies.protocols import PROTOCOLS
 from drgs.studies.statistics import (
     Effect,
     Unit,
-    at_views,
     coverage,
     differences,
     estimate,
     unit_of,
     values_of,
-    view_counts,
 )
 
 __all__ = [
@@ -73,8 +71,6 @@ def study_report(study: Study, rows: StudyRows, level: int = 3) -> str:
             if verdicts := _verdicts(study, mine, study.comparisons):
                 table += "\n\n" + verdicts
             parts += [f"{below} Other pairs", table]
-        if counts := view_counts(mine):
-            parts += [f"{below} Against the number of views", _curves(study, mine, counts)]
         parts += [f"{below} Every unit", _points(study, mine)]
     if len(protocols) > 1:
         parts += [f"{'#' * level} `paper` against `blind`", _leaked(study, rows)]
@@ -247,40 +243,6 @@ def unlike_units(rows: StudyRows) -> str:
     if len({frozenset(found) for found in units.values()}) < 2:
         return ""
     return "Means of rows with different units do not compare; the differences within units do."
-
-
-def _curves(study: Study, rows: StudyRows, counts: Sequence[int]) -> str:
-    """Of each metric: policies against numbers of views, on average over scenes; below, what is left of differences."""
-    told = (
-        "Measured with so many views, on the way just before the next one is picked, with the last number at the end; "
-        "every scene counts alike."
-    )
-    heads = ["policy", *(f"{count} views" for count in counts)]
-    labels = _labels(study, rows)
-    measured = [at_views(rows, count) for count in counts]
-    units = {x: {len({unit_of(row) for row in at if row["policy"] == x}) for at in measured} for x in labels}
-    unlike = next((said for at in measured if (said := unlike_units(at))), "")
-    against = [(label, label, study.reference) for label in labels if label != study.reference]
-    pairs = [(f"{policy} against {reference}", policy, reference) for policy, reference in study.comparisons]
-    parts = [paragraph(f"{told} {unlike}".strip())]
-    for metric in study.metrics:
-        means = []
-        for label in labels:
-            values = [values_of(at, metric.key, label) for at in measured]
-            averages = [estimate(found).mean if found else None for found in values]
-            numbers = ("none" if x is None else f"{x:.{metric.digits}f}" for x in averages)
-            means.append([label, *numbers, _range(units[label])])
-        parts += [f"{_title(metric)}:", markdown_table([*heads, "units"], means)]
-        for said, wanted in ((f"The same, less that of `{study.reference}`:", against), ("Other pairs:", pairs)):
-            lines = []
-            for name, *pair in wanted:
-                values = [differences(at, metric.key, *pair) for at in measured]
-                if any(values):
-                    cells = [_difference(metric, estimate(found)) if found else "none" for found in values]
-                    lines.append([name, *cells])
-            if lines:
-                parts += [said, markdown_table(heads, lines)]
-    return "\n\n".join(parts)
 
 
 def _leaked(study: Study, rows: StudyRows) -> str:
