@@ -1,10 +1,12 @@
 """Does the score of a view predict what adding it does?
 
     python benchmarks/predict.py [--scenes office head still_life] [--runs runs/studies]
+    python benchmarks/predict.py --page                 runs nothing: docs/data/predict.csv and predict-psnr.csv
 
 On a fit to 6 views every other view of the pool is added alone, the fit goes on for a while, and the drop of the error
-of held-out views is compared with the score that each policy gave the view before. Results go to docs/active-static.md
-and benchmarks/predict.json; candidates that have been measured are not measured again.
+of held-out views is compared with the score that each policy gave the view before. Results go to
+benchmarks/predict.json and to the data files of docs/active-static.md; candidates that have been measured are not
+measured again.
 """
 
 from __future__ import annotations
@@ -21,7 +23,6 @@ from studies import ROOT
 import drgs
 from drgs.gain import Prior
 from drgs.select import Cache, select
-from drgs.studies.tables import fill_between
 
 VIEWS = 6
 STEPS = 1000
@@ -90,72 +91,57 @@ def drops(name: str, runs: Path) -> dict:
     return done
 
 
-def report(result: dict, made: str) -> str:
-    """The part of docs/active-static.md."""
-    names = list(result)
-    lines = [
-        f"Made by {made}",
-        "",
-        f"A fit to {VIEWS} views ({STEPS:,} steps, {studies.BASE['max_gaussians']:,} Gaussians, at most "
-        f"{studies.BASE['max_pixels']:,} pixels), then each candidate added alone for {MORE} more",
-        "steps.",
-        "Spearman's rho between the score and the realised drop of the held-out squared error, over the candidates;",
-        "in brackets what 95 % of random rankings stay below.",
-        "",
-        "| score | " + " | ".join(f"{name}, {len(result[name]['names'])} candidates" for name in names) + " | mean |",
-        "|---|" + "---|" * (len(names) + 1),
-    ]
+def rank_lines(result: dict) -> list[list[str]]:
+    """Spearman's rho between scores and realised drops over the candidates, and what 95 % of rankings stay below."""
+    lines = [["score", *(f"{name}, {len(one['names'])} candidates" for name, one in result.items()), "mean"]]
     for label in SCORES:
         values = []
-        for name in names:
-            r = result[name]
-            drop = np.mean(r["control"]) - np.asarray(r["after"])
-            values.append(studies.rank_correlation(r["scores"][label], drop))
-        lines.append(f"| {label} | " + " | ".join(f"{v:.2f}" for v in values) + f" | {np.mean(values):.2f} |")
-    bounds = [1.645 / math.sqrt(len(result[name]["names"]) - 1) for name in names]
-    lines.append("| (random) | " + " | ".join(f"({b:.2f})" for b in bounds) + " | |")
-    lines += [
-        "",
-        "Held-out PSNR of these fits, in dB:",
-        "",
-        "| | " + " | ".join(names) + " |",
-        "|---|" + "---|" * len(names),
-    ]
+        for one in result.values():
+            drop = np.mean(one["control"]) - np.asarray(one["after"])
+            values.append(studies.rank_correlation(one["scores"][label], drop))
+        lines.append([label, *(f"{value:.2f}" for value in values), f"{np.mean(values):.2f}"])
+    bounds = [1.645 / math.sqrt(len(one["names"]) - 1) for one in result.values()]
+    return [*lines, ["95 % of random rankings are below", *(f"{bound:.2f}" for bound in bounds), ""]]
+
+
+def psnr_lines(result: dict) -> list[list[str]]:
+    """Held-out PSNR of the fits, in dB."""
     psnr = lambda x: -10 * math.log10(x)  # noqa: E731
-    for label, of in (
-        ("no view added (3 seeds)", lambda r: f"{psnr(np.mean(r['control'])):.2f}"),
-        ("spread of these seeds", lambda r: f"{psnr(min(r['control'])) - psnr(max(r['control'])):.2f}"),
-        ("worst view added", lambda r: f"{psnr(max(r['after'])):.2f}"),
-        ("median view added", lambda r: f"{psnr(np.median(r['after'])):.2f}"),
-        ("best view added", lambda r: f"{psnr(min(r['after'])):.2f}"),
-        (
-            "picked by fisher, logdet",
-            lambda r: f"{psnr(r['after'][int(np.argmax(r['scores']['fisher, logdet']))]):.2f}",
-        ),
-        (
-            "picked by fisher, v_opt, with backdrop",
-            lambda r: f"{psnr(r['after'][int(np.argmax(r['scores']['fisher, v_opt, with backdrop']))]):.2f}",
-        ),
-        ("picked by fisherrf", lambda r: f"{psnr(r['after'][int(np.argmax(r['scores']['fisherrf']))]):.2f}"),
-        ("picked by coverage", lambda r: f"{psnr(r['after'][int(np.argmax(r['scores']['coverage']))]):.2f}"),
-        ("picked by farthest", lambda r: f"{psnr(r['after'][int(np.argmax(r['scores']['farthest']))]):.2f}"),
-    ):
-        lines.append(f"| {label} | " + " | ".join(of(result[name]) for name in names) + " |")
-    return "\n".join(lines)
+    picked = lambda label: lambda one: psnr(one["after"][int(np.argmax(one["scores"][label]))])  # noqa: E731
+    shown = {
+        "no view added, mean of 3 seeds": lambda one: psnr(np.mean(one["control"])),
+        "spread of these seeds": lambda one: psnr(min(one["control"])) - psnr(max(one["control"])),
+        "worst view added": lambda one: psnr(max(one["after"])),
+        "median view added": lambda one: psnr(np.median(one["after"])),
+        "best view added": lambda one: psnr(min(one["after"])),
+        **{
+            f"picked by {label}": picked(label)
+            for label in ("fisher, logdet", "fisher, v_opt, with backdrop", "fisherrf", "coverage", "farthest")
+        },
+    }
+    lines = [[label, *(f"{of(one):.2f}" for one in result.values())] for label, of in shown.items()]
+    return [["fit", *result], *lines]
 
 
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--scenes", nargs="+", default=list(studies.SCENES))
     parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "studies")
+    parser.add_argument("--page", action="store_true", help="run nothing, write the data files of what is there")
     args = parser.parse_args()
-    result = {name: drops(name, args.runs) for name in args.scenes}
-    made = studies.stamp("predict")
-    text = report(result, made)
-    print(text)
-    if tuple(args.scenes) == studies.SCENES:
-        studies.write_rows(ROOT / "benchmarks" / "predict.json", {"made": made, "scenes": result})
-        fill_between(ROOT / "docs" / "active-static.md", "predict", text)
+    results = ROOT / "benchmarks" / "predict.json"
+    if args.page:
+        result = studies.read_rows(results, {})["scenes"]
+    else:
+        result = {name: drops(name, args.runs) for name in args.scenes}
+    ranks, fits = rank_lines(result), psnr_lines(result)
+    print(studies.csv_text([*ranks, [], *fits]))
+    if tuple(result) != studies.SCENES:
+        return
+    if not args.page:
+        studies.write_rows(results, {"made": studies.stamp("predict"), "scenes": result})
+    studies.write_csv(ROOT / "docs" / "data" / "predict.csv", ranks)
+    studies.write_csv(ROOT / "docs" / "data" / "predict-psnr.csv", fits)
 
 
 if __name__ == "__main__":

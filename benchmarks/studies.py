@@ -7,9 +7,11 @@ means is in `drgs.studies.experiments.SIZES`.
 from __future__ import annotations
 
 import argparse
+import csv
+import io
 import json
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -33,11 +35,13 @@ __all__ = [
     "SCENES",
     "base",
     "command",
+    "csv_text",
     "dataset",
     "folder",
     "rank_correlation",
     "read_rows",
     "stamp",
+    "write_csv",
     "write_rows",
 ]
 
@@ -129,34 +133,42 @@ def read_rows(path: Path, default):
     return json.loads(path.read_text()) if path.exists() else default
 
 
+def csv_text(lines: Iterable[Sequence[str]]) -> str:
+    """Lines of cells, the first one the heads, as CSV."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(lines)
+    return text.getvalue()
+
+
+def write_csv(path: Path, lines: Iterable[Sequence[str]]) -> None:
+    """A data file of a page."""
+    with atomic_write(path) as file:
+        file.write(csv_text(lines).encode())
+
+
 def command(
     script: str,
     page: Path,
     scales: Iterable[str],
     study_of: Callable[[str, Path], Study],
-    units_of: Callable[..., list],
+    units_of: Callable[[Study, int], list],
     planned: Callable[[int], int],
     report: Callable[[Study, list[dict]], str],
+    rows: str,
     seeds: int = 3,
-    sets: Mapping[str, Sequence[str]] | None = None,
-    only: Mapping[str, Sequence[str]] | None = None,
-    rows: str | None = None,
 ) -> int:
-    """The command line of a study of fits; rows go to benchmarks/SCRIPT.jsonl or ROWS.jsonl, those of another set than
-    the first, whose page it is, to SCRIPT-SET.jsonl.
+    """The command line of a study of fits; rows go to benchmarks/ROWS.jsonl.
 
     Args:
         script: Name of the script, and of its part of the page.
         page: Page that the tables are written into.
         scales: Values of --scale, the default first.
         study_of: Scale, folder of runs -> study.
-        units_of: Study, --seeds and, with `sets`, the scenes -> units, as `Study.cells` takes them.
+        units_of: Study, --seeds -> units, as `Study.cells` takes them.
         planned: --seeds -> cells of the whole study.
         report: Study, its rows -> tables.
-        seeds: The default of --seeds.
-        sets: --set -> its scenes, the first the default; None: all scenes, and no such option.
-        only: Policy -> scenes, of policies that are not run on all of them.
         rows: Name of the file of rows.
+        seeds: The default of --seeds.
     Returns:
         The exit code.
     """
@@ -168,29 +180,21 @@ def command(
     parser.add_argument("--policies", nargs="+", help="cells of these policies alone")
     parser.add_argument("--page", action="store_true", help="run nothing, write the tables of the rows that there are")
     parser.add_argument("--merge", type=Path, nargs="+", default=[], help="rows of another checkout, to be added")
-    if sets:
-        parser.add_argument("--set", choices=list(sets), default=next(iter(sets)), help="of scenes")
     args = parser.parse_args()
-    scenes = sets[args.set] if sets else None
-    if sets and args.page and args.set != next(iter(sets)):
-        parser.error(f"--page is of --set {next(iter(sets))}, got {args.set}; drop one of them")
-    name = f"{script}-{args.set}" if sets and args.set != next(iter(sets)) else rows or script
-    results = ROOT / "benchmarks" / f"{name}.jsonl"
+    results = ROOT / "benchmarks" / f"{rows}.jsonl"
     for path in args.merge:
         for row in read_study(path):
             append_row(results, row)
     study = study_of(args.scale, args.runs)
     if args.page:
         found = [row for row in read_study(results) if row["study"] == study.name]
-        found = [row for row in found if scenes is None or row["scene"] in scenes]
         done = f"{len(found)} of {planned(args.seeds)} cells are finished."
         text = f"`python benchmarks/{script}.py --scale {args.scale}`: {done}\n\n"
         fill_between(page, script, text + report(study, found))
         return 0
     shard, shards = map(int, args.shard.split("/"))
-    units = units_of(study, args.seeds, scenes) if scenes else units_of(study, args.seeds)
+    units = units_of(study, args.seeds)
     cells = [cell for cell in study.cells(units) if cell.policy in (args.policies or [cell.policy])]
-    cells = [cell for cell in cells if cell.scene in (only or {}).get(cell.policy, [cell.scene])]
     cells = cells[shard::shards]
     taken, failed = run_cells(study, cells, args.runs, results, say=lambda line: print(line, flush=True))
     print(f"{len(cells)} cells, {len(taken)} with other processes, {len(failed)} failed: {stamp(script)}")

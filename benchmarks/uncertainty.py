@@ -1,11 +1,12 @@
 """Are the pixels wrong that a model calls uncertain? AUSE of variance maps, on held-out views of active fits.
 
-    python benchmarks/uncertainty.py [--set report] [--scale small] [--seeds 5] [--runs runs/studies]
+    python benchmarks/uncertainty.py [RUN ...]
 
-Of benchmarks/active.py the runs of one policy, `random`, which are there already: twelve views and a model of them.
+Runs are folders of active fits, of `drgs fit --views active` or `drgs reproduce`; those of the rows that are there had
+picked twelve views at random.
 Area between two sparsification curves: the root of the mean squared error of the pixels that are left when those called
 most uncertain are taken out, and the same by the true error; both are divided by the error of all pixels, and 0 is
-perfect. Finished units are kept (benchmarks/uncertainty.jsonl); the table goes to docs/active-static.md.
+perfect. Rows are kept (benchmarks/uncertainty.jsonl); their means go to a data file of docs/active-static.md.
 """
 
 from __future__ import annotations
@@ -18,23 +19,18 @@ from pathlib import Path
 
 os.environ.setdefault("DRGS_THREADS", "1")
 
-import active
 import numpy as np
 import studies
 import torch
 from studies import ROOT
+from where import add_row, ran, read_rows
 
 import drgs
 from drgs import fisher
-from drgs.files import Run
-from drgs.fitting.frames import Frame, load_frames
+from drgs.fitting.frames import Frame, load_dataset, load_frames
 from drgs.fitting.records import load_run
 from drgs.gain import Prior, variances
-from drgs.studies.cells import Study
-from drgs.studies.rows import Cell
-from drgs.studies.tables import fill_between
 
-POLICY = "random"
 MAPS = {
     "variance, Gaussians alone": ("geometry", Prior(1e-3, relative=True)),
     "variance, Gaussians alone, lambda 1": ("geometry", Prior(1.0)),
@@ -87,65 +83,42 @@ def curve(wrong: torch.Tensor, order: torch.Tensor, points: int = 100) -> torch.
     return rmse / rmse[0]
 
 
-def measured(study: Study, cell: Cell, runs: Path) -> dict | None:
-    """The row of a unit; None where its run is not there or not finished."""
-    run = Run(runs / study.name / cell.name)
-    if not (run.path / "metrics.json").exists():
-        return None
-    known = json.loads((run.path / "selection.json").read_text())
+def measured(path: Path) -> dict:
+    """The row of a run."""
+    loaded = load_run(path)
+    config = loaded.record.config
+    known = json.loads((path / "selection.json").read_text())
     names = {one["name"] for one in (*known["start"], *known["picks"])}
-    train, test = study.dataset(cell).split()
-    loaded = load_run(run)
-    pixels = study.fit.data.max_pixels
+    train, test = load_dataset(loaded.record.data, config, lazy=True, points=False).split()
+    pixels = config.data.max_pixels
     step = -(-len(test) // VIEWS)
     seen = load_frames([view for view in train if view.name in names], pixels)
-    found = ause(loaded.gaussians, seen, load_frames(test[::step], pixels), study.fit.settings)
-    return {**cell.to_json(), "study": study.name, "ause": found}
+    found = ause(loaded.gaussians, seen, load_frames(test[::step], pixels), config.settings)
+    return {"run": path.name, "scene": Path(loaded.record.data).name, "ause": found, **ran()}
 
 
-def table(rows: list[dict], scenes: list[str]) -> str:
-    """Means over the units of each scene."""
+def lines(rows: list[dict]) -> list[list[str]]:
+    """Means over the runs of each scene."""
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
     units = {scene: [row["ause"] for row in rows if row["scene"] == scene] for scene in scenes}
-    mean = lambda scene, key: f"{np.mean([unit[key] for unit in units[scene]]):.3f}"  # noqa: E731
-    lines = [
-        "| map | " + " | ".join(scenes) + " |",
-        "|---|" + "---|" * len(scenes),
-        "| (units) | " + " | ".join(str(len(units[scene])) for scene in scenes) + " |",
-        "| (pixels with alpha > 0.5) | "
-        + " | ".join(f"{np.mean([unit['covered'] for unit in units[scene]]):.0%}" for scene in scenes)
-        + " |",
+    means = [
+        [name, *(f"{np.mean([unit[key] for unit in units[scene]]):.3f}" for scene in scenes)]
+        for name, key in {"share of pixels with alpha > 0.5": "covered", **{x: x for x in (*MAPS, *PLAIN)}}.items()
     ]
-    lines += [f"| {name} | " + " | ".join(mean(scene, name) for scene in scenes) + " |" for name in (*MAPS, *PLAIN)]
-    return "\n".join(lines)
+    return [["map", *scenes], ["runs", *(str(len(units[scene])) for scene in scenes)], *means]
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--set", choices=list(active.SETS), default="report")
-    parser.add_argument("--scale", choices=active.SCALES, default="small")
-    parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "studies")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="*", type=Path)
     args = parser.parse_args()
-    study = active.study_of(args.scale, args.runs)
-    rows = []
-    if ROWS.exists():
-        rows = [json.loads(line) for line in ROWS.read_text().splitlines()]
-    units = [unit for unit in active.units_of(study, args.seeds, active.SETS[args.set]) if unit[3] == "blind"]
-    for cell in [cell for cell in study.cells(units) if cell.policy == POLICY]:
-        own = {**cell.to_json(), "study": study.name}
-        if any(own == {key: row[key] for key in own} for row in rows):
-            continue
-        row = measured(study, cell, args.runs)
-        if row:
-            rows.append(row)
-            with ROWS.open("a") as file:
-                file.write(json.dumps(row) + "\n")
-            print(cell.name, {name: round(x, 3) for name, x in row["ause"].items()}, flush=True)
-    scenes = [scene for scene in active.SETS[args.set] if any(row["scene"] == scene for row in rows)]
-    text = table([row for row in rows if row["study"] == study.name], scenes)
-    print(text)
-    if args.set == "report":
-        fill_between(active.PAGE, "uncertainty", f"Made by {studies.stamp('uncertainty')}\n\n{text}")
+    there = {row.get("run") for row in read_rows(ROWS)}
+    for path in args.runs:
+        if path.name not in there:
+            add_row(ROWS, measured(path))
+    table = lines(read_rows(ROWS))
+    print(studies.csv_text(table))
+    studies.write_csv(ROOT / "docs" / "data" / "uncertainty.csv", table)
     return 0
 
 

@@ -628,8 +628,8 @@ def test_medians_stand_beside_means():
 
 
 def test_curves_are_of_the_metrics_of_then(tmp_path):
-    """Means, differences and their intervals at each number of views that was measured, the end among them; rows that
-    were not measured on the way count at the end only; the picture has a panel a scene.
+    """At each number of views that was measured, the end among them; rows that were not measured on the way count at
+    the end only; the picture has a panel a scene.
     """
     rows = []
     for seed in range(6):
@@ -642,17 +642,6 @@ def test_curves_are_of_the_metrics_of_then(tmp_path):
     assert [row["metrics"]["psnr"] for row in at_views(rows, 4)[:2]] == [14.0, 10.0]
     assert len(at_views(rows, 6)) == 13
     assert view_counts(rows[-1:]) == []
-    text = told(rows)
-    assert "| p | 13.00 | 14.00 | 30.00 | 6 to 7 |" in text
-    assert "| Random, 1 | 10.00 | 10.00 | 29.00 | 6 |" in text
-    assert "Means of rows with different units do not compare" in " ".join(text.split())
-    assert "Means of rows with" not in told(rows[:-1])
-    assert "| p | +3.00 [+3.00, +3.00] **gain**, 6 of 6 | +4.00 [+4.00, +4.00] **gain**, 6 of 6 | +1.00 " in text
-    assert "Other pairs:" not in text
-    pairs = told(rows, comparisons=(("p", "Random, 1"), ("p", "other"))).partition("Other pairs:")[2]
-    assert "| p against Random, 1 | +3.00 [+3.00, +3.00] **gain**, 6 of 6 | +4.00 " in pairs
-    assert "other" not in pairs
-    assert "Against the number of views" not in told(rows[-1:])
     study = dataclasses.replace(small(tmp_path), policies={"p": {}, "Random, 1": {}})
     assert not draw_curves(study, rows[-1:], METRICS[0], tmp_path / "none.png")
     pytest.importorskip("matplotlib")
@@ -663,33 +652,40 @@ def test_curves_are_of_the_metrics_of_then(tmp_path):
 
 
 def test_a_page_comes_from_its_rows(monkeypatch):
-    """The tables of docs/active-static.md are what benchmarks/active.py makes of benchmarks/active.jsonl."""
+    """The table of docs/active-static.md and its data files are what benchmarks/policies.py makes of its rows; of the
+    differences, whose intervals take long, those of PSNR.
+    """
     root = Path(__file__).parents[1]
     monkeypatch.syspath_prepend(root / "benchmarks")
-    active = importlib.import_module("active")
-    rows = [row for row in read_study(root / "benchmarks" / "active.jsonl") if row["scene"] in active.REPORT]
-    assert rows
-    text = study_report(active.study_of("small", root / "runs"), rows)
-    assert text in (root / "docs" / "active-static.md").read_text()
+    policies, studies = importlib.import_module("policies"), importlib.import_module("studies")
+    rows = read_study(policies.ROWS)
+    assert {row["policy"] for row in rows} == {policies.DEFAULT, *policies.OTHERS}
+    assert policies.table(rows) in policies.PAGE.read_text()
+    for name, lines in (
+        ("scenes", policies.scene_lines(rows)),
+        ("units", policies.unit_lines(rows)),
+        ("choosing", policies.choosing_lines(read_study(policies.CHOSEN))),
+    ):
+        assert (policies.DATA / f"policies-{name}.csv").read_text() == studies.csv_text(lines), name
+    there = (policies.DATA / "policies-differences.csv").read_text().splitlines(keepends=True)
+    made = studies.csv_text(policies.difference_lines(rows, policies.METRICS[:1]))
+    assert made == "".join(line for line in there if ",psnr," in line or line is there[0])
 
 
-def test_a_set_of_scenes_has_rows_of_its_own(monkeypatch, capsys):
-    """Those of the set of the page go beside it, those of another set elsewhere; the page is of its set alone."""
-    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
-    active, studies = importlib.import_module("active"), importlib.import_module("studies")
-    monkeypatch.setattr(active, "distinct_seeds", lambda study, scene, split, count: list(range(count)))
-    written = []
-    monkeypatch.setattr(studies, "run_cells", lambda study, cells, runs, rows, say: written.append(rows) or ([], {}))
-    for chosen in ([], ["--set", "choice"]):
-        monkeypatch.setattr(sys, "argv", ["active.py", "--seeds", "1", *chosen])
-        assert active.main() == 0
-    assert [path.name for path in written] == ["active.jsonl", "active-choice.jsonl"]
-    before = active.PAGE.read_bytes()
-    monkeypatch.setattr(sys, "argv", ["active.py", "--page", "--set", "choice"])
-    with pytest.raises(SystemExit, match="2"):
-        active.main()
-    assert "--page is of --set report, got choice" in capsys.readouterr().err
-    assert active.PAGE.read_bytes() == before
+def test_data_files_come_from_their_rows(monkeypatch):
+    """Those of benchmarks/predict.py and benchmarks/uncertainty.py, which make them without running anything."""
+    pytest.importorskip("scipy.stats")
+    root = Path(__file__).parents[1]
+    monkeypatch.syspath_prepend(root / "benchmarks")
+    predict, uncertainty = importlib.import_module("predict"), importlib.import_module("uncertainty")
+    written = {}
+    for module, words in ((predict, ["--page"]), (uncertainty, [])):
+        monkeypatch.setattr(module.studies, "write_csv", lambda path, lines: written.update({path: list(lines)}))
+        monkeypatch.setattr(sys, "argv", [f"{module.__name__}.py", *words])
+        assert not module.main()
+    assert sorted(path.name for path in written) == ["predict-psnr.csv", "predict.csv", "uncertainty.csv"]
+    for path, lines in written.items():
+        assert path.read_text() == predict.studies.csv_text(lines), path.name
 
 
 def test_the_semantic_study_is_whole_units(monkeypatch, tmp_path):

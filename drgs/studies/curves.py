@@ -47,7 +47,7 @@ def draw_curves(study: Study, rows: Sequence[Mapping[str, Any]], metric: Metric,
     figure, axes = plt.subplots(lines, columns, figsize=(_SIZE * columns, _SIZE * lines), dpi=100, squeeze=False)
     for axis in axes.flat[len(scenes) :]:
         axis.set_axis_off()
-    colors = plt.get_cmap("tab20")
+    colors = plt.get_cmap("tab10" if len(study.policies) <= 10 else "tab20")
     judged = {policy for policy, _ in study.comparisons}
     for axis, scene in zip(axes.flat, scenes, strict=False):
         mine = [row for row in rows if row["scene"] == scene]
@@ -55,7 +55,10 @@ def draw_curves(study: Study, rows: Sequence[Mapping[str, Any]], metric: Metric,
             found = [(count, values_of(at_views(mine, count), metric.key, label)) for count in counts]
             points = [(count, float(np.mean(list(values.values())))) for count, values in found if values]
             if points:
-                style: dict[str, Any] = {"ls": "--" if label == study.reference else "-", "color": colors(number % 20)}
+                style: dict[str, Any] = {
+                    "ls": "--" if label == study.reference else "-",
+                    "color": colors(number % colors.N),
+                }
                 if label in judged:
                     style |= {"color": "black", "lw": 2.2, "zorder": 3}
                 axis.plot(*zip(*points, strict=True), **({"lw": 1.2} | style), ms=3, marker="o", label=label)

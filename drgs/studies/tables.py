@@ -22,7 +22,6 @@ from drgs.studies.statistics import (
     estimate,
     unit_of,
     values_of,
-    view_counts,
 )
 
 __all__ = [
@@ -73,8 +72,6 @@ def study_report(study: Study, rows: StudyRows, level: int = 3) -> str:
             if verdicts := _verdicts(study, mine, study.comparisons):
                 table += "\n\n" + verdicts
             parts += [f"{below} Other pairs", table]
-        if counts := view_counts(mine):
-            parts += [f"{below} Against the number of views", curves(study, mine, counts)]
         parts += [f"{below} Every unit", _points(study, mine)]
     if len(protocols) > 1:
         parts += [f"{'#' * level} `paper` against `blind`", _leaked(study, rows)]
@@ -260,8 +257,6 @@ def curves(study: Study, rows: StudyRows, counts: Sequence[int]) -> str:
     measured = [at_views(rows, count) for count in counts]
     units = {x: {len({unit_of(row) for row in at if row["policy"] == x}) for at in measured} for x in labels}
     unlike = next((said for at in measured if (said := unlike_units(at))), "")
-    against = [(label, label, study.reference) for label in labels if label != study.reference]
-    pairs = [(f"{policy} against {reference}", policy, reference) for policy, reference in study.comparisons]
     parts = [paragraph(f"{told} {unlike}".strip())]
     for metric in study.metrics:
         means = []
@@ -271,15 +266,13 @@ def curves(study: Study, rows: StudyRows, counts: Sequence[int]) -> str:
             numbers = ("none" if x is None else f"{x:.{metric.digits}f}" for x in averages)
             means.append([label, *numbers, _range(units[label])])
         parts += [f"{_title(metric)}:", markdown_table([*heads, "units"], means)]
-        for said, wanted in ((f"The same, less that of `{study.reference}`:", against), ("Other pairs:", pairs)):
-            lines = []
-            for name, *pair in wanted:
-                values = [differences(at, metric.key, *pair) for at in measured]
-                if any(values):
-                    cells = [_difference(metric, estimate(found)) if found else "none" for found in values]
-                    lines.append([name, *cells])
-            if lines:
-                parts += [said, markdown_table(heads, lines)]
+        lines = []
+        for label in labels:
+            values = [differences(at, metric.key, label, study.reference) for at in measured]
+            if label != study.reference and any(values):
+                lines.append([label, *(_difference(metric, estimate(x)) if x else "none" for x in values)])
+        if lines:
+            parts += [f"The same, less that of `{study.reference}`:", markdown_table(heads, lines)]
     return "\n\n".join(parts)
 
 
