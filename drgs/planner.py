@@ -3,7 +3,8 @@
     planner = drgs.Planner()
     planner.observe(image, camera, depth)      # (H, W, 3), drgs.Camera, (H, W) or None
     planner.fit(seconds=0.5)
-    plan = planner.next(candidates, seconds=1.0)
+    planner.scores(candidates, seconds=1.0)    # cameras where the robot could be
+    plan = planner.next()
     plan.picks[0].camera, plan.changed         # where to go; how far what was known has changed since
 
 What lasts from call to call: the model, what each view tells about it, and the candidates. What a view tells is asked
@@ -31,7 +32,7 @@ from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
 from drgs.fitting.config import FitConfig
 from drgs.fitting.online import OnlineFit
-from drgs.gain import Prior
+from drgs.gain import Information, Prior
 from drgs.guards.arguments import ArgumentError, kind_of, must_be
 from drgs.guards.inputs import camera_list
 from drgs.information.drift import DriftCache, Unanswered
@@ -46,7 +47,6 @@ __all__ = ["Cost", "Plan", "PlannedView", "Planner"]
 Cost = Sequence[float] | Callable[[Camera, Camera], float]
 """What it costs to go to each candidate, in the caller's unit; or a function: from where, to where."""
 
-_COVERAGE = Scoring(settings=RenderSettings.preset("fast"), prior=Prior(1e-6))
 _FAST = Scoring(settings=RenderSettings.preset("fast"))
 _LATELY = 9  # times that are remembered of how long something took
 
@@ -121,7 +121,7 @@ class Planner:
         scoring: Scoring | None = None,
         info_pixels: int = 2_700,
         max_views: int = 64,
-        bound: float = 0.1,
+        bound: float = 0.2,
         look: float = 1.0,
         max_bytes: int = 1 << 30,
     ) -> None:
@@ -306,11 +306,21 @@ class Planner:
                 return
             known = self._known
             self._expect([*known, *self._pool])
-            found = select(scene, known, [], len(known) - 1, "coverage", scoring=_COVERAGE, cache=self._cache)
+            found = select(scene, known, [], len(known) - 1, "coverage", information=self._coverage_of(scene))
             (gone,) = set(range(len(known))) - {pick.index for pick in found.picks}
             self._known = [camera for i, camera in enumerate(known) if i != gone]
             if self._own is None:
                 self._fit.drop(known[gone].name)
+
+    def _coverage_of(self, scene: Gaussians) -> Callable[[Camera], Information]:
+        """What policy `coverage` goes by, as far as views have been asked; one that has not been is asked now."""
+
+        def told(camera: Camera) -> Information:
+            if self._cache.seen(scene, camera) is None:
+                self._ask_one(scene, camera)
+            return {"coverage": self._cache.seen(scene, camera)}
+
+        return told
 
     def _asked(self) -> tuple[Gaussians, list[Camera]]:
         """The model and the known views, together."""
@@ -355,16 +365,19 @@ class Planner:
             stale = sorted((i for i in changes if changes[i] > self._cache.bound), key=lambda i: (-changes[i], -i))
             queues.append([cameras[i] for i in stale])
         turns = [camera for pair in itertools.zip_longest(*queues) for camera in pair if camera is not None]
-        alone = dataclasses.replace(self._scoring, prior=Prior(1.0))  # what a view tells does not depend on it
         done = 0
         for camera in turns:
             began = time.monotonic()
             if done and began + self._asked_in.usual > until:  # one at least, so that every call brings something
                 break
-            select(scene, [camera], [], 1, scoring=alone, cache=self._cache)
+            self._ask_one(scene, camera)
             self._asked_in.note(time.monotonic() - began)
             done += 1
         return done
+
+    def _ask_one(self, scene: Gaussians, camera: Camera) -> None:
+        """Ask one view, beside no others: what it tells depends neither on these nor on lambda."""
+        select(scene, [camera], [], 1, scoring=dataclasses.replace(self._scoring, prior=Prior(1.0)), cache=self._cache)
 
     def _answer(self, scene: Gaussians, known: list[Camera], k: int) -> Plan:
         """Scores and picks by what is kept."""

@@ -18,6 +18,7 @@ change is at most `bound`; the default was measured (docs/planner.md).
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Hashable, Iterable
 from typing import cast
 
@@ -116,7 +117,7 @@ class DriftCache(Cache):
         given: Camera, as `camera_key` gives it -> largest change of what was given of it since it was emptied.
     """
 
-    def __init__(self, bound: float = 0.1, max_bytes: int = 1 << 30) -> None:
+    def __init__(self, bound: float = 0.2, max_bytes: int = 1 << 30) -> None:
         """
         Args:
             bound: The largest change, see the attributes.
@@ -130,7 +131,9 @@ class DriftCache(Cache):
         self._shapes: dict[Hashable, Shapes] = {}  # key -> the Gaussians that an answer is of
         self._seen: dict[Hashable, torch.Tensor] = {}  # camera -> (N,) how much of its image each Gaussian makes up
         self._now: tuple[Scene, Shapes] | None = None
-        self._changes: dict[int, torch.Tensor] = {}  # id of shapes -> change of each Gaussian since
+        # Since then, to the Gaussians as they are now: id of shapes -> (N,); key -> of its view.
+        self._changes: dict[int, torch.Tensor] = {}
+        self._views_changes: dict[Hashable, float] = {}
 
     def expect(self, cameras: Iterable[Camera]) -> None:
         """Name the cameras that will be asked for; what is kept of all others is forgotten."""
@@ -140,11 +143,22 @@ class DriftCache(Cache):
                 self._forget(key)
 
     def change(self, scene: Scene, camera: Camera) -> float:
-        """Change of a view since the oldest of its answers; 1 where none is kept."""
+        """Change of a view since the oldest of its answers; infinite where none is kept."""
         with self._lock:
             self._look_at(scene)
             view = camera_key(camera)
-            return max((self._change(key, view) for key in self._answers if _parts(key)[1] == view), default=1.0)
+            return max((self._change(key, view) for key in self._answers if _parts(key)[1] == view), default=math.inf)
+
+    def seen(self, scene: Scene, camera: Camera) -> torch.Tensor | None:
+        """(N,) how much of a view's image each Gaussian made up when it was asked, sum of w^2; None if it was not."""
+        with self._lock:
+            self._look_at(scene)
+            found = self._seen.get(camera_key(camera))
+            if found is None:
+                return None
+            padded = found.new_zeros(len(self._shapes_now()))
+            padded[: len(found)] = found
+            return padded
 
     def answered(self, question: Hashable, camera: Camera) -> bool:
         """Whether there is an answer of a view to a question, of whatever age."""
@@ -191,10 +205,12 @@ class DriftCache(Cache):
         if self._now is None or self._now[0] is not scene:
             self._now = scene, Shapes.of(scene.at(None))
             self._changes.clear()
+            self._views_changes.clear()
 
     def _forget(self, key: Hashable) -> None:
         super()._forget(key)
         self._shapes.pop(key, None)
+        self._views_changes.pop(key, None)
         _, view = _parts(key)
         if all(_parts(other)[1] != view for other in self._answers):
             self._seen.pop(view, None)
@@ -205,7 +221,13 @@ class DriftCache(Cache):
 
     def _change(self, key: Hashable, view: Hashable) -> float:
         """Change of a view since an answer, see the module's text."""
-        before, now = self._shapes[key], self._shapes_now()
+        found = self._views_changes.get(key)
+        if found is None:
+            found = self._views_changes[key] = self._changed(self._shapes[key], view)
+        return found
+
+    def _changed(self, before: Shapes, view: Hashable) -> float:
+        now = self._shapes_now()
         if before is now:
             return 0.0
         change = self._changes.get(id(before))
@@ -220,7 +242,7 @@ class DriftCache(Cache):
             weights[len(seen) :] = seen[there].mean() * _inside(self._cameras[view], now.means[len(seen) :])
         total = float(weights.sum())
         if not total:  # it saw nothing: whatever has come counts
-            return float(_inside(self._cameras[view], now.means).any()) if len(now) > len(before) else 0.0
+            return float(len(now) > len(before) and bool(_inside(self._cameras[view], now.means).any()))
         return float((weights * change).sum()) / total
 
     def _padded(self, answer: Information, count: int) -> Information:

@@ -1,0 +1,191 @@
+"""What `drgs.Planner` costs over many photographs, and what it loses by keeping what views told of an earlier model.
+
+    python benchmarks/planner.py DATA [--frames 500] [--page]      rows as they come, kept: benchmarks/planner.jsonl
+    python benchmarks/planner.py --page                            the tables of docs/planner.md
+
+DATA is a sequence with depth: `drgs scene room --views 560 --size 120x90 --test-every 10 -o DATA`, or a capture. Its
+training views come in their order, 10 steps of the fit after each, and after each one 30 of the views that are still
+to come are scored within a second and three are picked.
+
+Every tenth photograph, up to the 200th, planners with other bounds are asked the same about the same models without a
+limit of time. What is right is the answer of bound 0, which asks every view anew.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import sys
+import time
+from pathlib import Path
+
+os.environ.setdefault("DRGS_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks"), str(ROOT / "examples")]
+
+import dataclasses  # noqa: E402
+
+import numpy as np  # noqa: E402
+import psutil  # noqa: E402
+from plan_views import depth_of, psnr  # noqa: E402
+from studies import rank_correlation  # noqa: E402
+from where import add_row, ran, read_rows  # noqa: E402
+
+import drgs  # noqa: E402
+from drgs.studies.tables import fill_between, markdown_table, paragraph  # noqa: E402
+
+ROWS = ROOT / "benchmarks" / "planner.jsonl"
+PAGE = ROOT / "docs" / "planner.md"
+BOUNDS = (0.0, 0.05, 0.1, 0.2, 0.4, 0.6, 1.0)
+CANDIDATES = 30
+STEPS = 10
+SECONDS = 1.0
+COMPARED_EVERY, COMPARED_UNTIL = 10, 200
+WINDOW = 100  # photographs of a line of the table
+
+
+def measure(path: Path, frames: int) -> None:
+    """Rows of the photographs of a data set, and of the bounds that are compared on the way."""
+    dataset = drgs.load_data(path)
+    train, held_out = dataset.split()
+    train = train[:frames]
+    cameras = [dataclasses.replace(view.camera.undistorted(), name=view.name) for view in train]
+    where = {"data": path.resolve().name} | ran()
+    planner = drgs.Planner()
+    others = {bound: drgs.Planner(bound=bound, max_bytes=4 << 30) for bound in BOUNDS}
+    draw = random.Random(0)
+    process = psutil.Process()
+    for number, (view, camera) in enumerate(zip(train, cameras, strict=True)):
+        began = time.monotonic()
+        planner.observe(view.image(), camera, depth_of(dataset, view))
+        observed = time.monotonic()
+        planner.fit(steps=STEPS)
+        fitted = time.monotonic()
+        coming = cameras[number + 1 :] or cameras[:number]
+        places = draw.sample(coming, min(CANDIDATES, len(coming)))
+        plan = planner.scores(places, seconds=SECONDS)
+        picked = planner.next(min(3, len(places)), seconds=0)
+        scene = planner.scene
+        assert scene is not None
+        row = {
+            "what": "photograph",
+            "number": number,
+            "gaussians": len(scene),
+            "known": len(planner.views),
+            "observe": observed - began,
+            "fit": fitted - observed,
+            "scores": plan.seconds,
+            "next": picked.seconds,
+            "computed": plan.computed,
+            "unscored": sum(score is None for score in plan.scores),
+            "left_out": plan.left_out,
+            "changed": plan.changed,
+            "memory": process.memory_info().rss,
+        }
+        if number % 50 == 49:
+            row["psnr"] = psnr(scene, held_out[:12], 12_000)
+        add_row(ROWS, row | where)
+        print({k: round(v, 3) if isinstance(v, float) else v for k, v in row.items()}, flush=True)
+        known = [one for one in cameras[: number + 1] if one.name in planner.views]
+        if number >= COMPARED_UNTIL:
+            others = {}
+        if number % COMPARED_EVERY or number < COMPARED_EVERY:
+            continue
+        truth: np.ndarray | None = None
+        for bound, other in others.items():
+            other.scene = scene
+            for one in known:
+                if one.name not in other.views:
+                    other.observe(None, one)
+            plan = other.scores(places)
+            scores = np.array(plan.scores, float)
+            truth = scores if truth is None else truth
+            row = {
+                "what": "bound",
+                "number": number,
+                "bound": bound,
+                "seconds": plan.seconds,
+                "computed": plan.computed,
+                "changed": plan.changed,
+                "tau": rank_correlation(truth, scores, "kendall"),
+                "short": float(1 - truth[scores.argmax()] / truth.max()),
+            }
+            add_row(ROWS, row | where)
+            print(row, flush=True)
+
+
+def tables(rows: list[dict]) -> str:
+    """Latency and memory by hundreds of photographs, and bounds against what is asked and how right it is."""
+    parts = []
+    for name in dict.fromkeys(row["data"] for row in rows):
+        mine = [row for row in rows if row["data"] == name]
+        frames = [row for row in mine if row["what"] == "photograph"]
+        last = mine[-1]
+        parts.append(
+            paragraph(
+                f"`{name}`: {len(frames)} photographs, {last['machine']}, {last['date']}, commit {last['commit'][:7]}. "
+                "Seconds are medians, in brackets the largest; memory is that of the process at the end."
+            )
+        )
+        lines = []
+        for begin in range(0, len(frames), WINDOW):
+            own = frames[begin : begin + WINDOW]
+            cells = [f"{np.median([x[k] for x in own]):.2f} ({max(x[k] for x in own):.1f})"
+                     for k in ("observe", "scores", "next")]  # fmt: skip
+            quality = [x["psnr"] for x in own if "psnr" in x]
+            lines.append(
+                [
+                    f"{begin + 1} to {begin + len(own)}",
+                    f"{own[-1]['gaussians']:,}",
+                    str(own[-1]["known"]),
+                    *cells,
+                    f"{np.mean([x['computed'] for x in own]):.1f}",
+                    f"{np.median([x['changed'] for x in own]):.2f}",
+                    f"{own[-1]['memory'] / 1e9:.2f} GB",
+                    f"{quality[-1]:.1f} dB" if quality else "",
+                ]
+            )
+        heads = ["photographs", "Gaussians", "kept", "observe", "scores", "next, 3 picks", "views asked", "changed",
+                 "memory", "held out"]  # fmt: skip
+        parts.append(markdown_table(heads, lines))
+        compared = [row for row in mine if row["what"] == "bound"]
+        lines = []
+        for bound in BOUNDS:
+            own = [row for row in compared if row["bound"] == bound]
+            if own:
+                asked, seconds, tau, short = (
+                    np.mean([x[k] for x in own]) for k in ("computed", "seconds", "tau", "short")
+                )
+                worst = min(x["tau"] for x in own)
+                lines.append(
+                    [f"{bound:g}", f"{asked:.1f}", f"{seconds:.2f}", f"{tau:.3f} ({worst:.2f})", f"{100 * short:.1f} %"]
+                )
+        if lines:
+            count = len({row["number"] for row in compared})
+            parts.append(paragraph(f"Bounds, {count} models, ten photographs apart; in brackets the worst:"))
+            parts.append(
+                markdown_table(["bound", "views asked", "seconds", "Kendall's tau", "what the best lacks"], lines)
+            )
+    return "\n\n".join(parts)
+
+
+def main() -> None:
+    """The program."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", nargs="?", type=Path)
+    parser.add_argument("--frames", type=int, default=500)
+    parser.add_argument("--page", action="store_true", help="write the tables of what is there")
+    args = parser.parse_args()
+    if args.data is not None:
+        measure(args.data, args.frames)
+    text = tables(read_rows(ROWS))
+    print(text)
+    if args.page:
+        fill_between(PAGE, "planner", text)
+
+
+if __name__ == "__main__":
+    main()
