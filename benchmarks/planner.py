@@ -1,14 +1,15 @@
 """What `drgs.Planner` costs over many photographs, and what it loses by keeping what views told of an earlier model.
 
-    python benchmarks/planner.py DATA [--frames 500] [--page]      rows as they come, kept: benchmarks/planner.jsonl
-    python benchmarks/planner.py --page                            the tables of docs/planner.md
+    python benchmarks/planner.py DATA --frames 500           rows as they come, kept: benchmarks/planner.jsonl
+    python benchmarks/planner.py DATA --frames 200 --bounds
+    python benchmarks/planner.py --page                      the tables of docs/planner.md
 
 DATA is a sequence with depth: `drgs scene room --views 560 --size 120x90 --test-every 10 -o DATA`, or a capture. Its
 training views come in their order, 10 steps of the fit after each, and after each one 30 of the held-out views are
 scored within a second and three are picked; of a third of the held-out views PSNR is measured.
 
-Every tenth photograph, up to the 200th, planners with other bounds are asked the same about the same models without a
-limit of time. What is right is the answer of bound 0, which asks every view anew.
+With `--bounds` nothing else is measured but every tenth photograph: planners with other bounds are asked the same about
+the same model, without a limit of time. What is right is the answer of bound 0, which asks every view anew.
 """
 
 from __future__ import annotations
@@ -42,32 +43,38 @@ BOUNDS = (0.0, 0.05, 0.1, 0.2, 0.4, 0.6, 1.0)
 CANDIDATES = 30
 STEPS = 10
 SECONDS = 1.0
-COMPARED_EVERY, COMPARED_UNTIL = 10, 200
+COMPARED_EVERY = 10
 WINDOW = 100  # photographs of a line of the table
 
 
-def measure(path: Path, frames: int) -> None:
-    """Rows of the photographs of a data set, and of the bounds that are compared on the way."""
+def measure(path: Path, frames: int, bounds: bool) -> None:
+    """Rows of the photographs of a data set, or of the bounds that are compared on the way."""
     dataset = drgs.load_data(path)
     train, held_out = dataset.split()
     train = train[:frames]
     measured = held_out[::3]
-    candidates = [view for view in held_out if view not in measured][:CANDIDATES]
-    places = [view.camera.undistorted() for view in candidates]
+    places = [view.camera.undistorted() for view in held_out if view not in measured][:CANDIDATES]
     cameras = [dataclasses.replace(view.camera.undistorted(), name=view.name) for view in train]
     where = {"data": path.resolve().name} | ran()
     planner = drgs.Planner()
-    others = {bound: drgs.Planner(bound=bound, max_bytes=4 << 30) for bound in BOUNDS}
+    others = {bound: drgs.Planner(bound=bound) for bound in BOUNDS}
     for number, (view, camera) in enumerate(zip(train, cameras, strict=True)):
         began = time.monotonic()
         planner.observe(view.image(), camera, depth_of(dataset, view))
         observed = time.monotonic()
         planner.fit(steps=STEPS)
         fitted = time.monotonic()
-        plan = planner.scores(places, seconds=SECONDS)
-        picked = planner.next(min(3, len(places)), seconds=0)
         scene = planner.scene
         assert scene is not None
+        if bounds:
+            if number % COMPARED_EVERY == 0 and number:
+                known = [one for one in cameras[: number + 1] if one.name in planner.views]
+                for row in compared(scene, known, places, others):
+                    add_row(ROWS, row | {"number": number} | where)
+                    print(row, flush=True)
+            continue
+        plan = planner.scores(places, seconds=SECONDS)
+        picked = planner.next(min(3, len(places)), seconds=0)
         row = {
             "what": "photograph",
             "number": number,
@@ -87,23 +94,25 @@ def measure(path: Path, frames: int) -> None:
             row["psnr"] = psnr(scene, measured[:12], 12_000)
         add_row(ROWS, row | where)
         print({k: round(v, 3) if isinstance(v, float) else v for k, v in row.items()}, flush=True)
-        known = [one for one in cameras[: number + 1] if one.name in planner.views]
-        if number >= COMPARED_UNTIL:
-            others = {}
-        if number % COMPARED_EVERY or number < COMPARED_EVERY:
-            continue
-        truth: np.ndarray | None = None
-        for bound, other in others.items():
-            other.scene = scene
-            for one in known:
-                if one.name not in other.views:
-                    other.observe(None, one)
-            plan = other.scores(places)
-            scores = np.array(plan.scores, float)
-            truth = scores if truth is None else truth
-            row = {
+
+
+def compared(
+    scene: drgs.Gaussians, known: list[drgs.Camera], places: list[drgs.Camera], others: dict[float, drgs.Planner]
+) -> list[dict]:
+    """A row of each bound, the smallest first: what it asks of a model, and how right its answer is."""
+    rows = []
+    truth: np.ndarray | None = None
+    for bound, other in others.items():
+        other.scene = scene
+        for one in known:
+            if one.name not in other.views:
+                other.observe(None, one)
+        plan = other.scores(places)
+        scores = np.array(plan.scores, float)
+        truth = scores if truth is None else truth
+        rows.append(
+            {
                 "what": "bound",
-                "number": number,
                 "bound": bound,
                 "seconds": plan.seconds,
                 "computed": plan.computed,
@@ -111,8 +120,8 @@ def measure(path: Path, frames: int) -> None:
                 "tau": rank_correlation(truth, scores, "kendall"),
                 "short": float(1 - truth[scores.argmax()] / truth.max()),
             }
-            add_row(ROWS, row | where)
-            print(row, flush=True)
+        )
+    return rows
 
 
 def tables(rows: list[dict]) -> str:
@@ -125,7 +134,7 @@ def tables(rows: list[dict]) -> str:
         parts.append(
             paragraph(
                 f"`{name}`: {len(frames)} photographs, {last['machine']}, {last['date']}, commit {last['commit'][:7]}. "
-                "Seconds are medians, in brackets the largest; memory is the largest that the process had by then, the other bounds' planners included."
+                "Seconds are medians, in brackets the largest; memory is the largest that the process had by then."
             )
         )
         lines = []
@@ -175,10 +184,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", nargs="?", type=Path)
     parser.add_argument("--frames", type=int, default=500)
+    parser.add_argument("--bounds", action="store_true", help="compare bounds")
     parser.add_argument("--page", action="store_true", help="write the tables of what is there")
     args = parser.parse_args()
     if args.data is not None:
-        measure(args.data, args.frames)
+        measure(args.data, args.frames, args.bounds)
     text = tables(read_rows(ROWS))
     print(text)
     if args.page:
