@@ -27,17 +27,19 @@ from collections import deque
 from collections.abc import Callable, Sequence
 
 import numpy as np
+import torch
 
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
 from drgs.fitting.config import FitConfig
 from drgs.fitting.online import OnlineFit
-from drgs.gain import Information, Prior
+from drgs.gain import Information
 from drgs.guards.arguments import ArgumentError, kind_of, must_be
 from drgs.guards.inputs import camera_list
 from drgs.information.drift import DriftCache, Unanswered
-from drgs.information.pool import Pick, Selection
+from drgs.information.pool import Pick, Pool, Selection
 from drgs.information.refining import Refine
+from drgs.policies.informed import ask
 from drgs.select import Scoring, select
 from drgs.settings import RenderSettings
 from drgs.sizes import at_most
@@ -48,6 +50,7 @@ Cost = Sequence[float] | Callable[[Camera, Camera], float]
 """What it costs to go to each candidate, in the caller's unit; or a function: from where, to where."""
 
 _FAST = Scoring(settings=RenderSettings.preset("fast"))
+_RNG = torch.Generator()  # which nothing that is asked here draws from
 _LATELY = 9  # times that are remembered of how long something took
 
 
@@ -138,9 +141,9 @@ class Planner:
         """
         for name, value in {"info_pixels": info_pixels, "max_views": max_views}.items():
             if type(value) is not int or value < 2:
-                raise ArgumentError(f"Planner: {name} must be a whole number >= 2, got {kind_of(value)}; raise it")
+                raise ArgumentError(f"Planner: {name} must be a whole number >= 2, got {value!r}; raise it")
         if not 0 <= bound <= 1:
-            raise ArgumentError(f"Planner: bound must be in [0, 1], got {bound!r}; try 0.1")
+            raise ArgumentError(f"Planner: bound must be in [0, 1], got {bound!r}; try 0.2")
         if not (math.isfinite(look) and look > 0):
             raise ArgumentError(f"Planner: look must be a finite number > 0, got {look!r}; try 1")
         self.info_pixels = info_pixels
@@ -276,7 +279,8 @@ class Planner:
             camera: Where to begin, e.g. that of a pick.
             refine: How far and how long; default 20 further views, in the box of all known views and candidates.
         Returns:
-            `camera` is the place, at the size at which views are asked; `score` and `start` what it and the first tell.
+            `camera` is the place, at the size at which views are asked; `score` and `start` are what it and the first
+            tell, scored beside no other candidates.
         """
         must_be("Planner.refine", "camera", camera, Camera, "e.g. plan.picks[0].camera")
         with self._asking:
@@ -363,7 +367,8 @@ class Planner:
         for cameras in (known, self._pool):
             changes = {i: self._cache.change(scene, camera) for i, camera in enumerate(cameras)}
             stale = sorted((i for i in changes if changes[i] > self._cache.bound), key=lambda i: (-changes[i], -i))
-            queues.append([cameras[i] for i in stale])
+            queues.append(([cameras[i] for i in stale], len(cameras)))
+        queues = [queue for queue, _ in sorted(queues, key=lambda x: -len(x[0]) / x[1])]  # where more is left first
         turns = [camera for pair in itertools.zip_longest(*queues) for camera in pair if camera is not None]
         done = 0
         for camera in turns:
@@ -376,8 +381,8 @@ class Planner:
         return done
 
     def _ask_one(self, scene: Gaussians, camera: Camera) -> None:
-        """Ask one view, beside no others: what it tells depends neither on these nor on lambda."""
-        select(scene, [camera], [], 1, scoring=dataclasses.replace(self._scoring, prior=Prior(1.0)), cache=self._cache)
+        """Ask one view, beside no others, which what it tells does not depend on."""
+        ask(Pool(scene=scene, candidates=[camera], train=[], k=1, scoring=self._scoring, rng=_RNG, cache=self._cache))
 
     def _answer(self, scene: Gaussians, known: list[Camera], k: int) -> Plan:
         """Scores and picks by what is kept."""
@@ -465,7 +470,7 @@ def _checked_image(image: np.ndarray | None, camera: Camera) -> np.ndarray:
     if not isinstance(image, np.ndarray) or image.shape != shape:
         got = f"shape {image.shape}" if isinstance(image, np.ndarray) else kind_of(image)
         raise ValueError(
-            f"Planner.observe: image must be an array of shape {shape}, as its camera, got {got}; resize it"
+            f"Planner.observe: image must be an array of shape {shape}, its camera's, got {got}; resize it"
         )
     if image.dtype != np.uint8 and not (np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1):
         raise ValueError("Planner.observe: image must be uint8, or finite and in [0, 1], got others; scale it")
@@ -479,6 +484,6 @@ def _checked_depth(depth: np.ndarray | None, camera: Camera) -> np.ndarray | Non
     if not isinstance(depth, np.ndarray) or depth.shape != shape:
         got = f"shape {depth.shape}" if isinstance(depth, np.ndarray) else kind_of(depth)
         raise ValueError(
-            f"Planner.observe: depth must be an array of shape {shape}, as its camera, got {got}; resize it"
+            f"Planner.observe: depth must be an array of shape {shape}, its camera's, got {got}; resize it"
         )
     return np.nan_to_num(depth.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0).clip(min=0)

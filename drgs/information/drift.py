@@ -90,7 +90,9 @@ class Shapes:
         count = min(len(self), len(now))
         a, b = ({k: x[:count] for k, x in vars(one).items() if k != "sh"} for one in (self, now))
         scales = a["log_scales"]
-        turn = 2 * (a["quats"] * b["quats"]).sum(1).abs().clamp(max=1).acos()
+        # q and -q are one rotation; by the chord, for the arc cosine of nearly 1 has half of the digits.
+        chord = torch.minimum((a["quats"] - b["quats"]).norm(dim=1), (a["quats"] + b["quats"]).norm(dim=1))
+        turn = 4 * (chord / 2).clamp(max=1).asin()
         flat = 1 - (scales.amin(1) - scales.amax(1)).exp()
         parts = (
             (b["means"] - a["means"]).norm(dim=1) / scales.mean(1).exp(),

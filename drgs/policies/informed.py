@@ -12,10 +12,10 @@ from typing import Any
 
 from drgs.information.blocks import CoverageQuestion, DiagonalQuestion, SceneBlocks
 from drgs.information.combine import Asked, Combination, Questions, asked_of
-from drgs.information.greedy import InformationSource, ViewInformation, greedy
+from drgs.information.greedy import AskedView, InformationSource, ViewInformation, greedy
 from drgs.information.pool import Pool, Selection
 
-__all__ = ["coverage", "fisher", "fisherrf"]
+__all__ = ["ask", "coverage", "fisher", "fisherrf"]
 
 _FEW_PROBES = 8  # of a network's information, below which 1 / H is far too large on average
 
@@ -25,8 +25,7 @@ def fisher(pool: Pool) -> Selection:
     scoring = pool.scoring
     if pool.information is not None:  # it knows by itself what it is about
         return _greedy(pool, ())
-    views = [*pool.train, *pool.candidates]
-    blocks = SceneBlocks.of(pool.scene, scoring, views, answers=pool.answers, empty_outside=pool.empty_outside)
+    blocks = _blocks(pool)
     asked, combination = asked_of(blocks)
     selection = _greedy(pool, asked, combination)
     selection.blocks = list(blocks.names)
@@ -68,21 +67,37 @@ def _greedy(pool: Pool, asked: Sequence[Asked], combination: Combination | None 
         asked: What is asked of a view.
         combination: How that becomes a score; default by the pool's scoring, all groups together.
     """
-    settings = pool.scoring.settings
     combination = combination or Combination(pool.scoring)
-
-    def by(asked: Sequence[Asked]) -> InformationSource:
-        questions = Questions(settings, tuple(asked))
-        if pool.cache is None:
-            return InformationSource(questions)
-        return InformationSource(questions.lasting(), finish=questions.finished)
-
     if own := pool.information:
-        source = InformationSource(lambda scene, camera, mask: own(camera), (own, settings), by_name=True)
+        kept_by = own, pool.scoring.settings
+        source = InformationSource(lambda scene, camera, mask: own(camera), kept_by, by_name=True)
         return greedy(pool, ViewInformation(pool, source), combination)
     told = [one for one in asked if one.question.asks_known]
-    known = None if len(told) == len(asked) else by(told)
-    return greedy(pool, ViewInformation(pool, by(asked), known), combination)
+    known = None if len(told) == len(asked) else _source(pool, told)
+    return greedy(pool, ViewInformation(pool, _source(pool, asked), known), combination)
+
+
+def _source(pool: Pool, asked: Sequence[Asked]) -> InformationSource:
+    """What views are asked: with a cache, first what depends on a view alone."""
+    questions = Questions(pool.scoring.settings, tuple(asked))
+    if pool.cache is None:
+        return InformationSource(questions)
+    return InformationSource(questions.lasting(), finish=questions.finished)
+
+
+def ask(pool: Pool) -> None:
+    """Ask the candidates what `fisher` goes by, for the pool's cache; nothing is scored."""
+    asked, _ = asked_of(_blocks(pool))
+    for _ in ViewInformation(pool, _source(pool, asked)).each(
+        [AskedView(f"candidate {i}", camera) for i, camera in enumerate(pool.candidates)]
+    ):
+        pass
+
+
+def _blocks(pool: Pool) -> SceneBlocks:
+    """The blocks of the image that the pool's views are asked about."""
+    views = [*pool.train, *pool.candidates]
+    return SceneBlocks.of(pool.scene, pool.scoring, views, answers=pool.answers, empty_outside=pool.empty_outside)
 
 
 def _scored(pool: Pool, **fields: Any) -> Pool:
