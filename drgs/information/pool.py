@@ -15,6 +15,7 @@ from drgs.ellipsoids import Scene
 from drgs.gain import Information
 from drgs.information.cache import Cache, camera_key, value_key
 from drgs.information.choices import Combine
+from drgs.information.once_per_time import once_per_time
 from drgs.information.refining import Refine
 from drgs.information.scoring import Scoring
 
@@ -235,7 +236,8 @@ class Pool:
     def _computed(self, views: Sequence[ViewQuestion]) -> Iterator[Information]:
         if self.workers is not None:
             return self.workers.each(self.scene, [(view.question, view.camera, view.mask) for view in views])
-        return (view.question(self.scene, view.camera, view.mask) for view in views)
+        scene = once_per_time(self.scene)
+        return (view.question(scene, view.camera, view.mask) for view in views)
 
     def pick(self, index: int, score: float, parts: Mapping | None = None, margin: float | None = None) -> Pick:
         """A `Pick` with plain numbers.
