@@ -14,10 +14,9 @@ from drgs.information.columns import by_columns
 from drgs.information.complement import left
 from drgs.information.elimination import ViewRows
 from drgs.information.groups import Group, groups_of
-from drgs.information.hit_sums import HitSums
 from drgs.information.nuisances import Nuisances
 from drgs.information.probes import by_probes
-from drgs.information.replay import Replay
+from drgs.information.replay import Replay, WalkSums
 from drgs.information.semantics import SemanticMetric
 from drgs.runtime import alone
 from drgs.settings import RenderSettings
@@ -40,7 +39,7 @@ def diagonal_and_opacity(
     masks: Masks = None,
     nuisances: Nuisances | None = None,
     backgrounds: Sequence[tuple[float, ...]] = (),
-    beside: Sequence[HitSums] = (),
+    beside: Sequence[WalkSums] = (),
 ) -> tuple[dict[str, torch.Tensor], list[torch.Tensor]]:
     """The diagonal of J^T J, and the opacity of the views that it is of.
 

@@ -104,6 +104,7 @@ class _Along:
         return states
 
     def _add(self, place: UInt32, own: list[list]) -> UInt32:
+        """Add rows of one Gaussian, slopes, channels' slopes and what its color does of each ray, image by image."""
         lib = self.walk.part.lib
 
         def body(k: UInt32, place: UInt32, own: list[list]) -> tuple[UInt32, UInt32, list[list]]:

@@ -310,7 +310,7 @@ class Together:
     """Several sinks, each of which takes every row.
 
     Args:
-        sinks: These; what they keep along a ray has names of its own.
+        sinks: The sinks; what each keeps along a ray has a name of its own.
     """
 
     def __init__(self, sinks: Sequence[Sink]) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 
@@ -82,7 +82,8 @@ class NetworkRows:
         quats = self._seen.quats.detach().to(geometry.device)
         slopes = _raw(geometry[:, told], quats[rows])
         if self._fields is None:
-            found = self._scene.squared_slopes(self._view[0].time, rows, slopes)
+            scene: Any = self._scene  # that has `squared_slopes`
+            found = scene.squared_slopes(self._view[0].time, rows, slopes)
             return {name: found[name] for name in self._names}
         return self._fields.squares(slopes, rows)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import drjit as dr
 import torch
@@ -18,18 +18,17 @@ from drgs.tracing.harmonics import sh_basis
 from drgs.tracing.hit_table import Table, along_lists
 from drgs.tracing.pose import quaternion_product
 from drgs.tracing.primitives import Activated
+from drgs.tracing.protocols import Sink
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
-    from drgs.information.hit_sums import HitSums
     from drgs.information.semantics import SemanticMetric
     from drgs.settings import RenderSettings
     from drgs.tracing.kernels import Channels
-    from drgs.tracing.protocols import Sink
     from drgs.tracing.walk import Part
 
-__all__ = ["Replay"]
+__all__ = ["Replay", "WalkSums"]
 
 _TABLED = 4  # channels whose tables are worth their memory
 _BESIDE = 16  # semantic channels of one traversal, beside the colors
@@ -56,6 +55,23 @@ class Walk(NamedTuple):
     part: Part
     finals: list[dict]
     table: Table | None
+
+
+class WalkSink(Sink, Protocol):
+    """The sink of one walk.
+
+    Attributes:
+        buffer: What it scatters into.
+    """
+
+    buffer: Float
+
+
+class WalkSums(Protocol):
+    """Sums over the hits of a view, to which each of its walks adds."""
+
+    def sink(self, replay: Replay, walk: Walk) -> WalkSink:
+        """What adds the hits of a walk of the view."""
 
 
 class Replay:
@@ -204,7 +220,7 @@ class Replay:
         """Hand the Jacobian's rows of a part to a sink: final states of its shared rays."""
         return walk.part.run(self._rows(walk.channels, walk.part, walk.finals, sink, walk.table))
 
-    def add_up(self, sums: HitSums) -> None:
+    def add_up(self, sums: WalkSums) -> None:
         """Add the hits of all walks to sums of them."""
         for walk in self.walks([1.0] * 3):
             sink = sums.sink(self, walk)
@@ -215,7 +231,7 @@ class Replay:
         sink_of: Callable[[Walk, dr.ReduceMode], Diagonal | Blocks],
         width: int,
         weights: Sequence[float],
-        beside: Sequence[HitSums] = (),
+        beside: Sequence[WalkSums] = (),
     ) -> torch.Tensor:
         """(N, width) float64: what `sink_of(walk, reduce mode)` sums up in its `buffer`, over all walks; their hits are
         added to the sums `beside`, too.
@@ -231,7 +247,7 @@ class Replay:
         return total
 
     def sums(
-        self, entries: Sequence[int], weights: Sequence[float], summed: bool = False, beside: Sequence[HitSums] = ()
+        self, entries: Sequence[int], weights: Sequence[float], summed: bool = False, beside: Sequence[WalkSums] = ()
     ) -> torch.Tensor:
         """(N, 11) float64: squares of the geometry, and sum w^2; those of SH along each ray are kept in `light`."""
         bands = self.call.coefficients if self.along_ray and self.extras is not None and GEOMETRY in entries else 0
@@ -245,7 +261,7 @@ class Replay:
         return total[:, : GEOMETRY + 1]
 
     def diagonal(
-        self, groups: dict, weights: Sequence[float], fisherrf: bool, beside: Sequence[HitSums] = ()
+        self, groups: dict, weights: Sequence[float], fisherrf: bool, beside: Sequence[WalkSums] = ()
     ) -> Information:
         """`fisher.diagonal` of one view; its hits are added to the sums `beside`, too."""
         entries = sorted({k for group in groups.values() for k in group.entries})
