@@ -371,11 +371,13 @@ class DynamicGaussians:
         Returns:
             A tensor of the shape of each parameter, named as in `parameters`: `phi.grid.*`, `phi.mlp.*`.
         """
+        home = self.field.grid[0]
+        index = index.to(home.device)
         moves = self.moving[index]
         index = index[moves]
-        of_deltas = [slopes[name][:, moves].to(self.field.grid[0].dtype) for name in Deltas._fields]
+        of_deltas = [slopes[name].to(home)[:, moves] for name in Deltas._fields]
         if self.motion is not None:
-            factor = (0.5 * self.motion.detach()[index]).tanh().to(of_deltas[0].dtype)
+            factor = (0.5 * self.motion.detach()[index]).tanh().to(home.dtype)
             of_deltas = [x * factor[:, None] for x in of_deltas]
         means = self.gaussians.means.detach()[index]
         found = self.field.squared_slopes(means, time, Deltas(*of_deltas), self.gaussians.origin)

@@ -214,7 +214,7 @@ class NetworkProbes:
         rows = None if view is None else view.network_rows(groups)
         if view is None or rows is None or probes > view.most_images:
             return None
-        images = _signs(torch.Generator().manual_seed(0), probes, view.pixels, view.rows)
+        images = _signs(torch.Generator().manual_seed(0), probes, view.pixels, view.rows, dtype=torch.float32)
         return cls(rows, rows.along(view.cotangents(images)), groups, semantics)
 
     @alone
@@ -222,7 +222,7 @@ class NetworkProbes:
         """What `network` returns of the view."""
         with own_errors():
             found = _by_group(self._groups, self._rows.squares(self.sums))
-        return {name: x.double() / len(self.sums.images) for name, x in found.items()}
+        return {name: x.double().div_(len(self.sums.images)) for name, x in found.items()}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -327,7 +327,7 @@ class _View:
 
         def each(images: torch.Tensor) -> Information:
             total = {name: torch.zeros_like(x) for own in groups.values() for name, x in own.items()}
-            for image in self.cotangents(images, self.scales).float():
+            for image in self.cotangents(images, self.scales):
                 for name, slope in pull(image[:, :3], image[:, 3:] if image.shape[1] > 3 else None).items():
                     total[name] += slope.square()
             return _by_group(groups, total)
@@ -341,9 +341,11 @@ class _View:
         return rows if rows.are_of_geometry else None
 
     def cotangents(self, images: torch.Tensor, scales: torch.Tensor | None = None) -> torch.Tensor:
-        """(K, pixels, C) rows as cotangents of channels, which are multiplied by the scales; None: by the weights."""
-        own = images if self.eliminated is None else self.eliminated.root(images.double())
-        return own * (self.weights if scales is None else scales)
+        """(K, pixels, C) rows as float32 cotangents of channels, which the scales multiply; None: the weights."""
+        if self.eliminated is not None:
+            images = self.eliminated.root(images.double())
+        factors = self.weights if scales is None else scales
+        return (images * factors.to(images.dtype)).float()
 
     def push(self, tangents: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """(K, pixels, C) float64 tangents of the rows, along (K, ...) tangents of phi by name."""
@@ -392,7 +394,7 @@ def _diagonal(view: _View, groups: Groups, probes: int, generator: torch.Generat
     squares = view.squares(groups)
     for start in range(0, probes, view.most_images):
         count = min(view.most_images, probes - start)
-        yield squares(_signs(generator, count, view.pixels, view.rows))
+        yield squares(_signs(generator, count, view.pixels, view.rows, dtype=torch.float32))
 
 
 def _trace_reverse(view: _View, groups: Groups, probes: int, generator: torch.Generator) -> Iterator[Information]:
@@ -423,9 +425,9 @@ _ESTIMATORS = {
 }
 
 
-def _signs(generator: torch.Generator, *shape: int) -> torch.Tensor:
-    """-1 or 1, float64."""
-    return torch.randint(0, 2, shape, generator=generator, dtype=torch.float64).mul_(2).sub_(1)
+def _signs(generator: torch.Generator, *shape: int, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+    """-1 or 1; the same of each type."""
+    return torch.randint(0, 2, shape, generator=generator, dtype=dtype).mul_(2).sub_(1)
 
 
 def _by_group(groups: Groups, found: Mapping[str, torch.Tensor]) -> Information:

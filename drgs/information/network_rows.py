@@ -65,10 +65,10 @@ class NetworkRows:
         return self._fields is None or set(self._fields.made) <= set(_FIELDS)
 
     def along(self, images: torch.Tensor) -> HitSums:
-        """Sums of the view's hits along (K, pixels, C) cotangents of the rows, none added yet."""
+        """Sums of the view's hits along (K, pixels, C) float32 cotangents of the rows, none added yet."""
         moves = getattr(self._scene, "moving", None)
         which = torch.ones(len(self._seen), dtype=torch.bool) if moves is None else moves.cpu()
-        return HitSums(images.float(), which)
+        return HitSums(images, which)
 
     def squares(self, sums: HitSums) -> dict[str, torch.Tensor]:
         """Squared slopes of the parameters by name, summed over the images; the hits are walked along if no other

@@ -11,7 +11,7 @@ from drgs.ellipsoids import DeformableScene, Gaussians, Scene
 
 __all__ = ["once_per_time"]
 
-_BYTES = 64 << 20  # of what is held, beside the Gaussians of the last time
+_BYTES = 64 << 20  # of what is held, or those of one time
 
 
 def once_per_time(scene: Scene) -> Scene:
@@ -31,15 +31,18 @@ class _OncePerTime:
     def __init__(self, scene: Scene) -> None:
         self._scene: Any = scene
         self._seen: OrderedDict[float | None, Gaussians] = OrderedDict()
+        self._most = 0  # times that are held; known when there are two
 
     def at(self, time: float | None) -> Gaussians:
         """The Gaussians at a time."""
         if time not in self._seen:
             with torch.no_grad():  # information is a number
                 self._seen[time] = self._scene.at(time)
+            if len(self._seen) > 1:
+                self._most = self._most or max(1, _BYTES // max(1, self._own_bytes(self._seen[time])))
+                if len(self._seen) > self._most:
+                    self._seen.popitem(last=False)
         self._seen.move_to_end(time)
-        while len(self._seen) > 1 and sum(map(self._own_bytes, self._seen.values())) > _BYTES:
-            self._seen.popitem(last=False)
         return self._seen[time]
 
     def parameters(self) -> dict[str, torch.Tensor]:
