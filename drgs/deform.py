@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 import torch
 
-from drgs.dynamics.hexplane import HexPlane, features
+from drgs.dynamics.hexplane import HexPlane, corners_of, features, product
 from drgs.dynamics.lives import LIVES, Lives, drift, living, logit_at
 from drgs.ellipsoids import Gaussians
 from drgs.guards.arguments import ArgumentError, must_be
@@ -32,6 +32,7 @@ __all__ = ["DeformationField", "Deltas", "DynamicGaussians", "FieldConfig"]
 _HEADS = {"means": 3, "quats": 4, "log_scales": 3}
 _BEYOND = 1e-6  # of the span: how far outside of it a time may lie, by rounding
 _FLATTEST = 1e-3  # of the longest side of the bounds: how short another may be
+_FLOATS = 1 << 22  # of the slopes by a layer of the MLP that are alive at a time
 PHI = "phi."
 
 
@@ -162,6 +163,39 @@ class DeformationField(torch.nn.Module):
         """`forward` of a field with these weights, named as in `named_parameters`; from any number of threads."""
         planes = [weights[f"grid.{k}"] for k in range(len(self.grid))]
         return _deltas(weights, features(planes, self._places(means, origin), self._moment(time)))
+
+    def squared_slopes(
+        self, means: torch.Tensor, time: float, slopes: Deltas, origin: ArrayLike | None = None
+    ) -> dict[str, torch.Tensor]:
+        """Squares of J^T u, J the derivative of the deltas by the parameters, summed over K cotangents u.
+
+        All cotangents go through the MLP together, and of the planes only nodes that the means read are looked at.
+
+        Args:
+            means, time, origin: The same as for `forward`.
+            slopes: The cotangents, (K, N, 3), (K, N, 4) and (K, N, 3).
+        Returns:
+            A tensor of the shape of each parameter, named as in `named_parameters`.
+        """
+        weights = {name: x.detach() for name, x in self.named_parameters()}  # leaves of a graph of their own
+        planes = {name: x for name, x in weights.items() if name.startswith("grid.")}
+        mlp = {name: x.requires_grad_() for name, x in weights.items() if name not in planes}
+        with torch.no_grad():  # which nodes are read, and of which weights, is the derivative by the planes
+            corners = corners_of(list(planes.values()), self._places(means, origin), self._moment(time))
+            found = [own.read(plane) for own, plane in zip(corners, planes.values(), strict=True)]
+        leaves = [*mlp.values(), *(x.requires_grad_() for x in found)]
+        with torch.enable_grad():
+            deltas = _deltas(mlp, product(found))
+        pull = torch.func.vmap(lambda *u: torch.autograd.grad(deltas, leaves, u, retain_graph=True))
+        total = {name: torch.zeros_like(x, requires_grad=False) for name, x in weights.items()}
+        step = max(1, _FLOATS // max(1, len(means) * len(_HEADS) * self.config.width))
+        for some in zip(*(x.split(step) for x in slopes), strict=True):
+            by_leaf = pull(*some)
+            for name, x in zip(mlp, by_leaf, strict=False):
+                total[name] += x.square().sum(0)
+            for name, own, x in zip(planes, corners, by_leaf[len(mlp) :], strict=True):
+                own.add_squares(total[name], x)
+        return total
 
     def _places(self, means: torch.Tensor, origin: ArrayLike | None) -> torch.Tensor:
         """Means as parts of the way from the lower to the upper bound: float64 differences of what is far from 0."""
@@ -324,6 +358,30 @@ class DynamicGaussians:
         if lives is not None:
             self._live(fields, lives, time)
         return self.gaussians.replace(**fields)
+
+    def squared_slopes(
+        self, time: float, index: torch.Tensor, slopes: Mapping[str, torch.Tensor]
+    ) -> dict[str, torch.Tensor]:
+        """Squares of J^T u, J the derivative of raw fields by the field's parameters, summed over K cotangents u.
+
+        Args:
+            time: The time.
+            index: (M,) int64: Gaussians whose cotangents are given; all others have 0.
+            slopes: The cotangents: (K, M, 3) `means`, (K, M, 4) `quats`, (K, M, 3) `log_scales`.
+        Returns:
+            A tensor of the shape of each parameter, named as in `parameters`: `phi.grid.*`, `phi.mlp.*`.
+        """
+        home = self.field.grid[0]
+        index = index.to(home.device)
+        moves = self.moving[index]
+        index = index[moves]
+        of_deltas = [slopes[name].to(home)[:, moves] for name in Deltas._fields]
+        if self.motion is not None:
+            factor = (0.5 * self.motion.detach()[index]).tanh().to(home.dtype)
+            of_deltas = [x * factor[:, None] for x in of_deltas]
+        means = self.gaussians.means.detach()[index]
+        found = self.field.squared_slopes(means, time, Deltas(*of_deltas), self.gaussians.origin)
+        return {PHI + name: x for name, x in found.items()}
 
     def _live(self, fields: dict[str, torch.Tensor], lives: Lives, time: float | torch.Tensor) -> None:
         """Put those that are there for a time where they are at a time, as opaque as they are then."""

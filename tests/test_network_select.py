@@ -8,12 +8,17 @@ import torch
 from scenes_random import camera, gaussians
 from test_network_information import swarm
 
+import drgs.information.once_per_time
 from drgs import fisher
+from drgs.ellipsoids import DeformableScene
 from drgs.fitting.config import SelectionConfig
 from drgs.gain import Prior, information_gain
 from drgs.information import diagonal
-from drgs.information.blocks import NetworkQuestion, SceneBlocks, SeenView
-from drgs.information.combine import asked_of
+from drgs.information.blocks import NetworkQuestion, SceneBlocks
+from drgs.information.combine import Questions, asked_of
+from drgs.information.once_per_time import once_per_time
+from drgs.information.replay import Replay
+from drgs.information.seen_view import SeenView
 from drgs.select import POLICIES, Cache, Scoring, select
 from drgs.settings import RenderSettings
 
@@ -105,6 +110,65 @@ def test_greedy_over_pairs_of_camera_and_time(views, cache):
     assert cache.misses < cache.hits
 
 
+@pytest.mark.parametrize("preset", ["fast", "exact"])
+@pytest.mark.parametrize("masked", [False, True])
+def test_one_traversal_for_geometry_and_deformation(views, monkeypatch, preset, masked):
+    """What the walk for the geometry sums up beside is what each says alone; the diagonal has the same bits."""
+    scene, cams = views
+    settings = RenderSettings.preset(preset)
+    mask = torch.linspace(0, 1, 256).reshape(16, 16) if masked else None
+    blocks = SceneBlocks.of(scene, Scoring(settings=settings, probes=K), cams)
+    replays = []
+    plain = Replay.__init__
+    monkeypatch.setattr(Replay, "__init__", lambda *a, **o: (replays.append(a), plain(*a, **o))[1])
+    found = Questions(settings, tuple(asked_of(blocks)[0]))(scene, cams[4], mask)
+    assert len(replays) == 1
+    masks = None if mask is None else [mask]
+    want = fisher.network(scene, cams[4], settings, probes=K, masks=masks)
+    for group, x in want.items():
+        torch.testing.assert_close(found[group], x.float(), rtol=1e-4, atol=1e-5 * float(x.max()))
+    for group, x in fisher.diagonal(scene.at(0.5), cams[4], settings, masks=masks).items():
+        assert torch.equal(found[group], x.float())
+
+
+def test_a_time_is_computed_once(views, monkeypatch):
+    """In one call, whatever is asked and in whatever order; never across calls, between which weights may change."""
+    scene, cams = views
+    times = []
+    plain = type(scene).at
+    monkeypatch.setattr(type(scene), "at", lambda self, time: (times.append(time), plain(self, time))[1])
+    first = pick(scene, cams[1:7], cams[:1])
+    assert sorted(set(times)) == [0.0, 0.5, 1.0]
+    assert len(times) <= 4  # one more as it is found out which blocks there are
+    with torch.no_grad():
+        scene.field.mlp["means"][3].bias += 0.05
+    changed = pick(scene, cams[1:7], cams[:1])
+    fresh = swarm(scene.gaussians)
+    fresh.field.load_state_dict(scene.field.state_dict())
+    again = pick(fresh, cams[1:7], cams[:1])
+    with torch.no_grad():
+        scene.field.mlp["means"][3].bias -= 0.05
+    assert changed.scores == again.scores != first.scores
+
+
+def test_what_is_computed_once_is_the_scene(views, monkeypatch):
+    """With its parameters and what else it has; few times are held where each takes much."""
+    scene, _ = views
+    once = once_per_time(scene)
+    assert once_per_time(once) is once
+    assert isinstance(once, DeformableScene)
+    assert once.parameters().keys() == scene.parameters().keys()
+    assert torch.equal(once.moving, scene.moving)
+    assert once.at(0.5) is once.at(0.5)
+    assert not any(x.requires_grad for x in once.at(0.5).parameters().values())
+    monkeypatch.setattr(drgs.information.once_per_time, "_BYTES", 0)
+    seen = once.at(0.5)
+    assert once.at(1.0) is not seen
+    assert once.at(0.5) is not seen
+    assert torch.equal(once.at(0.5).means, seen.means)
+    assert once_per_time(scene.gaussians) is scene.gaussians
+
+
 @pytest.mark.parametrize("network", ["trace", "paper"])
 def test_a_trace_needs_nothing_known(views, cache, network):
     """The paper's scores: of a candidate alone, whatever the known views and lambda are; k picks are the k best."""
@@ -125,14 +189,18 @@ def test_a_trace_does_not_ask_known_views(views, monkeypatch, blocks):
     """Probes of the network are pulled back at the candidates alone; other blocks ask known views as ever."""
     scene, cams = views
     asked = {"network": [], "diagonal_and_opacity": []}
-    for (name, names), module in zip(asked.items(), (fisher, diagonal), strict=True):
-        plain = getattr(module, name)
+    diagonal_of, network_of = diagonal.diagonal_and_opacity, NetworkQuestion.information
 
-        def spy(scene, camera, *rest, plain=plain, names=names, **options):
-            names.append(camera.name)
-            return plain(scene, camera, *rest, **options)
+    def spy(scene, camera, *rest, **options):
+        asked["diagonal_and_opacity"].append(camera.name)
+        return diagonal_of(scene, camera, *rest, **options)
 
-        monkeypatch.setattr(module, name, spy)
+    def spy_on_network(question, view):
+        asked["network"].append(view.camera.name)
+        return network_of(question, view)
+
+    monkeypatch.setattr(diagonal, "diagonal_and_opacity", spy)
+    monkeypatch.setattr(NetworkQuestion, "information", spy_on_network)
     pick(scene, cams[2:4], cams[:2], 2, blocks=blocks, network="trace")
     assert asked["network"] == [x.name for x in cams[2:4]]
     assert asked["diagonal_and_opacity"] == ([x.name for x in cams[:4]] if "geometry" in blocks else [])

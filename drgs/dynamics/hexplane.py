@@ -9,12 +9,13 @@ Reference:
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
-__all__ = ["SPACE_PAIRS", "TIME_AXES", "HexPlane", "features"]
+__all__ = ["SPACE_PAIRS", "TIME_AXES", "Corners", "HexPlane", "corners_of", "features", "product"]
 
 SPACE_PAIRS = ((0, 1), (0, 2), (1, 2))  # columns and rows of the planes of space
 TIME_AXES = 3  # planes with a time, a column along each axis
@@ -87,20 +88,66 @@ def features(planes: Sequence[torch.Tensor], places: torch.Tensor, time: torch.T
     Returns:
         (N, L C) of the dtype of the planes, differentiable in both modes by planes, places and time.
     """
-    out = []
+    found = []
     for space, times in levels(planes):
-        cells = [_between(places[:, axis], space[0].shape[0], space[0].dtype) for axis in range(3)]
+        cells = _cells(space[0], places)
         below, part = _between(time, times[0].shape[0], times[0].dtype)
         both = torch.stack([1 - part, part])[:, None, None]
-        found = [_bilinear(plane, cells[a], cells[b]) for plane, (a, b) in zip(space, SPACE_PAIRS, strict=True)]
+        found += [_bilinear(plane, cells[a], cells[b]) for plane, (a, b) in zip(space, SPACE_PAIRS, strict=True)]
         for plane, (first, s) in zip(times, cells, strict=True):
             line = (plane.narrow(0, int(below), 2) * both).sum(0)
             found.append(_Lookup.apply(line, _ends(first, 1), s[:, None]))
-        product = found[0]
-        for factor in found[1:]:
-            product = product * factor
-        out.append(product)
-    return torch.cat(out, 1)
+    return product(found)
+
+
+def product(found: Sequence[torch.Tensor]) -> torch.Tensor:
+    """(N, L C) features of what places look up in each plane, (N, C) in the order of `HexPlane`."""
+    return torch.cat([functools.reduce(torch.mul, found[k : k + 6]) for k in range(0, len(found), 6)], 1)
+
+
+class Corners(NamedTuple):
+    """What places read of a plane.
+
+    Attributes:
+        nodes: (N, 4) int64 which of its nodes, row by row.
+        weights: (N, 4) by which these are added up.
+    """
+
+    nodes: torch.Tensor
+    weights: torch.Tensor
+
+    def read(self, plane: torch.Tensor) -> torch.Tensor:
+        """(N, C) of the plane."""
+        return _bag(plane.flatten(0, 1), self.nodes, self.weights)
+
+    def add_squares(self, total: torch.Tensor, slopes: torch.Tensor) -> None:
+        """Add squares of slopes by the plane to a total of its shape, summed over K cotangents.
+
+        Args:
+            slopes: (K, N, C) by what was read.
+        """
+        # Places read few of the nodes: the others' slopes, of every cotangent, are 0.
+        used, which = self.nodes.unique(return_inverse=True)
+        each = slopes.permute(1, 0, 2)[:, None] * self.weights[..., None, None]
+        by_node = each.new_zeros(len(used), *each.shape[2:]).index_add_(0, which.flatten(), each.flatten(0, 1))
+        total.flatten(0, 1).index_add_(0, used, by_node.square_().sum(1))
+
+
+def corners_of(planes: Sequence[torch.Tensor], places: torch.Tensor, time: torch.Tensor) -> list[Corners]:
+    """What `features` reads of each plane; arguments are the same."""
+    found = []
+    for space, times in levels(planes):
+        cells = _cells(space[0], places)
+        moment = [x.expand(len(places)) for x in _between(time, times[0].shape[0], times[0].dtype)]
+        for plane, (a, b) in zip(space, SPACE_PAIRS, strict=True):
+            found.append(_corners(plane, cells[a], cells[b]))
+        found += [_corners(plane, cell, moment) for plane, cell in zip(times, cells, strict=True)]
+    return [Corners(nodes, _weights(parts)) for nodes, parts in found]
+
+
+def _cells(plane: torch.Tensor, places: torch.Tensor) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """Along each axis of space the node below each place, and how far it is to the next, in planes like this one."""
+    return [_between(places[:, axis], plane.shape[0], plane.dtype) for axis in range(3)]
 
 
 def _between(x: torch.Tensor, nodes: int, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
@@ -118,12 +165,19 @@ def _ends(first: torch.Tensor, step: int) -> torch.Tensor:
     return torch.stack([first, first + step], -1)
 
 
-def _bilinear(plane: torch.Tensor, column: tuple, row: tuple) -> torch.Tensor:
+def _bilinear(plane: torch.Tensor, column: Sequence[torch.Tensor], row: Sequence[torch.Tensor]) -> torch.Tensor:
     """(N, C) of cells and parts along the second and the first axis of a plane."""
+    return _Lookup.apply(plane.reshape(-1, plane.shape[2]), *_corners(plane, column, row))
+
+
+def _corners(
+    plane: torch.Tensor, column: Sequence[torch.Tensor], row: Sequence[torch.Tensor]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """(N, 4) nodes around cells and (N, 2) parts along the second and the first axis of a plane."""
     (a, s) = column
     (b, t) = row
-    corners = _ends(_ends(b * plane.shape[1] + a, 1), plane.shape[1]).flatten(1)
-    return _Lookup.apply(plane.reshape(-1, plane.shape[2]), corners, torch.stack([s, t], 1))
+    nodes = _ends(_ends(b * plane.shape[1] + a, 1), plane.shape[1]).flatten(1)
+    return nodes, torch.stack([s, t], 1)
 
 
 class _Lookup(torch.autograd.Function):

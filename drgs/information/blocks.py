@@ -21,13 +21,14 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from drgs.information.backdrop import BACKDROP, backdrop_sphere, opacity_of, painted_opacity
+from drgs.information.backdrop import BACKDROP, backdrop_sphere, painted_opacity
 from drgs.information.choices import BLOCKS
 from drgs.information.criteria import criterion_named
 from drgs.information.network_groups import NETWORK_GROUPS, network_groups
 from drgs.information.nuisances import Nuisances
 from drgs.information.prior import Prior
 from drgs.information.scoring import Scoring
+from drgs.information.seen_view import SeenView
 from drgs.information.semantics import SemanticMetric
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     from drgs.gain import Information
     from drgs.information.backdrop import Sphere
     from drgs.information.choices import Block, NetworkEstimate
-    from drgs.settings import RenderSettings
+    from drgs.information.network import NetworkProbes
 
 __all__ = [
     "BACKDROP_BLOCK",
@@ -50,7 +51,6 @@ __all__ = [
     "DiagonalQuestion",
     "ImageBlock",
     "SceneBlocks",
-    "SeenView",
     "add",
     "together",
 ]
@@ -73,41 +73,6 @@ Answers = Callable[[Callable, Sequence["Camera"]], Iterable["Information"]]
 # -------------------------------------------------- what a view is asked
 
 
-@dataclasses.dataclass
-class SeenView:
-    """A view while it is asked: what one question finds out on its way, another one need not render again.
-
-    Attributes:
-        scene: The scene that is seen.
-        camera: The view's camera.
-        settings: Settings of the renderer.
-        mask: (H, W) in [0, 1] what the image is multiplied by; None: 1.
-        opacity: (H, W) float32, once a question has come to know it.
-    """
-
-    scene: Scene
-    camera: Camera
-    settings: RenderSettings
-    mask: torch.Tensor | None = None
-    opacity: torch.Tensor | None = None
-
-    @property
-    def gaussians(self) -> Gaussians:
-        """The Gaussians at the time of the view."""
-        return self.scene.at(self.camera.time)
-
-    @property
-    def masks(self) -> list[torch.Tensor | None] | None:
-        """The mask as functions of `drgs.fisher` take it."""
-        return None if self.mask is None else [self.mask]
-
-    def known_opacity(self) -> torch.Tensor:
-        """(H, W) float32 opacity, rendered where no question has found it."""
-        if self.opacity is None:
-            self.opacity = opacity_of(self.scene, self.camera, self.settings)
-        return self.opacity
-
-
 class BlockQuestion:
     """What a view is asked for one block, or for several together.
 
@@ -119,6 +84,10 @@ class BlockQuestion:
     """
 
     asks_known: bool = True
+
+    def beside(self, view: SeenView) -> NetworkProbes | None:
+        """What a traversal of the view for another question may sum up for this one; None: nothing."""
+        return None
 
     def information(self, view: SeenView) -> Information:
         """What the view says: group -> tensor."""
@@ -177,6 +146,7 @@ class DiagonalQuestion(BlockQuestion):
             semantics=self.semantics,
             masks=view.masks,
             nuisances=self.nuisances,
+            beside=[one.sums for one in view.beside.values() if one.semantics is self.semantics],
         )
         if opacities and view.opacity is None:
             view.opacity = opacities[0]
@@ -243,20 +213,42 @@ class NetworkQuestion(BlockQuestion):
         """A trace is scored without what is known."""
         return self.estimate == "diagonal"
 
+    def beside(self, view: SeenView) -> NetworkProbes | None:
+        """The sums of hits along the probes."""
+        from drgs.information.network import NetworkProbes  # loads Dr.Jit, which poses alone need not have
+
+        if self.estimate != "diagonal":
+            return None
+        return NetworkProbes.of(
+            view.scene,
+            view.camera,
+            view.settings,
+            probes=self.probes,
+            channel_weights=self.channel_weights,
+            semantics=self.semantics,
+            mask=view.mask,
+            nuisances=self.nuisances,
+        )
+
     def information(self, view: SeenView) -> Information:
         """The network's information, by random probes."""
         from drgs import fisher
 
-        found = fisher.network(
-            view.scene,
-            view.camera,
-            view.settings,
-            estimate=self.estimate,
-            probes=self.probes,
-            channel_weights=self.channel_weights,
-            semantics=self.semantics,
-            masks=view.masks,
-            nuisances=self.nuisances,
+        probes = view.beside.get(self)
+        found = (
+            probes.information()
+            if probes
+            else fisher.network(
+                view.scene,
+                view.camera,
+                view.settings,
+                estimate=self.estimate,
+                probes=self.probes,
+                channel_weights=self.channel_weights,
+                semantics=self.semantics,
+                masks=view.masks,
+                nuisances=self.nuisances,
+            )
         )
         return {name: x for name, x in found.items() if self.groups is None or name in self.groups}
 

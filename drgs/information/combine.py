@@ -17,8 +17,10 @@ from typing import TYPE_CHECKING
 import torch
 
 from drgs.gain import Gain, Information, scorer
-from drgs.information.blocks import BlockQuestion, SceneBlocks, SeenView
+from drgs.information.blocks import BlockQuestion, SceneBlocks
 from drgs.information.criteria import criterion_named
+from drgs.information.once_per_time import once_per_time
+from drgs.information.seen_view import SeenView
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -63,8 +65,11 @@ class Questions:
     def __call__(self, scene: Scene, camera: Camera, mask: torch.Tensor | None) -> Information:
         """What one view says, in float32, as it is kept: half the memory, of sums that are of float32 images."""
         found: dict[str, torch.Tensor] = {}
-        view = SeenView(scene, camera, self.settings, mask)
+        view = SeenView(once_per_time(scene), camera, self.settings, mask)
         with torch.no_grad():  # information is a number
+            if len(self.asked) > 1:  # else nobody walks along the view for another one
+                beside = {one.question: one.question.beside(view) for one in self.asked}
+                view.beside = {question: sums for question, sums in beside.items() if sums}
             for one in self.asked:
                 found |= one.named(one.question.information(view))
         return {name: x.to(torch.float32) for name, x in found.items()}

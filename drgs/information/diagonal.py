@@ -16,7 +16,7 @@ from drgs.information.elimination import ViewRows
 from drgs.information.groups import Group, groups_of
 from drgs.information.nuisances import Nuisances
 from drgs.information.probes import by_probes
-from drgs.information.replay import Replay
+from drgs.information.replay import Replay, WalkSums
 from drgs.information.semantics import SemanticMetric
 from drgs.runtime import alone
 from drgs.settings import RenderSettings
@@ -39,6 +39,7 @@ def diagonal_and_opacity(
     masks: Masks = None,
     nuisances: Nuisances | None = None,
     backgrounds: Sequence[tuple[float, ...]] = (),
+    beside: Sequence[WalkSums] = (),
 ) -> tuple[dict[str, torch.Tensor], list[torch.Tensor]]:
     """The diagonal of J^T J, and the opacity of the views that it is of.
 
@@ -49,6 +50,8 @@ def diagonal_and_opacity(
         gaussians, cameras, settings, method, groups, channel_weights, probes, seed, semantics, masks, nuisances: Those
             of `drgs.fisher.diagonal`, of which messages speak.
         backgrounds: One for each view, in place of that of the settings; empty: none.
+        beside: Sums of the hits of the one view that there is, with this mask and these semantics. Methods `exact` and
+            `fisherrf` add to them on their way.
     Returns:
         Group -> float64 tensor on the CPU; and (H, W) float32 opacities on the CPU, one for each view, none of other
         methods and of views without a Gaussian.
@@ -92,7 +95,7 @@ def diagonal_and_opacity(
                 part |= by_probes(seen, camera, settings, own, channel_weights, *draw, semantics, network, *rest)
         else:
             replay = Replay(seen, camera, settings, semantics=semantics, mask=shown[number])
-            part |= replay.diagonal(wanted, channel_weights, method == "fisherrf")
+            part |= replay.diagonal(wanted, channel_weights, method == "fisherrf", beside)
             opacities.append(replay.opacity)
             rows = ViewRows.of(seen, camera, settings, channel_weights, semantics, shown[number], nuisances)
             if rows is not None:

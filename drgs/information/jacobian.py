@@ -24,7 +24,7 @@ from drgs.tracing.protocols import Sink
 from drgs.tracing.records import load_packed, pack, packed_size
 from drgs.tracing.responses import Response
 
-__all__ = ["GEOMETRY", "Blocks", "Diagonal", "Rows", "Variance", "extras"]
+__all__ = ["GEOMETRY", "Blocks", "Diagonal", "Rows", "Together", "Variance", "extras"]
 
 GEOMETRY = 10  # means 3, rotations 3, log-scales 3, logit-opacity 1: the order of every row
 # entries of `extras`: d log strength / dlogit, dc/dmu (9), then the response's
@@ -303,6 +303,28 @@ class Blocks:
                     total = dr.fma(slopes[i] * slopes[j], squares, total)
                 at = index * self.WIDTH + (i * (i + 1) // 2 + j)
                 dr.scatter_add(self.buffer, total, at, hits, mode=self.mode)
+        return states
+
+
+class Together:
+    """Several sinks, each of which takes every row.
+
+    Args:
+        sinks: The sinks; what each keeps along a ray has a name of its own.
+    """
+
+    def __init__(self, sinks: Sequence[Sink]) -> None:
+        self.sinks = sinks
+        self.needs_color = any(sink.needs_color for sink in sinks)
+
+    def init(self, k: int) -> dict:
+        """What all of them keep."""
+        return {name: x for sink in self.sinks for name, x in sink.init(k).items()}
+
+    def take(self, lib: Lib, index: UInt32, hits: Mask, rows: list[Row], states: list[dict]) -> list[dict]:
+        """One after another."""
+        for sink in self.sinks:
+            states = sink.take(lib, index, hits, rows, states)
         return states
 
 

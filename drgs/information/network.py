@@ -26,6 +26,7 @@ Reference:
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -46,9 +47,12 @@ from drgs.guards.inputs import (
 from drgs.information.choices import NETWORK_ESTIMATES, NetworkEstimate
 from drgs.information.complement import Eliminated
 from drgs.information.elimination import eliminated_of
+from drgs.information.hit_sums import HitSums
+from drgs.information.jacobian import GEOMETRY
 from drgs.information.network_groups import NETWORK_GROUPS, network_groups
 from drgs.information.network_rows import NetworkRows
 from drgs.information.nuisances import Nuisances
+from drgs.information.once_per_time import once_per_time
 from drgs.information.pullback import Pullback
 from drgs.runtime import alone
 from drgs.settings import RenderSettings
@@ -61,9 +65,9 @@ if TYPE_CHECKING:
     from drgs.gain import Information
     from drgs.information.semantics import SemanticMetric
 
-__all__ = ["network", "network_variance_map"]
+__all__ = ["NetworkProbes", "network", "network_variance_map"]
 
-_FLOATS = 1 << 23  # of the tangents that one traversal carries, or of their images
+_FLOATS = 1 << 23  # of the tangents that one traversal carries, or of images and what is summed up along them
 _BATCH = 16  # tangents of one traversal
 
 
@@ -104,7 +108,7 @@ def network(
         ValueError: If the scene has no such parameters, a name is unknown or a number out of range.
     """
     where = "fisher.network"
-    moving, groups = _checked(where, scene, estimate, mode, probes)
+    moving, groups = _checked(where, once_per_time(scene), estimate, mode, probes)
     total = {name: torch.zeros(_size(own) if estimate == "diagonal" else (), dtype=torch.float64)
              for name, own in groups.items()}  # fmt: skip
     views = some_cameras(where, cameras)
@@ -170,23 +174,82 @@ def network_variance_map(
 Groups = Mapping[str, Mapping[str, torch.Tensor]]  # group -> name -> parameter
 
 
+class NetworkProbes:
+    """Estimate `diagonal` of `network` of one view, whose hits may be summed up by a traversal for something else.
+
+    Attributes:
+        sums: The sums of the hits along the random images. Whoever replays the view may add to them, if colors, and
+            features by `semantics`, are what it replays; otherwise it is done as they are needed.
+        semantics: The metric of the features; None: colors alone.
+    """
+
+    def __init__(self, rows: NetworkRows, sums: HitSums, groups: Groups, semantics: SemanticMetric | None) -> None:
+        self.sums = sums
+        self.semantics = semantics
+        self._rows = rows
+        self._groups = groups
+
+    @classmethod
+    @alone
+    def of(
+        cls,
+        scene: Scene,
+        camera: Camera,
+        settings: RenderSettings,
+        *,
+        probes: int,
+        channel_weights: Sequence[float],
+        semantics: SemanticMetric | None,
+        mask: torch.Tensor | None,
+        nuisances: Nuisances | None,
+    ) -> NetworkProbes | None:
+        """None where more than the geometry of Gaussians moves, images do not fit at a time, or nothing is seen.
+
+        Args:
+            scene, camera, settings, probes, channel_weights, semantics, mask, nuisances: The same as for `network`.
+        """
+        where = "fisher.network"
+        moving, groups = _checked(where, scene, "diagonal", "reverse", probes)
+        view = _View.of(where, moving, camera, settings, channel_weights, semantics, mask, nuisances)
+        rows = None if view is None else view.network_rows(groups)
+        if view is None or rows is None or probes > view.most_images:
+            return None
+        images = _signs(torch.Generator().manual_seed(0), probes, view.pixels, view.rows, dtype=torch.float32)
+        return cls(rows, rows.along(view.cotangents(images)), groups, semantics)
+
+    @alone
+    def information(self) -> Information:
+        """What `network` returns of the view."""
+        with own_errors():
+            found = _by_group(self._groups, self._rows.squares(self.sums))
+        return {name: x.double().div_(len(self.sums.images)) for name, x in found.items()}
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class _View:
     """The rows of a view's image, each divided by its noise, as a function of phi.
 
     Attributes:
-        call: The call of the view.
-        scene, semantics: What it shows, and the metric of the features that are rows.
-        scales: (C,) what the call's channels are multiplied by, colors, then semantic channels; with a mask
-            (pixels, C).
-        eliminated: What the view's own unknowns explain of the rows, which are freed of it; None: nothing.
+        scene: What it shows.
+        seen: Its Gaussians at the time of the view, without a graph: Dr.Jit differentiates through `deformed`, of which
+            these are only the values now.
+        deformed: The scene with the features that are rows, if any.
+        camera, settings: The view.
+        semantics: The metric of these features.
+        weights: (C,) what rows are multiplied by: colors, then semantic channels.
+        mask: (H, W) what all of them are multiplied by besides; None: 1.
+        nuisances: The view's own unknowns, which rows are freed of.
     """
 
-    call: Call
     scene: DeformableScene
+    seen: Gaussians
+    deformed: DeformableScene
+    camera: Camera
+    settings: RenderSettings
     semantics: SemanticMetric | None
-    scales: torch.Tensor
-    eliminated: Eliminated | None = None
+    weights: torch.Tensor
+    mask: torch.Tensor | None = None
+    nuisances: Nuisances | None = None
 
     @classmethod
     def of(
@@ -206,7 +269,7 @@ class _View:
         check_view(where, seen, camera, settings)
         if not len(seen) or not camera.width * camera.height:
             return None
-        scales = torch.tensor(three_weights(where, channel_weights), dtype=torch.float64).sqrt()
+        weights = torch.tensor(three_weights(where, channel_weights), dtype=torch.float64).sqrt()
         deformed: DeformableScene = scene
         if semantics is None:
             seen = seen.replace(features=None)
@@ -217,33 +280,72 @@ class _View:
             directions = semantics.directions(seen.features)
             deformed = reduced = _Reduced(scene, directions)
             seen = reduced.reduced(seen)
-            scales = torch.cat([scales, torch.full((directions.shape[1],), semantics.weight**0.5)])
+            weights = torch.cat([weights, torch.full((directions.shape[1],), semantics.weight**0.5)])
         settings = settings or RenderSettings.preset("exact")
-        if mask is not None:  # a number, whatever graph it is in
-            scales = mask.detach().double().cpu().reshape(-1, 1) * scales
-        # Detached: Dr.Jit differentiates through `deformed`, of which these are only the values now.
-        call = Call(seen.detach(), camera, settings, frozenset(), scene=deformed)
-        eliminated = eliminated_of(call, scales, nuisances) if nuisances is not None and nuisances.names else None
-        return cls(call, scene, semantics, scales, eliminated)
+        return cls(scene, seen.detach(), deformed, camera, settings, semantics, weights, mask, nuisances)
+
+    @functools.cached_property
+    def call(self) -> Call:
+        """The call of the view."""
+        return Call(self.seen, self.camera, self.settings, frozenset(), scene=self.deformed)
+
+    @functools.cached_property
+    def scales(self) -> torch.Tensor:
+        """(C,) what the call's channels are multiplied by; with a mask (pixels, C)."""
+        if self.mask is None:
+            return self.weights
+        return self.mask.detach().double().cpu().reshape(-1, 1) * self.weights  # a number, whatever graph it is in
+
+    @functools.cached_property
+    def eliminated(self) -> Eliminated | None:
+        """What the view's own unknowns explain of the rows, which are freed of it; None: nothing."""
+        if self.nuisances is None or not self.nuisances.names:
+            return None
+        return eliminated_of(self.call, self.scales, self.nuisances)
+
+    @property
+    def pixels(self) -> int:
+        """How many there are."""
+        return self.camera.width * self.camera.height
 
     @property
     def rows(self) -> int:
         """C, rows of a pixel."""
-        return self.scales.shape[-1]
+        return len(self.weights)
 
-    def pullback(self, groups: Groups) -> Callable[[torch.Tensor], Iterator[Information]]:
-        """J^T: of each of (K, pixels, C) rows, group -> (P,) slopes."""
+    @property
+    def most_images(self) -> int:
+        """How many images are pulled back at a time."""
+        return max(1, _FLOATS // max(self.pixels * self.rows, len(self.seen) * GEOMETRY))
+
+    def squares(self, groups: Groups) -> Callable[[torch.Tensor], Information]:
+        """Squares of J^T u, summed over (K, pixels, C) rows u: group -> (P,)."""
+        rows = self.network_rows(groups)
+        if rows is not None:
+            return lambda images: _by_group(groups, rows.squares(rows.along(self.cotangents(images))))
+        pull = Pullback(self.call, [name for own in groups.values() for name in own])
+
+        def each(images: torch.Tensor) -> Information:
+            total = {name: torch.zeros_like(x) for own in groups.values() for name, x in own.items()}
+            for image in self.cotangents(images, self.scales):
+                for name, slope in pull(image[:, :3], image[:, 3:] if image.shape[1] > 3 else None).items():
+                    total[name] += slope.square()
+            return _by_group(groups, total)
+
+        return each
+
+    def network_rows(self, groups: Groups) -> NetworkRows | None:
+        """J^T by the geometry that phi moves; None where it reaches the image otherwise, too."""
         names = [name for own in groups.values() for name in own]
-        assert self.call.camera is not None  # as of every view
-        told = NetworkRows.of(self.scene, self.call.camera, self.call.settings, self.semantics, names)
-        pull = told or _each(Pullback(self.call, names))
+        rows = NetworkRows(self.scene, self.camera, self.settings, self.semantics, names, self.mask)
+        return rows if rows.are_of_geometry else None
 
-        def pulled(rows: torch.Tensor) -> Iterator[Information]:
-            own = rows if self.eliminated is None else torch.stack([self.eliminated.root(x) for x in rows])
-            for slopes in pull((own * self.scales).float()):  # as cotangents of images are
-                yield {group: torch.cat([slopes[name].flatten() for name in own]) for group, own in groups.items()}
-
-        return pulled
+    def cotangents(self, images: torch.Tensor, scales: torch.Tensor | None = None) -> torch.Tensor:
+        """(K, pixels, C) rows as float32 cotangents of channels, which the scales multiply; None: the weights."""
+        if self.eliminated is not None:
+            images = self.eliminated.root(images.double())
+        factors = self.weights if scales is None else scales
+        return (images * factors.to(images.dtype)).float()
 
     def push(self, tangents: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """(K, pixels, C) float64 tangents of the rows, along (K, ...) tangents of phi by name."""
@@ -254,19 +356,9 @@ class _View:
 
     def batches(self, groups: Groups, count: int) -> Iterator[int]:
         """How many of `count` tangents are carried through each traversal."""
-        largest = max(self.call.pixels * self.rows, sum(_size(own) for own in groups.values()))
+        largest = max(self.pixels * self.rows, sum(_size(own) for own in groups.values()))
         step = max(1, min(_BATCH, _FLOATS // largest))
         return iter([min(step, count - start) for start in range(0, count, step)])
-
-
-def _each(pull: Pullback) -> Callable[[torch.Tensor], Iterator[dict[str, torch.Tensor]]]:
-    """J^T of a view by whatever the parameters change, an image at a time."""
-
-    def pulled(images: torch.Tensor) -> Iterator[dict[str, torch.Tensor]]:
-        for image in images:
-            yield pull(image[:, :3], image[:, 3:] if image.shape[1] > 3 else None)
-
-    return pulled
 
 
 class _Reduced:
@@ -299,13 +391,10 @@ class _Reduced:
 
 
 def _diagonal(view: _View, groups: Groups, probes: int, generator: torch.Generator) -> Iterator[Information]:
-    pull = view.pullback(groups)
-    for count in view.batches(groups, probes):
-        total: dict[str, torch.Tensor] = {}  # of a few, in their precision; what all add up to is float64
-        for slopes in pull(_signs(generator, count, view.call.pixels, view.rows)):
-            for name, x in slopes.items():
-                total[name] = total[name].addcmul_(x, x) if name in total else x.square()
-        yield total
+    squares = view.squares(groups)
+    for start in range(0, probes, view.most_images):
+        count = min(view.most_images, probes - start)
+        yield squares(_signs(generator, count, view.pixels, view.rows, dtype=torch.float32))
 
 
 def _trace_reverse(view: _View, groups: Groups, probes: int, generator: torch.Generator) -> Iterator[Information]:
@@ -320,13 +409,12 @@ def _trace_forward(view: _View, groups: Groups, probes: int, generator: torch.Ge
 
 
 def _paper(view: _View, groups: Groups, probes: int, generator: torch.Generator) -> Iterator[Information]:
-    pull = view.pullback(groups)
+    squares = view.squares(groups)
     for count in view.batches(groups, probes):
         tangents: dict[str, torch.Tensor] = {}
         for own in groups.values():
             tangents |= _unflat(own, _signs(generator, count, _size(own)))
-        for slopes in pull(view.push(tangents)):
-            yield {name: x.square().sum() for name, x in slopes.items()}
+        yield {name: x.sum() for name, x in squares(view.push(tangents)).items()}
 
 
 _ESTIMATORS = {
@@ -337,9 +425,14 @@ _ESTIMATORS = {
 }
 
 
-def _signs(generator: torch.Generator, *shape: int) -> torch.Tensor:
-    """-1 or 1, float64."""
-    return torch.randint(0, 2, shape, generator=generator).double() * 2 - 1
+def _signs(generator: torch.Generator, *shape: int, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+    """-1 or 1; the same of each type."""
+    return torch.randint(0, 2, shape, generator=generator, dtype=dtype).mul_(2).sub_(1)
+
+
+def _by_group(groups: Groups, found: Mapping[str, torch.Tensor]) -> Information:
+    """Group -> (P,) of what is known by parameter."""
+    return {group: torch.cat([found[name].flatten() for name in own]) for group, own in groups.items()}
 
 
 def _size(own: Mapping[str, torch.Tensor]) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import operator
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
@@ -15,6 +16,7 @@ from drgs.ellipsoids import Scene
 from drgs.gain import Information
 from drgs.information.cache import Cache, camera_key, value_key
 from drgs.information.choices import Combine
+from drgs.information.once_per_time import once_per_time
 from drgs.information.refining import Refine
 from drgs.information.scoring import Scoring
 
@@ -235,7 +237,12 @@ class Pool:
     def _computed(self, views: Sequence[ViewQuestion]) -> Iterator[Information]:
         if self.workers is not None:
             return self.workers.each(self.scene, [(view.question, view.camera, view.mask) for view in views])
-        return (view.question(self.scene, view.camera, view.mask) for view in views)
+        return (view.question(self._once_per_time, view.camera, view.mask) for view in views)
+
+    @functools.cached_property
+    def _once_per_time(self) -> Scene:
+        """The scene, for questions that are asked here: a pool lives no longer than the choice from it."""
+        return once_per_time(self.scene)
 
     def pick(self, index: int, score: float, parts: Mapping | None = None, margin: float | None = None) -> Pick:
         """A `Pick` with plain numbers.

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import drjit as dr
 import torch
 
 from drgs.information.groups import GROUPS, Information
-from drgs.information.jacobian import GEOMETRY, Blocks, Diagonal, Rows, Variance, extras
+from drgs.information.jacobian import GEOMETRY, Blocks, Diagonal, Rows, Together, Variance, extras
 from drgs.tracing.arrays import Float
 from drgs.tracing.bridge import to_drjit
 from drgs.tracing.call import Call
@@ -18,6 +18,7 @@ from drgs.tracing.harmonics import sh_basis
 from drgs.tracing.hit_table import Table, along_lists
 from drgs.tracing.pose import quaternion_product
 from drgs.tracing.primitives import Activated
+from drgs.tracing.protocols import Sink
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -25,10 +26,9 @@ if TYPE_CHECKING:
     from drgs.information.semantics import SemanticMetric
     from drgs.settings import RenderSettings
     from drgs.tracing.kernels import Channels
-    from drgs.tracing.protocols import Sink
     from drgs.tracing.walk import Part
 
-__all__ = ["Replay"]
+__all__ = ["Replay", "WalkSums"]
 
 _TABLED = 4  # channels whose tables are worth their memory
 _BESIDE = 16  # semantic channels of one traversal, beside the colors
@@ -55,6 +55,23 @@ class Walk(NamedTuple):
     part: Part
     finals: list[dict]
     table: Table | None
+
+
+class WalkSink(Sink, Protocol):
+    """The sink of one walk.
+
+    Attributes:
+        buffer: What it scatters into.
+    """
+
+    buffer: Float
+
+
+class WalkSums(Protocol):
+    """Sums over the hits of a view, to which each of its walks adds."""
+
+    def sink(self, replay: Replay, walk: Walk) -> WalkSink:
+        """What adds the hits of a walk of the view."""
 
 
 class Replay:
@@ -203,20 +220,35 @@ class Replay:
         """Hand the Jacobian's rows of a part to a sink: final states of its shared rays."""
         return walk.part.run(self._rows(walk.channels, walk.part, walk.finals, sink, walk.table))
 
+    def add_up(self, sums: WalkSums) -> None:
+        """Add the hits of all walks to sums of them."""
+        for walk in self.walks([1.0] * 3):
+            sink = sums.sink(self, walk)
+            dr.eval(self.run(walk, sink), sink.buffer)
+
     def _summed(
-        self, sink_of: Callable[[Walk, dr.ReduceMode], Diagonal | Blocks], width: int, weights: Sequence[float]
+        self,
+        sink_of: Callable[[Walk, dr.ReduceMode], Diagonal | Blocks],
+        width: int,
+        weights: Sequence[float],
+        beside: Sequence[WalkSums] = (),
     ) -> torch.Tensor:
-        """(N, width) float64: what `sink_of(walk, reduce mode)` sums up in its `buffer`, over all walks."""
+        """(N, width) float64: what `sink_of(walk, reduce mode)` sums up in its `buffer`, over all walks; their hits are
+        added to the sums `beside`, too.
+        """
         total = torch.zeros(self.count, width, dtype=torch.float64)
         for walk in self.walks(weights):
             sink = sink_of(walk, walk.part.reduction)
+            others = [sums.sink(self, walk) for sums in beside]
             # A buffer is float32, which one traversal fills; what several add up to is float64.
-            dr.eval(self.run(walk, sink), sink.buffer)
+            dr.eval(self.run(walk, Together([sink, *others])), sink.buffer, [other.buffer for other in others])
             found = _torch(sink.buffer).reshape(self.count, -1)
             total[:, : found.shape[1]] += found
         return total
 
-    def sums(self, entries: Sequence[int], weights: Sequence[float], summed: bool = False) -> torch.Tensor:
+    def sums(
+        self, entries: Sequence[int], weights: Sequence[float], summed: bool = False, beside: Sequence[WalkSums] = ()
+    ) -> torch.Tensor:
         """(N, 11) float64: squares of the geometry, and sum w^2; those of SH along each ray are kept in `light`."""
         bands = self.call.coefficients if self.along_ray and self.extras is not None and GEOMETRY in entries else 0
 
@@ -224,14 +256,16 @@ class Replay:
             own = entries if walk.first else [k for k in entries if k < GEOMETRY]
             return Diagonal(self.lib, self.count, walk.weights, own, mode, bands if walk.first else 0, summed)
 
-        total = self._summed(made, GEOMETRY + 1 + 3 * bands, weights)
+        total = self._summed(made, GEOMETRY + 1 + 3 * bands, weights, beside)
         self.light = total[:, GEOMETRY + 1 :].reshape(self.count, bands, 3)
         return total[:, : GEOMETRY + 1]
 
-    def diagonal(self, groups: dict, weights: Sequence[float], fisherrf: bool) -> Information:
-        """`fisher.diagonal` of one view."""
+    def diagonal(
+        self, groups: dict, weights: Sequence[float], fisherrf: bool, beside: Sequence[WalkSums] = ()
+    ) -> Information:
+        """`fisher.diagonal` of one view; its hits are added to the sums `beside`, too."""
         entries = sorted({k for group in groups.values() for k in group.entries})
-        sums = self.sums(entries, weights, fisherrf)
+        sums = self.sums(entries, weights, fisherrf, beside)
         result = {}
         scale = torch.tensor([1.0] * 3 if fisherrf else weights, dtype=torch.float64)
         for name, group in groups.items():
