@@ -39,12 +39,12 @@ from drgs.guards.inputs import camera_list
 from drgs.information.drift import DriftCache, Unanswered
 from drgs.information.pool import Pick, Pool, Selection
 from drgs.information.refining import Refine
-from drgs.policies.informed import ask
+from drgs.policies.informed import ask_views
 from drgs.select import Scoring, select
 from drgs.settings import RenderSettings
 from drgs.sizes import at_most
 
-__all__ = ["Cost", "Plan", "PlannedView", "Planner"]
+__all__ = ["Cost", "ViewPlan", "PlannedView", "Planner"]
 
 Cost = Sequence[float] | Callable[[Camera, Camera], float]
 """What it costs to go to each candidate, in the caller's unit; or a function: from where, to where."""
@@ -87,7 +87,7 @@ class PlannedView:
 
 
 @dataclasses.dataclass(frozen=True)
-class Plan:
+class ViewPlan:
     """An answer, and what it rests on.
 
     Attributes:
@@ -235,7 +235,9 @@ class Planner:
             done += 1
         return done
 
-    def scores(self, candidates: Sequence[Camera], cost: Cost | None = None, *, seconds: float | None = None) -> Plan:
+    def scores(
+        self, candidates: Sequence[Camera], cost: Cost | None = None, *, seconds: float | None = None
+    ) -> ViewPlan:
         """What the view of each place would tell; these places are what `next` picks from, until there are others.
 
         Args:
@@ -254,7 +256,7 @@ class Planner:
             self._costs(list(range(len(pool))), self._here)  # refuses what is no cost
             return self._plan(0, seconds)
 
-    def next(self, k: int = 1, *, seconds: float | None = None) -> Plan:
+    def next(self, k: int = 1, *, seconds: float | None = None) -> ViewPlan:
         """The k places to go to next, of those that `scores` was given.
 
         Each is the one of most value, score over `look` + cost, once the ones before it are known; costs that are a
@@ -343,7 +345,7 @@ class Planner:
 
     # -------------------------------------------------- answers
 
-    def _plan(self, k: int, seconds: float | None) -> Plan:
+    def _plan(self, k: int, seconds: float | None) -> ViewPlan:
         """Ask what there is time for, and answer by what is known then."""
         begun = time.monotonic()
         scene, known = self._asked()
@@ -382,9 +384,11 @@ class Planner:
 
     def _ask_one(self, scene: Gaussians, camera: Camera) -> None:
         """Ask one view, beside no others, which what it tells does not depend on."""
-        ask(Pool(scene=scene, candidates=[camera], train=[], k=1, scoring=self._scoring, rng=_RNG, cache=self._cache))
+        ask_views(
+            Pool(scene=scene, candidates=[camera], train=[], k=1, scoring=self._scoring, rng=_RNG, cache=self._cache)
+        )
 
-    def _answer(self, scene: Gaussians, known: list[Camera], k: int) -> Plan:
+    def _answer(self, scene: Gaussians, known: list[Camera], k: int) -> ViewPlan:
         """Scores and picks by what is kept."""
         # Without costs all picks come of one call; with costs each is of another value than its score.
         at_once = max(k, 1) if self._cost is None else 1
@@ -407,7 +411,7 @@ class Planner:
             picks.append(PlannedView(places[best], here, selection.scores[best], costs[best], values[best]))
             there = [*there, here]
             selection, places, there = self._selected(scene, [i for i in places if i != places[best]], there, 1)
-        return Plan(picks, scores, max(self._cache.given.values(), default=0.0), 0, left_out, 0.0)
+        return ViewPlan(picks, scores, max(self._cache.given.values(), default=0.0), 0, left_out, 0.0)
 
     def _selected(
         self, scene: Gaussians, places: list[int], known: list[Camera], k: int

@@ -49,7 +49,7 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"information"}, "what a view's pixels say about each parameter: groups, Jacobian, replay"),
     ({"fisher"}, "information of views, for users"),
     (
-        {f"information.{x}" for x in ("blocks", "cache", "pool", "greedy", "combine")},
+        {f"information.{x}" for x in ("blocks", "cache", "drift", "pool", "greedy", "combine")},
         "choosing views by it",
     ),
     ({"meshing"}, "a surface from depth, cut to what information determines"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 import json
+import math
 import os
 import re
 import subprocess
@@ -403,3 +404,19 @@ def test_a_fit_with_their_selector(tmp_path):
     chosen = json.loads((tmp_path / "run" / "selection.json").read_text())
     assert chosen["policy"] == "examples.nbv_gym_adapter:nearest_first"
     assert len(chosen["picks"]) == 2
+
+
+def test_a_flight(tmp_path):
+    """By plan, with costs, and along the trajectory: each photograph is taken once, and the model gets better."""
+    folder = tmp_path / "still"
+    folder.mkdir()
+    write_still(folder)
+    script = EXAMPLES / "plan_views.py"
+    common = (folder, "--photographs", 4, "--steps", 5)
+    planned = run(script, *common, "--seconds", 0.2).splitlines()
+    ordered = run(script, *common, "--policy", "order").splitlines()
+    for lines in (planned, ordered):
+        names = [re.search(r": ([^,]+),", line)[1] for line in lines]
+        assert len(set(names)) == len(names) >= 3
+        assert all(math.isfinite(float(re.search(r"([\d.]+) dB", line)[1])) for line in lines)
+    assert all("changed" in line for line in planned)

@@ -229,6 +229,7 @@ class DriftCache(Cache):
         return found
 
     def _changed(self, before: Shapes, view: Hashable) -> float:
+        """Change of a view since some Gaussians were what it sees."""
         now = self._shapes_now()
         if before is now:
             return 0.0

@@ -15,7 +15,7 @@ from drgs.information.combine import Asked, Combination, Questions, asked_of
 from drgs.information.greedy import AskedView, InformationSource, ViewInformation, greedy
 from drgs.information.pool import Pool, Selection
 
-__all__ = ["ask", "coverage", "fisher", "fisherrf"]
+__all__ = ["ask_views", "coverage", "fisher", "fisherrf"]
 
 _FEW_PROBES = 8  # of a network's information, below which 1 / H is far too large on average
 
@@ -85,7 +85,7 @@ def _source(pool: Pool, asked: Sequence[Asked]) -> InformationSource:
     return InformationSource(questions.lasting(), finish=questions.finished)
 
 
-def ask(pool: Pool) -> None:
+def ask_views(pool: Pool) -> None:
     """Ask the candidates what `fisher` goes by, for the pool's cache; nothing is scored."""
     asked, _ = asked_of(_blocks(pool))
     for _ in ViewInformation(pool, _source(pool, asked)).each(

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from drgs.studies.statistics import FEWEST, differences, estimate
+from drgs.studies.statistics import FEWEST_UNITS, differences, estimate
 
 __all__ = ["decided", "over_views"]
 
@@ -36,7 +36,7 @@ def decided(rows: Sequence[Mapping[str, Any]], reference: str, protocol: str) ->
     found = {}
     for label in dict.fromkeys(row["policy"] for row in mine if row["policy"] != reference):
         values = differences(mine, _BY, label, reference)
-        if len(values) < FEWEST:
+        if len(values) < FEWEST_UNITS:
             continue
         effect = estimate(values, share=_SHARE)
         if effect.low <= 0 <= effect.high:

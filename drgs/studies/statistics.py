@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 __all__ = [
-    "FEWEST",
+    "FEWEST_UNITS",
     "Effect",
     "Unit",
     "at_views",
@@ -39,7 +39,7 @@ __all__ = [
 Unit = tuple[str, tuple[int, int], tuple[str, ...]]
 """Scene, split, and what was given before the first pick."""
 
-FEWEST = 6
+FEWEST_UNITS = 6
 """Units from which on there is a verdict: five that all agree do so by chance in one of 16 studies (two-sided)."""
 
 _DRAWS = 10_000

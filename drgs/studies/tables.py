@@ -13,7 +13,7 @@ from drgs.files import atomic_write
 from drgs.studies.cells import Metric, Study
 from drgs.studies.protocols import PROTOCOLS
 from drgs.studies.statistics import (
-    FEWEST,
+    FEWEST_UNITS,
     Effect,
     Unit,
     at_views,
@@ -183,7 +183,7 @@ def explained(study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]]) -
     units = len({unit for values in intervals for unit in values})
     if not intervals:
         return "Differences within a unit; of a single one there is no interval, and no verdict."
-    judged = sum(len(values) >= FEWEST for values in intervals)
+    judged = sum(len(values) >= FEWEST_UNITS for values in intervals)
     held = coverage(scenes, units)
     told = (
         f"**Gain** and **loss**: the interval excludes 0. Were all policies equal, about {judged * (1 - held):.1f} of "
@@ -310,7 +310,7 @@ def _difference(metric: Metric, found: Effect) -> str:
 
 def _verdict(metric: Metric, found: Effect) -> str:
     """`gain`, `loss`, or nothing where the interval holds 0 or is of too few units."""
-    if found.units < FEWEST or found.low <= 0 <= found.high:
+    if found.units < FEWEST_UNITS or found.low <= 0 <= found.high:
         return ""
     return "gain" if (found.mean > 0) == metric.larger else "loss"
 
@@ -326,7 +326,7 @@ def _verdicts(study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]]) -
             one = found[metric.key]
             if one and (word := _verdict(metric, one)):
                 words[word].append(metric.title)
-        if not any(one and one.units >= FEWEST for one in found.values()):
+        if not any(one and one.units >= FEWEST_UNITS for one in found.values()):
             continue
         told = [f"{verbs[word]} {', '.join(names)}" for word, names in words.items() if names]
         lines.append(
