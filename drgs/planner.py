@@ -91,7 +91,8 @@ class ViewPlan:
     """An answer, and what it rests on.
 
     Attributes:
-        picks: In the order in which to go there; fewer than were asked for where the others are not known in time.
+        picks: Picked candidates in the order of going there; fewer than were asked for where the others are not known
+            in time.
         scores: Score of each candidate before the first pick; None of those that nothing was known of in time.
         changed: Largest change, in [0, 1], of what a view sees since it was asked what it tells; 0: all is as of now.
         computed: Views that were asked for this answer.
@@ -195,7 +196,7 @@ class Planner:
 
         Args:
             image: (H, W, 3) uint8, or floats in [0, 1]; None if the model is the caller's own.
-            camera: Where it was taken, of the image's size; unnamed ones are named by their number.
+            camera: The camera at the place where it was taken, of the image's size; unnamed ones are named by number.
             depth: (H, W) distance along the camera's axis, world units, 0 or NaN where unknown; None: there is none.
         Raises:
             ValueError: If shapes do not agree, values are out of range, or there is no image for the planner's model.
@@ -241,7 +242,7 @@ class Planner:
         """What the view of each place would tell; these places are what `next` picks from, until there are others.
 
         Args:
-            candidates: Where the camera could go.
+            candidates: Cameras at the places where it could go.
             cost: What it costs to go to each, >= 0; a function is called with the last place and the candidate.
             seconds: Wall time for the answer; None: all is asked that has changed.
         Returns:
@@ -278,7 +279,7 @@ class Planner:
         """A place moved to where its view tells more, within bounds; see `drgs.select.Refine`.
 
         Args:
-            camera: Where to begin, e.g. that of a pick.
+            camera: The place to begin with, e.g. that of a pick.
             refine: How far and how long; default 20 further views, in the box of all known views and candidates.
         Returns:
             `camera` is the place, at the size at which views are asked; `score` and `start` are what it and the first

@@ -47,7 +47,7 @@ class OnlineFit:
     def __init__(self, config: FitConfig) -> None:
         """
         Args:
-            config: For what stands still, without a selection.
+            config: Configuration of a fit to what stands still, without a selection.
         Raises:
             ValueError: If it is of another kind of fit.
         """

@@ -63,7 +63,7 @@ class Experiment:
 
     Attributes:
         title, told: What it shows.
-        study: Whose cells they are.
+        study: The study that its cells are of.
         policies: Label -> what the table calls it.
         reference: The label that the others are compared with.
         paper: Label -> the paper's numbers, as far as its text states them.

@@ -128,7 +128,7 @@ def estimate(values: Mapping[Unit, float], draws: int = _DRAWS, share: float = 0
     Args:
         values: Unit -> difference, at least one.
         draws: Draws of the bootstrap, the same ones every time.
-        share: Of the drawn means, within the interval.
+        share: Share of the drawn means that is within the interval.
     """
     scenes: dict[str, list[float]] = {}
     for unit, value in values.items():
