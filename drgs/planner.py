@@ -44,7 +44,7 @@ from drgs.select import Scoring, select
 from drgs.settings import RenderSettings
 from drgs.sizes import at_most
 
-__all__ = ["Cost", "ViewPlan", "PlannedView", "Planner"]
+__all__ = ["Cost", "PlannedView", "Planner", "ViewPlan", "default_config"]
 
 Cost = Sequence[float] | Callable[[Camera, Camera], float]
 """What it costs to go to each candidate, in the caller's unit; or a function: from where, to where."""
@@ -171,7 +171,8 @@ class Planner:
         """The model as it is now, which further steps leave alone; None before there is any.
 
         A caller that maps by itself sets it, after every change, to Gaussians that keep their order: new ones come
-        last. `observe` then notes where a photograph was taken, and `fit` has nothing to do.
+        last. Where there are fewer than before, all views are asked again. `observe` then notes where a photograph was
+        taken, and `fit` has nothing to do.
         """
         with self._fitting:
             if self._own is not None:

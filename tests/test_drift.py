@@ -132,11 +132,11 @@ def test_what_a_view_does_not_see_may_change():
 def test_new_gaussians_count_where_they_are_seen():
     """One in the image counts as the average one; one behind the camera does not. Answers get zeros for them."""
     g, (camera, *_) = scene(), cameras()
-    cache = DriftCache(bound=1.0)
-    cache.expect([camera])
-    cache.keep(g, key_of(camera), information(g))
     front, back = (camera.center + z * camera.c2w[:3, 2] for z in (3.0, -3.0))
     for place, want in ((front, 1 / 13), (back, 0.0)):
+        cache = DriftCache(bound=1.0)
+        cache.expect([camera])
+        cache.keep(g, key_of(camera), information(g))
         more = {name: torch.cat([x, x[:1]]) for name, x in g.parameters().items()}
         more["means"][12] = torch.from_numpy(place).float()
         grown = g.replace(**more)
@@ -145,6 +145,9 @@ def test_new_gaussians_count_where_they_are_seen():
         assert {name: tuple(x.shape) for name, x in found.items()} == {"means": (13, 3), "sh": (13, 4, 3)}
         assert not found["means"][12].any()
         assert torch.equal(found["means"][:12], information(g)["means"])
+    cache = DriftCache(bound=1.0)
+    cache.expect([camera])
+    cache.keep(g, key_of(camera), information(g))
     sharper = g.replace(sh=torch.cat([g.sh, torch.zeros(12, 5, 3)], 1))
     found = cache.find(sharper, key_of(camera))["sh"]
     assert tuple(found.shape) == (12, 9, 3)
@@ -168,3 +171,18 @@ def test_only_what_is_expected_is_kept():
     assert cache.seen(g, views[1]) is None
     cache.invalidate()
     assert (len(cache), cache.bytes, cache.change(g, views[2])) == (0, 0, math.inf)
+
+
+def test_a_shorter_list_is_another_scene():
+    """Nothing says which Gaussians have gone: everything is forgotten, and cameras are still expected."""
+    g, (camera, *_) = scene(), cameras()
+    cache = DriftCache(bound=1.0)
+    cache.expect([camera])
+    cache.keep(g, key_of(camera), information(g))
+    fewer = g.replace(**{name: x[:7] for name, x in g.parameters().items()})
+    assert cache.find(fewer, key_of(camera)) is None
+    assert cache.seen(fewer, camera) is None
+    cache.keep(fewer, key_of(camera), information(fewer))
+    assert cache.find(g, key_of(camera))["means"].shape == (12, 3)
+    flat = g.replace(sh=g.sh[:, :1])
+    assert cache.find(flat, key_of(camera)) is None

@@ -109,7 +109,8 @@ class Shapes:
 class DriftCache(Cache):
     """What views tell, kept while what they see has changed by at most a bound.
 
-    For Gaussians that keep their places in the list; new ones come at its end. An answer from before they came has
+    For Gaussians that keep their places in the list; new ones come at its end. Where the list gets shorter everything
+    is forgotten. An answer from before they came has
     zeros for them. Only views of cameras that are expected are kept.
 
     Attributes:
@@ -136,6 +137,13 @@ class DriftCache(Cache):
         # Since then, to the Gaussians as they are now: id of shapes -> (N,); key -> of its view.
         self._changes: dict[int, torch.Tensor] = {}
         self._views_changes: dict[Hashable, float] = {}
+
+    def invalidate(self) -> None:
+        """Forget everything, but not which cameras are expected."""
+        with self._lock:
+            super().invalidate()
+            for known in (self._shapes, self._seen, self._changes, self._views_changes):
+                known.clear()
 
     def expect(self, cameras: Iterable[Camera]) -> None:
         """Name the cameras that will be asked for; what is kept of all others is forgotten."""
@@ -204,10 +212,15 @@ class DriftCache(Cache):
 
     def _look_at(self, scene: Scene) -> None:
         """A scene that has changed is compared with what answers are of."""
-        if self._now is None or self._now[0] is not scene:
-            self._now = scene, Shapes.of(scene.at(None))
-            self._changes.clear()
-            self._views_changes.clear()
+        if self._now is not None and self._now[0] is scene:
+            return
+        shapes = Shapes.of(scene.at(None))
+        before = shapes if self._now is None else self._now[1]
+        if len(shapes) < len(before) or shapes.sh < before.sh:
+            self.invalidate()  # some have gone, and nothing says which
+        self._now = scene, shapes
+        self._changes.clear()
+        self._views_changes.clear()
 
     def _forget(self, key: Hashable) -> None:
         super()._forget(key)
