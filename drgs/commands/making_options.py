@@ -135,8 +135,7 @@ class Reproduce(Common, Clustered):
     """Compare policies on made scenes or on your data, as arXiv 2512.22771 does: fits by each, means, intervals."""
 
     what: Positional[ExperimentName]
-    """Policies on static scenes, or where things move (dynamic); lambda (prior), or what the score counts (blocks);
-    policies by color alone, to 20 views (captures)."""
+    """Policies on static scenes, where things move (dynamic), or on captures; lambda (prior); what counts (blocks)."""
     output: OutputPath
     """Folder for scenes, runs, rows.jsonl, tables and figures, of all of these; what is finished there is kept."""
     data: Annotated[tuple[Path, ...], arg(metavar="DATA"), UseAppendAction] = ()
