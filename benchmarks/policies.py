@@ -22,7 +22,7 @@ from drgs.fitting.config import FitConfig
 from drgs.studies.cells import Metric, Study
 from drgs.studies.curves import draw_curves
 from drgs.studies.rows import read_study
-from drgs.studies.statistics import at_views, differences, estimate, unit_of, values_of, view_counts
+from drgs.studies.statistics import FEWEST_UNITS, at_views, differences, estimate, unit_of, values_of, view_counts
 from drgs.studies.tables import fill_between, markdown_table
 
 Rows = Sequence[dict[str, Any]]
@@ -63,7 +63,6 @@ GROUPS = {
 }
 TABLED = ("all", "rooms", "still lifes", "captures")  # of the policies that pick by poses alone
 SHOWN = (4, 6, 8, 12)  # views, of the page's table
-FEWEST = 6  # units, below which nothing is said to be a gain
 
 CHOICE = ("head", "banana", "room-3", "room-4", "still-5", "still-6")
 TRIED = {
@@ -109,7 +108,7 @@ def table(rows: Rows) -> str:
             ]
             cells = []
             for one in found:
-                sure = group == "all" and one.units >= FEWEST and not one.low <= 0 <= one.high
+                sure = group == "all" and one.units >= FEWEST_UNITS and not one.low <= 0 <= one.high
                 mean = f"**{one.mean:+.2f}**" if sure else f"{one.mean:+.2f}"
                 cells.append(f"{mean} [{one.low:+.2f}, {one.high:+.2f}]")
             last = found[-1]

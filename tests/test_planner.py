@@ -248,7 +248,7 @@ def test_threads(world):
         (lambda: Planner(bound=1.5), r"Planner: bound must be in \[0, 1\], got 1.5; try 0.2"),
         (lambda: Planner(look=0), "Planner: look must be a finite number > 0, got 0; try 1"),
         (lambda: Planner(scene=3), "Planner: scene must be"),
-        (lambda: Planner(drgs.FitConfig(selection=drgs.SelectionConfig())), "planner: config must have no selection"),
+        (lambda: Planner(drgs.FitConfig(selection=drgs.SelectionConfig())), "Planner: config must have no selection"),
     ],
 )
 def test_what_no_planner_can_be(make, told):

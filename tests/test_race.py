@@ -90,6 +90,7 @@ def test_units_of_captures(still, tmp_path):  # noqa: F811
     assert plan.study.race
     assert plan.study.reference == "geometry+backdrop, v_opt"
     assert not study_of("static", "tiny", tmp_path).race
+    assert plan.notes == (), "nothing is said of features, of which there are none"
     fit = plan.study.config_of(plan.cells[0])
     assert (fit.features.semantics, fit.selection.measure) == ("ignore", (3,))
     with pytest.raises(ValueError, match="--policy must be one of: random; uniform"):

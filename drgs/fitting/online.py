@@ -52,7 +52,7 @@ class OnlineFit:
             ValueError: If it is of another kind of fit.
         """
         if config.selection is not None:
-            raise ValueError("planner: config must have no selection, got one; the planner chooses")
+            raise ValueError("Planner: config must have no selection, got one; leave it out, the planner chooses")
         self.config = config
         self.trainer: Trainer | None = None
         self._waiting: list[Frame] = []

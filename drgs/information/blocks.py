@@ -223,48 +223,39 @@ class NetworkQuestion(BlockQuestion):
             view.scene,
             view.camera,
             view.settings,
-            probes=self.probes,
-            channel_weights=self.channel_weights,
-            semantics=self.semantics,
             mask=view.mask,
             nuisances=self.nuisances,
+            **self._rows,
         )
 
     def information(self, view: SeenView) -> Information:
         """The network's information, by random probes."""
         from drgs import fisher
 
-        probes = view.beside.get(self)
-        found = (
-            probes.information()
-            if probes
-            else fisher.network(
+        if probes := view.beside.get(self):
+            found = probes.information()
+        else:
+            found = fisher.network(
                 view.scene,
                 view.camera,
                 view.settings,
                 estimate=self.estimate,
-                probes=self.probes,
-                channel_weights=self.channel_weights,
-                semantics=self.semantics,
                 masks=view.masks,
                 nuisances=self.nuisances,
+                **self._rows,
             )
-        )
         return {name: x for name, x in found.items() if self.groups is None or name in self.groups}
 
     def variance_map(self, view: SeenView, weights: Information) -> torch.Tensor:
         """`drgs.fisher.network_variance_map` of the same rows."""
         from drgs import fisher
 
-        return fisher.network_variance_map(
-            view.scene,
-            view.camera,
-            weights,
-            view.settings,
-            probes=self.probes,
-            channel_weights=self.channel_weights,
-            semantics=self.semantics,
-        )
+        return fisher.network_variance_map(view.scene, view.camera, weights, view.settings, **self._rows)
+
+    @property
+    def _rows(self) -> dict[str, Any]:
+        """Which rows of an image are asked, and along how many random images."""
+        return {"probes": self.probes, "channel_weights": self.channel_weights, "semantics": self.semantics}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -153,6 +153,8 @@ def _units_of(
 
 def _missing(study: Study, scene: str, dataset: data.Dataset) -> tuple[list[str], list[str]]:
     """What is said of a data set without a teacher or without labels, and the policies that it has nothing for."""
+    if study.fit.features.semantics == "ignore":
+        return [], []
     known = dataset.semantics
     if known is not None and known.maps:
         if known.labels:
