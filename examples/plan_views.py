@@ -57,6 +57,7 @@ def fly(dataset: drgs.Dataset, policy: str, photographs: int, seconds: float, st
     train, held_out = dataset.split()
     views = {view.name: view for view in train}
     left = [dataclasses.replace(view.camera.undistorted(), name=view.name) for view in train]
+    print(f"{len(train)} places; the first photograph takes some seconds, for kernels are compiled", flush=True)
     planner = drgs.Planner()
     here = left[0 if policy == "order" else draw.randrange(len(left))]
     curve = []

@@ -415,6 +415,7 @@ def test_a_flight(tmp_path):
     common = (folder, "--photographs", 4, "--steps", 5)
     planned = run(script, *common, "--seconds", 0.2).splitlines()
     ordered = run(script, *common, "--policy", "order").splitlines()
+    assert all(re.match(r"\d+ places; ", lines.pop(0)) for lines in (planned, ordered))
     for lines in (planned, ordered):
         names = [re.search(r": ([^,]+),", line)[1] for line in lines]
         assert len(set(names)) == len(names) >= 3
