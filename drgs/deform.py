@@ -32,7 +32,6 @@ __all__ = ["DeformationField", "Deltas", "DynamicGaussians", "FieldConfig"]
 _HEADS = {"means": 3, "quats": 4, "log_scales": 3}
 _BEYOND = 1e-6  # of the span: how far outside of it a time may lie, by rounding
 _FLATTEST = 1e-3  # of the longest side of the bounds: how short another may be
-_FLOATS = 1 << 22  # of the slopes by a layer of the MLP that are alive at a time
 PHI = "phi."
 
 
@@ -169,7 +168,7 @@ class DeformationField(torch.nn.Module):
     ) -> dict[str, torch.Tensor]:
         """Squares of J^T u, J the derivative of the deltas by the parameters, summed over K cotangents u.
 
-        All cotangents go through the MLP together, and of the planes only nodes that the means read are looked at.
+        The field is evaluated once, and of the planes only nodes that the means read are looked at.
 
         Args:
             means, time, origin: The same as for `forward`.
@@ -186,13 +185,11 @@ class DeformationField(torch.nn.Module):
         leaves = [*mlp.values(), *(x.requires_grad_() for x in found)]
         with torch.enable_grad():
             deltas = _deltas(mlp, product(found))
-        pull = torch.func.vmap(lambda *u: torch.autograd.grad(deltas, leaves, u, retain_graph=True))
         total = {name: torch.zeros_like(x, requires_grad=False) for name, x in weights.items()}
-        step = max(1, _FLOATS // max(1, len(means) * len(_HEADS) * self.config.width))
-        for some in zip(*(x.split(step) for x in slopes), strict=True):
-            by_leaf = pull(*some)
+        for some in zip(*slopes, strict=True):  # one after another: together, copies would cost more than they spare
+            by_leaf = torch.autograd.grad(deltas, leaves, some, retain_graph=True)
             for name, x in zip(mlp, by_leaf, strict=False):
-                total[name] += x.square().sum(0)
+                total[name] += x.square()
             for name, own, x in zip(planes, corners, by_leaf[len(mlp) :], strict=True):
                 own.add_squares(total[name], x)
         return total

@@ -10,7 +10,7 @@ import torch
 from scenes_random import camera, gaussians
 from test_network_information import TIME, swarm
 
-from drgs import deform, fisher
+from drgs import fisher
 from drgs.dynamics.lives import Lives
 from drgs.information import network, network_rows
 from drgs.information.network import _Reduced
@@ -107,16 +107,6 @@ def test_through_the_graph_of_any_scene():
     found = scene.squared_slopes(TIME, index, slopes)
     for name in names:
         torch.testing.assert_close(found[name], want[name], rtol=1e-5, atol=1e-6 * float(want[name].max()))
-
-
-def test_squares_in_parts(monkeypatch):
-    """Cotangents that do not fit at a time are pulled back some at a time."""
-    scene, _ = made()
-    slopes = {"means": torch.randn(7, 40, 3), "quats": torch.randn(7, 40, 4), "log_scales": torch.randn(7, 40, 3)}
-    want = scene.squared_slopes(TIME, torch.arange(40), slopes)
-    monkeypatch.setattr(deform, "_FLOATS", 3 * 40 * 3 * 3)
-    for name, x in scene.squared_slopes(TIME, torch.arange(40), slopes).items():
-        torch.testing.assert_close(x, want[name])
 
 
 def test_through_a_world_and_along_rays():

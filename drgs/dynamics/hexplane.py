@@ -9,9 +9,10 @@ Reference:
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 
@@ -105,7 +106,8 @@ def product(found: Sequence[torch.Tensor]) -> torch.Tensor:
     return torch.cat([functools.reduce(torch.mul, found[k : k + 6]) for k in range(0, len(found), 6)], 1)
 
 
-class Corners(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Corners:
     """What places read of a plane.
 
     Attributes:
@@ -120,17 +122,24 @@ class Corners(NamedTuple):
         """(N, C) of the plane."""
         return _bag(plane.flatten(0, 1), self.nodes, self.weights)
 
+    @functools.cached_property
+    def _readers(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Nodes that are read; places that read them, node by node, where each node's begin, and their weights."""
+        nodes, order = self.nodes.flatten().sort(stable=True)
+        used, counts = nodes.unique_consecutive(return_counts=True)
+        places = order // self.nodes.shape[1]
+        return used, places, counts.cumsum(0) - counts, self.weights.flatten()[order]
+
     def add_squares(self, total: torch.Tensor, slopes: torch.Tensor) -> None:
-        """Add squares of slopes by the plane to a total of its shape, summed over K cotangents.
+        """Add squares of slopes by the plane to a total of its shape.
 
         Args:
-            slopes: (K, N, C) by what was read.
+            slopes: (N, C) by what was read.
         """
-        # Places read few of the nodes: the others' slopes, of every cotangent, are 0.
-        used, which = self.nodes.unique(return_inverse=True)
-        each = slopes.permute(1, 0, 2)[:, None] * self.weights[..., None, None]
-        by_node = each.new_zeros(len(used), *each.shape[2:]).index_add_(0, which.flatten(), each.flatten(0, 1))
-        total.flatten(0, 1).index_add_(0, used, by_node.square_().sum(1))
+        # Places read few of the nodes: the others' slopes are 0.
+        used, places, starts, weights = self._readers
+        by_node = torch.nn.functional.embedding_bag(places, slopes, starts, mode="sum", per_sample_weights=weights)
+        total.flatten(0, 1).index_add_(0, used, by_node.square_())
 
 
 def corners_of(planes: Sequence[torch.Tensor], places: torch.Tensor, time: torch.Tensor) -> list[Corners]:
