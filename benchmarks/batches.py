@@ -2,12 +2,12 @@
 
     python benchmarks/batches.py [--page]
 
-Appends one row a split and way to benchmarks/batches.jsonl as it ends, leaves out what is there, then writes the table
-of docs/tutorials/phone.md. Of the capture `banana`, ten photographs (or fourteen) are captured, every eighth of them
-held out; the other ones join by `--add`, held out stay the same two; and fits to all of them begin anew, on the same
-poses, with as many Gaussians as those that joined. From the rows was chosen from how many on `--add` begins anew, which
-is switched off here. Photographs have 12,000 pixels. One seed; seconds are those that the process computed, of the
-first two ways with poses and pages.
+Appends one row a split and way to benchmarks/batches.jsonl as it ends, leaves out what is there, then writes
+docs/data/batches.csv, which docs/tutorials/phone.md links to. Of the capture `banana`, ten photographs (or fourteen)
+are captured, every eighth of them held out; the other ones join by `--add`, held out stay the same two; and fits to all
+of them begin anew, on the same poses, with as many Gaussians as those that joined. From the rows was chosen from how
+many on `--add` begins anew, which is switched off here. Photographs have 12,000 pixels. One seed; seconds are those
+that the process computed, of the first two ways with poses and pages.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
+from studies import write_csv  # noqa: E402
 from where import DATA, add_row, ran, read_rows  # noqa: E402
 
 from drgs.commands import capture  # noqa: E402
@@ -35,11 +36,10 @@ from drgs.data import load  # noqa: E402
 from drgs.data.checks import list_images  # noqa: E402
 from drgs.files import Run  # noqa: E402
 from drgs.fitting.config import FitConfig, recorded_config  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
 from drgs.train import fit  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "batches.jsonl"
-PAGE = ROOT / "docs" / "tutorials" / "phone.md"
+TABLE = ROOT / "docs" / "data" / "batches.csv"
 JOINING = {6: (1, 3, 6, 9, 11, 15), 2: (3, 11)}
 """Number of photographs that join -> which of the sixteen, in the order of their names."""
 ANEW = (200, 400, 600)
@@ -84,29 +84,27 @@ def measure(count: int, folder: Path) -> None:
         added("anew", folder / f"anew{steps}", began)
 
 
-def table(rows: list[dict]) -> str:
+def table(rows: list[dict]) -> list[list[str]]:
     """A row a split and way."""
     words = {"first": "{n}", "joined": "and {k} that join", "anew": "all {n} from the beginning"}
-    lines = ["| photographs | steps | Gaussians | held-out PSNR |", "|---" * 4 + "|"]
+    lines = [["photographs", "steps", "Gaussians", "held-out PSNR (dB)"]]
     for row in rows:
         what = words[row["way"]].format(n=row["photographs"], k=row["joining"])
         steps = f"and {row['steps']}" if row["way"] == "joined" else f"{row['steps']}"
-        lines.append(f"| {what} | {steps} | {row['gaussians']:,} | {row['psnr']:.2f} dB |")
-    return "\n".join(lines)
+        lines.append([what, steps, f"{row['gaussians']}", f"{row['psnr']:.2f}"])
+    return lines
 
 
 def main() -> None:
     """The program."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--page", action="store_true", help="measure nothing, write the table of what is there")
+    parser.add_argument("--page", action="store_true", help="measure nothing, write the data file of what is there")
     args = parser.parse_args()
     done = {row["joining"] for row in read_rows(ROWS) if row["way"] == "anew" and row["steps"] == ANEW[-1]}
     for count in () if args.page else [x for x in JOINING if x not in done]:
         with tempfile.TemporaryDirectory() as folder:
             measure(count, Path(folder))
-    text = table(read_rows(ROWS))
-    print(text)
-    fill_between(PAGE, "batches", text)
+    write_csv(TABLE, table(read_rows(ROWS)))
 
 
 if __name__ == "__main__":

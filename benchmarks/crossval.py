@@ -1,6 +1,6 @@
-"""What `drgs crossval` says of correct and broken rasterizers and of outside code; writes docs/crossval.md's tables.
+"""What `drgs crossval` says of correct and broken rasterizers and of outside code: rows, and docs/crossval.md of them.
 
-    python benchmarks/crossval.py [--only alarms|poses|broken|rays|eval3d|outside] [--seeds 50] [--runs runs]
+    python benchmarks/crossval.py [--only alarms|poses|broken|rays|eval3d|outside] [--seeds 50] [--runs runs] [--page]
 
 Correct ones, for false alarms (`alarms`): our presets against the oracle, and gsplat's own torch code (examples/) where
 it is installed. Each seed has its cotangents and its view of a real scene, and the crop of it that the command takes.
@@ -12,7 +12,11 @@ gsplat 1.6's own torch code (examples/gsplat_eval3d.py), through a pinhole, Open
 in crossval_rays.json and crossval_eval3d.json; those of gsplat's code are made where gsplat 1.6 can be imported.
 
 Outside code: gsplat's again, and Mitsuba's `volprim_rf_basic`. Scenes: random ones, and of real scenes (DRGS_DATA) the
-2,000 Gaussians that weigh most in a view of 64x48 pixels (250 at 48x40 for the broken ones, which are dense).
+2,000 Gaussians that weigh most in a view of 64x48 pixels (250 at 48x40 for the broken ones, which are dense). These
+rows are docs/data/crossval-outside.csv itself.
+
+The page's table, its picture and the other docs/data/crossval-*.csv are made of the rows; where rows were made is said
+on the page by hand.
 """
 
 from __future__ import annotations
@@ -23,6 +27,7 @@ import importlib.util
 import math
 import subprocess
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import studies
@@ -48,9 +53,15 @@ from drgs.lab.rasterizers import function, load_rasterizer  # noqa: E402
 from drgs.lab.raw import PARAMETERS, POSE_END, raw_of, with_pose  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.sizes import at_most  # noqa: E402
+from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
 from drgs.testing import random_scene  # noqa: E402
 
 BACKGROUND = (0.3, 0.6, 0.2)
+PAGE = ROOT / "docs" / "crossval.md"
+CSV = ROOT / "docs" / "data"
+PICTURE = ROOT / "docs" / "pictures" / "crossval.png"
+GROUPS = (*PARAMETERS, "viewmats", "colors")
+TOLERANCE = 5e-3  # of float32, which the correct rasterizers are given in
 OUTSIDE_GSPLAT = "examples.gsplat_torch:rasterization"
 OUTSIDE = {
     "gsplat 1.5.3, its torch code": (OUTSIDE_GSPLAT, "gsplat"),
@@ -118,37 +129,23 @@ def wolf(count: int, width: int, height: int) -> tuple | None:
     return heaviest(g, camera, count)
 
 
-def alarms(runs: Path, seeds: int, table_only: bool = False) -> list[str]:
-    """One line a rasterizer: verdicts of `seeds` seeds on each real scene."""
+def alarms(runs: Path, seeds: int) -> None:
+    """Verdicts of `seeds` seeds on each real scene."""
     rows = studies.read_rows(ROWS, {})
     scenes = real_scenes(runs)
-    counts = {scene: min(seeds, FEWER) if scene in CHOSEN_ON else seeds for scene in scenes}
     names = [n for n in CORRECT if n.startswith("drgs:") or importlib.util.find_spec("gsplat")]
-    for seed in range(0 if table_only else seeds):
+    for seed in range(seeds):
         for scene, (g, cameras) in scenes.items():
-            for name in names if seed < counts[scene] else ():
+            for name in names if seed < (FEWER if scene in CHOSEN_ON else seeds) else ():
                 key = f"{name} {scene} {seed}"
                 if key not in rows:
                     rows[key] = _alarm(name, g, cameras[seed % len(cameras)], seed)
                     studies.write_rows(ROWS, rows)
                     print(key, rows[key]["verdict"], f"{rows[key]['seconds']:.1f} s", flush=True)
-    lines = ["| rasterizer | " + " | ".join(scenes) + " |", "|---|" + "---|" * len(scenes)]
-    for name in names:
-        cells = []
-        for scene in scenes:
-            keys = [f"{name} {scene} {seed}" for seed in range(counts[scene])]
-            found = [rows[key] for key in keys if key in rows]
-            wrong = [row["verdict"] for row in found if row["verdict"] != "agreement"]
-            share = [row["near_ties"] / row["pixels"] for row in found if row["near_ties"]]
-            said = f"{len(wrong)} of {len(found)}" + (f" ({', '.join(sorted(set(wrong)))})" if wrong else "")
-            looked = f"; near ties in {len(share)}, up to {max(share):.0%} of the pixels" if share else ""
-            cells.append(f"{said}; {max(max(row['relative']) for row in found):.0e}{looked}")
-        lines.append(f"| `{name}` | " + " | ".join(cells) + " |")
-    return lines
 
 
-def poses(runs: Path) -> list[str]:
-    """One line a rasterizer: the pose's gradient and that of six channels, on each real scene."""
+def poses(runs: Path) -> None:
+    """The pose's gradient and that of six channels, on each real scene."""
     rows = studies.read_rows(POSES, {})
     scenes = real_scenes(runs)
     names = [n for n in CORRECT if n.startswith("drgs:") or importlib.util.find_spec("gsplat")]
@@ -160,16 +157,6 @@ def poses(runs: Path) -> list[str]:
                     rows[key] = _alarm(name, g, cameras[(7 * seed + 3) % len(cameras)], seed)
                     studies.write_rows(POSES, rows)
                     print(key, rows[key], flush=True)
-    lines = ["| rasterizer | " + " | ".join(scenes) + " |", "|---|" + "---|" * len(scenes)]
-    for name in names:
-        cells = []
-        for scene in scenes:
-            found = [rows[f"{name} {scene} {seed}"] for seed in range(POSE_SEEDS)]
-            wrong = sum(row["verdict"] != "agreement" for row in found)
-            largest = [max((row[k] for row in found if row[k] is not None), default=None) for k in ("pose", "colors")]
-            cells.append(f"{wrong} of {len(found)}; " + ", ".join("-" if x is None else f"{x:.0e}" for x in largest))
-        lines.append(f"| `{name}` | " + " | ".join(cells) + " |")
-    return lines
 
 
 def _alarm(name: str, g: Gaussians, camera: Camera, seed: int) -> dict:
@@ -202,31 +189,20 @@ def shrunk(scene: tuple, factor: float) -> tuple:
     return g, [dataclasses.replace(camera, w2c=w2c)]
 
 
-def broken(runs: Path) -> list[str]:
-    """One line a defect."""
+def broken(runs: Path) -> None:
+    """Every defect on every scene."""
     scenes = {f"random {seed}": random_scene(seed) for seed in range(3)}
     for name, (g, cameras) in real_scenes(runs).items():
         camera = cameras[0].resized(48, 40)
         scenes[name] = wolf(250, 48, 40) if name == "wolf" else heaviest(g, camera, 250)
     rows = studies.read_rows(BROKEN, {})
-    lines = [
-        "| rasterizer | what is wrong | " + " | ".join(scenes) + " | named |",
-        "|---|---|" + "---|" * len(scenes) + "---|",
-    ]
     for name in ("correct", *torch_rasterizer.DEFECTS):
-        what = "nothing" if name == "correct" else torch_rasterizer.DEFECTS[name].what
-        cells = []
-        named = {}
         for scene, (g, cameras) in scenes.items():
             key = f"{name} {scene}"
             if key not in rows:
                 rows[key] = _found(name, g, cameras)
                 studies.write_rows(BROKEN, rows)
                 print(key, rows[key], flush=True)
-            cells.append(rows[key]["verdict"] if rows[key]["right"] else f"**{rows[key]['verdict']}**")
-            named |= dict.fromkeys(rows[key]["named"])
-        lines.append(f"| `{name}` | {what} | " + " | ".join(cells) + f" | {', '.join(named)} |")
-    return lines
 
 
 def _found(name: str, g: Gaussians, cameras: list[Camera]) -> dict:
@@ -285,29 +261,16 @@ def right_rays() -> torch_rays.RayModel:
     return dataclasses.replace(torch_rays.CORRECT, alpha_max=s.alpha_max, density_min=density, between=False)
 
 
-def rays() -> list[str]:
-    """One line a rasterizer along rays that is broken on purpose."""
-    scenes = ray_scenes()
+def rays() -> None:
+    """Every rasterizer along rays that is broken on purpose, and the right one."""
     rows = studies.read_rows(RAYS, {})
-    lines = [
-        "| rasterizer | what is wrong | " + " | ".join(scenes) + " | named |",
-        "|---|---|" + "---|" * len(scenes) + "---|",
-    ]
     for name in ("right", *torch_rays.DEFECTS):
-        what = "nothing" if name == "right" else torch_rays.DEFECTS[name].what
-        cells = []
-        named = {}
-        for scene, (g, camera) in scenes.items():
+        for scene, (g, camera) in ray_scenes().items():
             key = f"{name} {scene}"
             if key not in rows:
                 rows[key] = _ray_row(name, g, camera)
                 studies.write_rows(RAYS, rows)
                 print(key, rows[key], flush=True)
-            row = rows[key]
-            cells.append(row["verdict"] if row["right"] else f"**{row['verdict']}**")
-            named |= dict.fromkeys(row["named"])
-        lines.append(f"| `{name}` | {what} | " + " | ".join(cells) + f" | {', '.join(named)} |")
-    return lines
 
 
 def _ray_row(name: str, g: Gaussians, camera: Camera) -> dict:
@@ -348,33 +311,17 @@ def _ray_row(name: str, g: Gaussians, camera: Camera) -> dict:
     return {"verdict": verdict, "right": is_right, "named": named, "seconds": seconds}
 
 
-def eval3d() -> list[str]:
-    """One line a scene: gsplat 1.6's own torch code along rays beside preset `3dgut` and the rasterizer in plain torch.
+def eval3d() -> None:
+    """gsplat 1.6's own torch code along rays beside preset `3dgut` and the rasterizer in plain torch.
 
     Rows that are kept need no gsplat.
     """
     rows = studies.read_rows(EVAL3D, {})
-    lines = [
-        "| scene | conventions that differ | RMS of the image | verdict | relative difference of gradients: means, "
-        "quats, log_scales, logit_opacities, sh, viewmats, colors | plain torch: image, largest of the gradients "
-        "| the same with a rolling shutter, the largest of four directions "
-        "| `drgs.render` with a rolling shutter: conventions that differ; verdict; RMS; largest of the gradients |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
     for scene, (g, camera) in ray_scenes().items():
         if scene not in rows:
             rows[scene] = _eval3d_row(g, camera)
             studies.write_rows(EVAL3D, rows)
             print(scene, rows[scene], flush=True)
-        row = rows[scene]
-        groups = ", ".join(f"{row['groups'][name]:.0e}" for name in (*PARAMETERS, "viewmats", "colors"))
-        pairs = [", ".join(f"{x:.0e}" for x in row[kind]) for kind in ("plain", "rolling")]
-        odd = "; ".join(row["conventions"]) or "-"
-        rolled = [", ".join(row["rolling_conventions"]) or "-", row["rolling_verdict"]]
-        rolled += [f"{row[name]:.0e}" for name in ("rolling_rms", "rolling_gradient")]
-        cells = [scene, odd, f"{row['rms']:.0e}", row["verdict"], groups, *pairs, "; ".join(rolled)]
-        lines.append(f"| {' | '.join(cells)} |")
-    return lines
 
 
 def _eval3d_row(g: Gaussians, camera: Camera) -> dict:
@@ -414,14 +361,10 @@ def _apart(a, b, g: Gaussians, camera: Camera) -> tuple[float, float]:
     return float((images[0] - images[1]).abs().max()), max(float((x - y).norm() / y.norm()) for x, y in pairs)
 
 
-def outside() -> list[str]:
-    """One line a rasterizer and scene."""
-    lines = [
-        "| rasterizer | scene | preset | conventions that differ | RMS of the image | pixels off by > 0.001 "
-        "| mean of alpha | verdict | relative difference of gradients: means, quats, log_scales, logit_opacities, sh, "
-        "viewmats, colors | seconds |",
-        "|---|---|---|---|---|---|---|---|---|---|",
-    ]
+def outside() -> None:
+    """Rasterizers of others: writes the rows of those that are installed."""
+    heads = ["rasterizer", "scene", "preset", "conventions", "rms", "pixels_off", "alpha_bias", "verdict"]
+    lines = [[*heads, *GROUPS, "gradient_bugs", "seconds"]]
     scenes = {f"random {seed}": random_scene(seed, aspect=1.0) for seed in range(3)}
     scenes["random 0, 10 times smaller"] = shrunk(scenes["random 0"], 0.1)
     real = wolf(2000, 64, 48)
@@ -436,34 +379,137 @@ def outside() -> list[str]:
             found = crossval(load_rasterizer(name), g, cameras, preset, {"background": BACKGROUND})
             seconds = time.perf_counter() - start
             view = found.report["image"]["views"][0]
-            odd = "; ".join(f"{c['name']}: {c['found']}" for c in found.report["conventions"]) or "-"
-            groups = []
-            for group in (*PARAMETERS, "viewmats", "colors"):
-                row = found.report["groups"].get(group)
-                if row is None:
-                    groups.append("-")
-                    continue
-                mark = {"gradient bug": "**", "agreement": ""}.get(row["verdict"], "")
-                groups.append(f"{mark}{row['relative']:.0e}{mark}")
-            lines.append(
-                f"| {label} | {place} | {preset} | {odd} | {view['rms']:.0e} | {view['share']:.1%} "
-                f"| {view['alpha']['bias']:+.0e} | {found.verdict} | "
-                f"{', '.join(groups)} | {seconds:.0f} |"
-            )
+            odd = "; ".join(f"{c['name']}: {c['found']}" for c in found.report["conventions"])
+            image = [f"{view['rms']:.0e}", f"{view['share']:.1%}", f"{view['alpha']['bias']:+.0e}"]
+            groups = found.report["groups"]
+            apart = [f"{groups[x]['relative']:.0e}" if x in groups else "" for x in GROUPS]
+            wrong = " ".join(x for x in GROUPS if x in groups and groups[x]["verdict"] == "gradient bug")
+            lines.append([label, place, preset, odd, *image, found.verdict, *apart, wrong, f"{seconds:.0f}"])
             print(lines[-1], flush=True)
-    return lines
+    studies.write_csv(CSV / "crossval-outside.csv", lines)
+
+
+# ------------------------------------------------------------------------------------------------------------ the page
+
+
+def judged(rows: dict) -> str:
+    """How many verdicts are as they should be, of all."""
+    return f"{sum(row['right'] for row in rows.values())} of {len(rows)}"
+
+
+def agreed(rows: dict) -> str:
+    """The same of correct rasterizers."""
+    return f"{sum(row['verdict'] == 'agreement' for row in rows.values())} of {len(rows)}"
+
+
+def table() -> str:
+    """What the page is about, one line a study."""
+    correct, posed, wrong, along = (studies.read_rows(path, {}) for path in (ROWS, POSES, BROKEN, RAYS))
+    largest = max(max(row["relative"]) for row in correct.values())
+    moved = [max(row[key] for row in posed.values()) for key in ("pose", "colors")]
+    wrongly = ", ".join(
+        f"`{name}` on {scene}" for name, _, scene in (k.partition(" ") for k in wrong if not wrong[k]["right"])
+    )
+    lines = [
+        [f"correct; gradients differ by {largest:.0e} at most", "five real ones", agreed(correct)],
+        [f"the same; poses {moved[0]:.0e}, six channels {moved[1]:.0e} at most", "five real ones", agreed(posed)],
+        [
+            f"{len(torch_rasterizer.DEFECTS)} broken copies of a correct one, and that; wrong is {wrongly}",
+            "three random and five real ones",
+            judged(wrong),
+        ],
+        [
+            f"{len(torch_rays.DEFECTS)} broken copies of one along rays, and that",
+            "two random ones through three lenses, and `wolf`",
+            judged(along),
+        ],
+    ]
+    return markdown_table(["rasterizers", "scenes", "right verdicts"], lines)
+
+
+def correct_lines() -> Iterator[list[str]]:
+    """Every verdict about a correct rasterizer."""
+    yield ["study", "rasterizer", "scene", "seed", "view", "verdict", *GROUPS, "near_ties", "pixels", "gaussians"]
+    for study, path in (("alarms", ROWS), ("poses", POSES)):
+        for key, row in studies.read_rows(path, {}).items():
+            apart = [*row["relative"], row.get("pose"), row.get("colors")]
+            numbers = ["" if x is None else f"{x:.0e}" for x in apart]
+            sizes = [str(row[name]) for name in ("near_ties", "pixels", "gaussians")]
+            yield [study, *key.split(" "), row["view"], row["verdict"], *numbers, *sizes]
+
+
+def broken_lines(path: Path, right: str, defects: dict) -> Iterator[list[str]]:
+    """Every broken rasterizer: what is wrong with it, and what is said of it on each scene."""
+    rows = studies.read_rows(path, {})
+    scenes = [key.removeprefix(f"{right} ") for key in rows if key.startswith(f"{right} ")]
+    yield ["rasterizer", "what is wrong", *scenes, "named", "verdicts that are wrong"]
+    for name in (right, *defects):
+        found = {scene: rows[f"{name} {scene}"] for scene in scenes}
+        named = dict.fromkeys(word for row in found.values() for word in row["named"])
+        wrong = [scene for scene, row in found.items() if not row["right"]]
+        what = "nothing" if name == right else defects[name].what
+        yield [name, what, *(row["verdict"] for row in found.values()), "; ".join(named), " ".join(wrong)]
+
+
+def eval3d_lines() -> Iterator[list[str]]:
+    """gsplat's torch code along rays, one line a scene."""
+    plain = ["torch_image", "torch_gradient", "torch_shutter_image", "torch_shutter_gradient"]
+    rolled = [f"shutter_{name}" for name in ("conventions", "verdict", "rms", "gradient")]
+    yield ["scene", "conventions", "rms", "verdict", *GROUPS, *plain, *rolled]
+    for scene, row in studies.read_rows(EVAL3D, {}).items():
+        apart = [f"{x:.0e}" for x in (*(row["groups"][name] for name in GROUPS), *row["plain"], *row["rolling"])]
+        last = ["; ".join(row["rolling_conventions"]), row["rolling_verdict"]]
+        last += [f"{row[name]:.0e}" for name in ("rolling_rms", "rolling_gradient")]
+        yield [scene, "; ".join(row["conventions"]), f"{row['rms']:.0e}", row["verdict"], *apart, *last]
+
+
+def draw() -> None:
+    """The picture: of every verdict about a correct rasterizer, the largest difference of its gradients."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    rows = studies.read_rows(ROWS, {})
+    scenes = (*SPLATS, *FITS)
+    figure, axis = plt.subplots(figsize=(9, 4), dpi=100)
+    for i, scene in enumerate(scenes):
+        points = []
+        for j, name in enumerate(CORRECT):
+            found = [row for key, row in rows.items() if key.rsplit(" ", 1)[0] == f"{name} {scene}"]
+            points += [(j + 0.15 * (i - 2) + 0.1 * (k / len(found) - 0.5), row) for k, row in enumerate(found)]
+        axis.plot([x for x, _ in points], [max(row["relative"]) for _, row in points], ".", ms=4, label=scene)
+    axis.axhline(TOLERANCE, color="black", lw=1)
+    axis.text(-0.4, TOLERANCE * 1.2, "tolerance of float32", fontsize=9)
+    axis.set(yscale="log", ylabel="largest relative difference\nof a group's gradient", ylim=(3e-8, 2e-2))
+    axis.set_xticks(range(len(CORRECT)), [name.replace(OUTSIDE_GSPLAT, "gsplat,\nits torch code") for name in CORRECT])
+    axis.legend(loc="upper left", bbox_to_anchor=(1, 1), frameon=False, markerscale=2)
+    figure.tight_layout()
+    figure.savefig(PICTURE)
+    plt.close(figure)
+
+
+def page() -> None:
+    """The table, the picture and the data files, of the rows that there are."""
+    studies.write_csv(CSV / "crossval-correct.csv", correct_lines())
+    studies.write_csv(CSV / "crossval-broken.csv", broken_lines(BROKEN, "correct", torch_rasterizer.DEFECTS))
+    studies.write_csv(CSV / "crossval-rays.csv", broken_lines(RAYS, "right", torch_rays.DEFECTS))
+    studies.write_csv(CSV / "crossval-eval3d.csv", eval3d_lines())
+    draw()
+    fill_between(PAGE, "verdicts", table())
 
 
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--only", choices=["alarms", "poses", "broken", "rays", "eval3d", "outside"])
     parser.add_argument("--seeds", type=int, default=50, help="of every correct rasterizer on every real scene")
-    parser.add_argument("--table", action="store_true", help="of false alarms: the table of the rows that are there")
     parser.add_argument("--runs", type=Path, default=ROOT / "runs", help="where fits are kept")
-    parser.add_argument("--print", action="store_true", help="do not touch docs/crossval.md")
+    parser.add_argument(
+        "--page", action="store_true", help="measure nothing, write the page of the rows that there are"
+    )
     args = parser.parse_args()
     makers = {
-        "alarms": lambda: alarms(args.runs, args.seeds, args.table),
+        "alarms": lambda: alarms(args.runs, args.seeds),
         "poses": lambda: poses(args.runs),
         "broken": lambda: broken(args.runs),
         "rays": rays,
@@ -471,15 +517,10 @@ def main():
         "outside": outside,
     }
     for part, make in makers.items():
-        if args.only in (None, part):
-            made = studies.stamp("crossval")
-            lines = make()
-            if not args.print:
-                page = Path(ROOT) / "docs" / "crossval.md"
-                begin, end = f"<!-- {part}: begin -->", f"<!-- {part}: end -->"
-                before, _, rest = page.read_text().partition(begin)
-                text = "\n".join(["", "", f"Made by {made}", "", *lines, "", ""])
-                page.write_text(before + begin + text + end + rest.partition(end)[2])
+        if not args.page and args.only in (None, part):
+            make()
+            print(f"{part}: {studies.stamp('crossval')}")
+    page()
 
 
 if __name__ == "__main__":

@@ -2,13 +2,13 @@
 
     python benchmarks/sfm.py [--scenes banana bonsai] [--seeds 1] [--page]
 
-Appends one row a scene, method and seed to benchmarks/sfm.jsonl as it ends, leaves out what is there, then writes the
-table of docs/datasets.md. `drgs` finds features as `drgs sfm` does (affine shapes, pooled scales), once, and matches
-all pairs, the next ones by name, or the nearest by appearance; `COLMAP` is pycolmap's extract_features,
-match_exhaustive and incremental_mapping with its own options, but for one thread and the same size of photographs: with
-the cameras that it makes by default, and with one that all photographs share, as drgs does. Camera centers are compared
-with those of the model beside the photographs. Seconds are those that the process computed, with one thread. The seed
-is that of pairs, verification and mapping; COLMAP runs once, with its own.
+Appends one row a scene, method and seed to benchmarks/sfm.jsonl as it ends, leaves out what is there, then writes
+docs/data/datasets-sfm.csv, which docs/datasets.md links to. `drgs` finds features as `drgs sfm` does (affine shapes,
+pooled scales), once, and matches all pairs, the next ones by name, or the nearest by appearance; `COLMAP` is pycolmap's
+extract_features, match_exhaustive and incremental_mapping with its own options, but for one thread and the same size of
+photographs: with the cameras that it makes by default, and with one that all photographs share, as drgs does. Camera
+centers are compared with those of the model beside the photographs. Seconds are those that the process computed, with
+one thread. The seed is that of pairs, verification and mapping; COLMAP runs once, with its own.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 import numpy as np  # noqa: E402
 import pycolmap  # noqa: E402
+from studies import write_csv  # noqa: E402
 from where import DATA, add_row, ran, read_rows  # noqa: E402
 
 from drgs.data.checks import list_images  # noqa: E402
 from drgs.data.mapping import map_photos  # noqa: E402
 from drgs.data.matching import extract, match, quiet  # noqa: E402
 from drgs.data.pairing import choose_pairs  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "sfm.jsonl"
-PAGE = ROOT / "docs" / "datasets.md"
+TABLE = ROOT / "docs" / "data" / "datasets-sfm.csv"
 SCENES = {"banana": (16, 752), "bonsai": (110, 320)}
 """Name of a capture -> how many of its photographs, evenly spaced, and the pixels of their longer side."""
 MATCHED = ("exhaustive", "retrieval", "sequential")
@@ -200,12 +200,11 @@ def measure(scene: str, seeds: int) -> None:
             print(f"\r{scene}: {read_rows(ROWS)[-1]}", flush=True)
 
 
-def table(found: list[dict]) -> str:
+def table(found: list[dict]) -> list[list[str]]:
     """A row a scene and method: means of seconds and pairs over the seeds, and the rest of each."""
     lines = [
-        "| photographs | method | pairs | features, matching, mapping (s) | with a pose | points | reprojection (px) "
-        "| centers off |",
-        "|---" * 8 + "|",
+        ["photographs", "method", "pairs", "features, matching, mapping (s)"]
+        + ["with a pose", "points", "reprojection (px)", "centers off"]
     ]
     for scene, method in [(scene, method) for scene in SCENES for method in (*MATCHED, *OWN)]:
         mine = sorted(
@@ -227,8 +226,8 @@ def table(found: list[dict]) -> str:
             " / ".join(f"{one['reprojection_error']:.2f}" for one in mine),
             " / ".join(f"{one['off']:.2%}" for one in mine),
         ]
-        lines.append(f"| {' | '.join(columns)} |")
-    return "\n".join(lines)
+        lines.append(columns)
+    return lines
 
 
 def main() -> None:
@@ -236,13 +235,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES), help="names of captures")
     parser.add_argument("--seeds", type=int, default=1, help="seeds of what drgs does")
-    parser.add_argument("--page", action="store_true", help="run nothing, write the table of the rows that there are")
+    parser.add_argument(
+        "--page", action="store_true", help="run nothing, write the data file of the rows that there are"
+    )
     args = parser.parse_args()
     for scene in [] if args.page else args.scenes:
         measure(scene, args.seeds)
-    text = table(read_rows(ROWS))
-    print(text)
-    fill_between(PAGE, "sfm", text)
+    write_csv(TABLE, table(read_rows(ROWS)))
 
 
 if __name__ == "__main__":
