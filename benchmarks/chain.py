@@ -1,9 +1,11 @@
 """How far the criteria are from the mutual information they stand for, on scenes where it can be computed.
 
-python benchmarks/chain.py [--scenes 24] [--print]
+    python benchmarks/chain.py [--scenes 24]     benchmarks/chain.json
+    python benchmarks/chain.py --page            measures nothing
 
 Random scenes of 12 Gaussians (SH degree 0, 156 parameters), Jacobians of the float64 oracle at 12x10 pixels; 1, 2 or 4
-training views and 8 candidates in random directions. Writes the table of docs/information.md.
+training views and 8 candidates in random directions. Both write docs/data/criteria.csv and the table of docs/
+information.md.
 """
 
 from __future__ import annotations
@@ -19,13 +21,16 @@ import dense_jacobian  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from scenes_random import camera, gaussians  # noqa: E402
-from studies import rank_correlation  # noqa: E402
+from studies import rank_correlation, read_rows, write_csv, write_rows  # noqa: E402
+from where import ran  # noqa: E402
 
 from drgs import reference  # noqa: E402
 from drgs.gain import dense  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
+from drgs.studies.tables import fill_between, markdown_table, paragraph  # noqa: E402
 
+RESULTS = ROOT / "benchmarks" / "chain.json"
+DATA = ROOT / "docs" / "data" / "criteria.csv"
 FORMS = ("trace_bound", "eig", "logdet", "block_logdet")
 GAUSSIANS = 12
 CANDIDATES = 8
@@ -45,13 +50,10 @@ def views(seed: int) -> tuple[list[torch.Tensor], torch.Tensor]:
     return [x.flatten(1) for x in rows], torch.arange(13 * GAUSSIANS) // 13
 
 
-def main():
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--scenes", type=int, default=24)
-    parser.add_argument("--print", action="store_true", help="do not touch docs/information.md")
-    args = parser.parse_args()
-    found = {}
-    for seed in range(args.scenes):
+def measure(scenes: int) -> list[dict]:
+    """A row for each scene, number of training views, lambda and form: ratios of the candidates, tau and regret."""
+    found = []
+    for seed in range(scenes):
         J, labels = views(seed)
         for count in TRAIN:
             for value in LAMBDAS:
@@ -61,22 +63,70 @@ def main():
                     scores = np.array([getattr(x, form) for x in chains])
                     regret = 1 - truth[scores.argmax()] / truth.max()
                     tau = rank_correlation(scores, truth, "kendall")
-                    found.setdefault((value, count, form), []).append((scores / truth, tau, regret))
-    lines = [
-        "| lambda | training views | form | form / mutual information: median (5 %, 95 %) | Kendall tau "
-        "| regret: mean, worst |",
-        "|---|---|---|---|---|---|",
-    ]
-    for (value, count, form), results in found.items():
-        ratios, tau, regret = (np.concatenate([x[0] for x in results]), *np.array([x[1:] for x in results]).T)
-        low, middle, high = np.quantile(ratios, (0.05, 0.5, 0.95))
+                    row = {"scene": seed, "training_views": count, "lambda": value, "form": form}
+                    ratios = [float(f"{ratio:.4g}") for ratio in scores / truth]
+                    found.append(row | {"ratios": ratios, "tau": round(float(tau), 4), "regret": round(regret, 5)})
+    return found
+
+
+def summary(rows: list[dict]) -> dict[str, float]:
+    """Of rows of one form: quantiles of the ratios of all candidates, means of tau and regret, the worst regret."""
+    low, middle, high = np.quantile(np.concatenate([row["ratios"] for row in rows]), (0.05, 0.5, 0.95))
+    regrets = [row["regret"] for row in rows]
+    return {
+        "ratio_5": low,
+        "ratio_median": middle,
+        "ratio_95": high,
+        "tau": np.mean([row["tau"] for row in rows]),
+        "regret": np.mean(regrets),
+        "worst_regret": max(regrets),
+    }
+
+
+def groups(rows: list[dict]) -> dict[tuple, dict[str, float]]:
+    """(training views, lambda, form) -> what the scenes say."""
+    keys = dict.fromkeys((row["training_views"], row["lambda"], row["form"]) for row in rows)
+    return {
+        key: summary([row for row in rows if (row["training_views"], row["lambda"], row["form"]) == key])
+        for key in keys
+    }
+
+
+def text(result: dict) -> str:
+    """What the page says: ranges over lambda and the numbers of training views."""
+    found = groups(result["rows"])
+    lines = []
+    for form in FORMS:
+        own = [x for (_, _, name), x in found.items() if name == form]
+        ratios = [x["ratio_median"] for x in own]
+        taus = [x["tau"] for x in own]
+        means = [100 * x["regret"] for x in own]
         lines.append(
-            f"| {value:g} | {count} | `{form}` | {middle:.3g} ({low:.3g}, {high:.3g}) | {tau.mean():.2f} "
-            f"| {100 * regret.mean():.1f} %, {100 * regret.max():.0f} % |"
+            [
+                f"`{form}`",
+                f"{min(ratios):.2g} to {max(ratios):.2g}",
+                f"{min(taus):.2f} to {max(taus):.2f}",
+                f"{min(means):.1f} to {max(means):.1f} %",
+                f"{100 * max(x['worst_regret'] for x in own):.0f} %",
+            ]
         )
-    print("\n".join(lines))
-    if not args.print:
-        fill_between(ROOT / "docs" / "information.md", "chain", "\n".join(lines))
+    heads = ["form", "median ratio", "Kendall tau", "mean regret", "worst"]
+    made = f"`python benchmarks/chain.py`, {result['machine']}, {result['date']}, commit {result['commit']}."
+    return f"{paragraph(made)}\n\n{markdown_table(heads, lines)}"
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", type=int, default=24)
+    parser.add_argument("--page", action="store_true", help="measure nothing, write what there is")
+    args = parser.parse_args()
+    if not args.page:
+        write_rows(RESULTS, {**ran(), "rows": measure(args.scenes)})
+    result = read_rows(RESULTS, None)
+    found = groups(result["rows"])
+    heads = ["training_views", "lambda", "form", *next(iter(found.values()))]
+    write_csv(DATA, [heads, *([*map(str, key), *(f"{x:.3g}" for x in row.values())] for key, row in found.items())])
+    fill_between(ROOT / "docs" / "information.md", "chain", text(result))
 
 
 if __name__ == "__main__":

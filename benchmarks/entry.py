@@ -1,6 +1,7 @@
 """Preset `mitsuba`: how right its order of entries is, and what it costs to sort by them.
 
     python benchmarks/entry.py [--quick] [--print]     a table of docs/numerics.md, benchmarks/entry.json
+    python benchmarks/entry.py --page                  the table of what benchmarks/entry.json has
 
 Errors are against the float64 oracle, in a window of `wolf` (../shared/data, or DRGS_DATA) and inside of three huge
 Gaussians; times are CPU time of the process beside the same settings in the order of centers, which sorts nothing along
@@ -27,10 +28,12 @@ from where import ran  # noqa: E402
 import drgs  # noqa: E402
 from drgs.cameras import Camera, orbit  # noqa: E402
 from drgs.ellipsoids import Gaussians  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
+from drgs.studies.tables import fill_between, markdown_table, paragraph  # noqa: E402
 
 MITSUBA = drgs.RenderSettings.preset("mitsuba")
 OFF = 1e-3
+PAGE = ROOT / "docs" / "numerics.md"
+RESULTS = ROOT / "benchmarks" / "entry.json"
 
 
 def huge() -> Gaussians:
@@ -73,28 +76,30 @@ def costs(g: Gaussians, camera: Camera, turns: int) -> dict[str, float]:
 
 def report(r: dict) -> str:
     """What docs/numerics.md says."""
-    lines = [
-        f"Made by `python benchmarks/entry.py`, {r['machine']}, {r['date']}, commit {r['commit']}. Pixels that are off "
-        f"by more than {OFF:g}, and what the order of entries costs over the order of centers of the same hits.",
-        "",
-        "| scene | pixels | ambiguous | off | off, of the others | largest error of those | image | with gradients |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    told = (
+        f"`python benchmarks/entry.py`, {r['machine']}, {r['date']}, commit {r['commit']}; windows of "
+        f"{max(row['pixels'] for row in r['rows'].values()):,} pixels. Off: by more than {OFF:g}. Cost: over the order "
+        "of centers, of an image / with gradients."
+    )
+    lines = []
     for name, row in r["rows"].items():
         cost = row.get("cost")
-        times = f"{cost['image']:.2f}x | {cost['gradients']:.2f}x" if cost else "|"
-        lines.append(
-            f"| {name} | {row['pixels']:,} | {row['ambiguous']:.0%} | {row['off']:.2%} | {row['clear_off']:.2%} | "
-            f"{row['clear_max']:.0e} | {times} |"
-        )
-    return "\n".join(lines)
+        times = f"{cost['image']:.2f}x / {cost['gradients']:.2f}x" if cost else "-"
+        off = f"{row['off']:.2%} ({row['clear_off']:.2%})"
+        lines.append([name, f"{row['ambiguous']:.0%}", off, f"{row['clear_max']:.0e}", times])
+    heads = ["scene", "ambiguous", "off (of the others)", "largest error of the others", "cost"]
+    return f"{paragraph(told)}\n\n{markdown_table(heads, lines)}"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--quick", action="store_true", help="without wolf: checks that the script runs")
     parser.add_argument("--print", action="store_true", help="do not touch docs/numerics.md")
+    parser.add_argument("--page", action="store_true", help="measure nothing, write what there is")
     args = parser.parse_args()
+    if args.page:
+        fill_between(PAGE, "entry", report(json.loads(RESULTS.read_text())))
+        return
     inside = orbit((0, 0, 0), 3.0, 1, width=40, height=40)[0]
     result: dict = {
         **ran(),
@@ -113,9 +118,9 @@ def main() -> None:
     text = report(result)
     print(text)
     if not args.quick:
-        (ROOT / "benchmarks" / "entry.json").write_text(json.dumps(result, indent=1) + "\n")
+        RESULTS.write_text(json.dumps(result, indent=1) + "\n")
     if not (args.print or args.quick):
-        fill_between(ROOT / "docs" / "numerics.md", "entry", text)
+        fill_between(PAGE, "entry", text)
 
 
 if __name__ == "__main__":

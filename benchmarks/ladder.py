@@ -4,8 +4,9 @@
 
 `wolf` is a published capture of an object, seen from an orbit whose distance shrinks as the field of view grows, so
 that the object fills every picture; `office` is a fit (made where there is none), seen by its photographs' cameras with
-another focal length. Results go to docs/ladder.md (tables), docs/pictures/ladder.png and benchmarks/ladder.json; what
-is in the JSON is not measured again. The wolf is also drawn with more pixels, without crops.
+another focal length. Results go to docs/ladder.md (a table), docs/data/ladder.csv (every step), docs/pictures/
+ladder.png and benchmarks/ladder.json; what is in the JSON is not measured again. The wolf is also drawn with more
+pixels, without crops.
 """
 
 from __future__ import annotations
@@ -30,11 +31,11 @@ from drgs.commands.viewpoints import evenly
 from drgs.data import load
 from drgs.files import Run, atomic_write
 from drgs.fitting.records import fit_record
-from drgs.lab.ladder import Pictures, ladder, table
+from drgs.lab.ladder import Pictures, ladder
 from drgs.lab.raw import PARAMETERS
 from drgs.settings import RenderSettings
 from drgs.sizes import at_most
-from drgs.studies.tables import fill_between
+from drgs.studies.tables import fill_between, markdown_table, paragraph
 
 FOVS = (20, 45, 70, 95, 120)
 STARTS = ("inria", "gsplat")
@@ -42,8 +43,17 @@ PIXELS = 19_200  # 160 x 120
 VIEWS = 3
 CROP = {"wolf": 16, "office": 24}
 SHOWN = "inria"  # in the figure
-FULL = 70  # degrees: the field of view whose whole tables are on the page, and at which wolf gets more pixels
+FULL = 70  # degrees: the field of view at which wolf gets more pixels
 WIDTHS = (160, 320, 640, 1280)
+TABLED = (20, 70, 120)  # degrees, of the table on the page
+ROWS = {
+    "dilation": ("dilation",),
+    "EWA linearization": ("EWA",),
+    "one depth a Gaussian (key and order)": ("depth key", "order"),
+    "near plane": ("near plane",),
+    "cut-offs, early stop, culling": ("alpha cut-offs", "early stop", "culling"),
+}
+"""Steps of the table, some of them taken together: shares add up."""
 COLORS = {
     "near plane": "#7f7f7f",
     "culling": "#bcbd22",
@@ -202,92 +212,75 @@ def bars(axis, fovs: list, reports: list, read) -> None:
     axis.yaxis.set_major_formatter(lambda x, _: f"{100 * x:.0f} %")
 
 
-def percent(x: float | None) -> str:
+def percent(x: float) -> str:
     """Whole percents, one digit below 10."""
-    if x is None:
-        return "-"
     x = 0.0 if abs(x) < 5e-4 else x
-    return f"{100 * x:.{0 if abs(x) >= 0.0995 or not x else 1}f} %"
+    return f"{100 * x:.{0 if abs(x) >= 0.0995 or not x else 1}f}"
 
 
 def page(result: dict, made: str) -> str:
-    """The generated part of docs/ladder.md."""
-    out = [made, "", "![size and shares of every step](pictures/ladder.png)"]
-    parts = [(scene, result[scene], "°") for scene in result["order"]]
-    for name, found, unit in [*parts, (f"wolf at {FULL}°, by the image's width", result["widths"], " px")]:
-        places = sorted(found, key=int)
-        if not places:
-            continue
-        reports, others = ([found[place][start] for place in places] for start in STARTS)
-        heads = [f"{place}{unit}" for place in places]
-        sizes = [found[place]["sigma"] for place in places]
-        out += [
-            "",
-            f"### {name}, from `{SHOWN}`",
-            "",
-            *summary(heads, reports, sizes),
-            "",
-            *apart(heads, reports, others),
-        ]
-    out += ["", f"### Whole reports at {FULL} degrees, from `{SHOWN}`", "", "Pairs: stated order / reverse."]
-    for scene in result["order"]:
-        if str(FULL) in result[scene]:
-            out += ["", f"#### {scene}", "", table(result[scene][str(FULL)][SHOWN])]
-    return "\n".join(out)
+    """The generated part of docs/ladder.md: the largest steps of some reports."""
+    shown = [(scene, str(fov), "°", result[scene]) for scene in result["order"] for fov in TABLED]
+    shown += [(f"wolf {FULL}°,", str(width), " px", result["widths"]) for width in WIDTHS[-1:]]
+    shown = [one for one in shown if one[1] in one[3]]
+    reports = [found[place][SHOWN] for _, place, _, found in shown]
+    heads = ["share of the image difference, %", *(f"{name} {place}{unit}" for name, place, unit, _ in shown)]
+    lines = [[name, *(shares(report, steps) for report in reports)] for name, steps in ROWS.items()]
+    totals = [report["image"]["total"] for report in reports]
+    lines.append(["**RMS of the difference**", *(f"{total['rms']:.1e}" for total in totals)])
+    for group in ("means", "log_scales"):
+        cells = [percent(total["gradient"][group]["of_exact"]) for total in totals]
+        lines.append([f"gradient of `{group}`: difference / `exact`, %", *cells])
+    sizes = [f"{found[place]['sigma']:.2f}" for _, place, _, found in shown]
+    lines.append(["median Gaussian's largest sigma, px", *sizes])
+    for name, step in (("response: peak to integral", "response"), ("sorted to true volume", "volume")):
+        cells = [f"{rms(x['far'], 'forward', step):.1e}" if "far" in x else "-" for x in reports]
+        lines.append([f"{name}, RMS (crops)", *cells])
+    return f"{paragraph(f'{made} {apart(result)}')}\n\n{markdown_table(heads, lines)}"
 
 
-def summary(heads: list[str], reports: list[dict], sizes: list[float]) -> list[str]:
-    """A column a report: image shares in both orders, then sizes."""
-    out = ["| share of the image difference | " + " | ".join(heads) + " |", "|---" * (1 + len(heads)) + "|"]
-
-    def line(name, cells):
-        out.append(f"| {name} | " + " | ".join(cells) + " |")
-
-    for name in COLORS:
-        cells = []
-        for report in reports:
-            rows = [{r["rung"]: r for r in report["image"][order]}.get(name) for order in ("forward", "reverse")]
-            cells.append(" / ".join(dict.fromkeys(percent(r["share"] if r else 0.0) for r in rows)))
-        line(LABELS.get(name, name), cells)
-    line("**RMS of the difference**", [f"{r['image']['total']['rms']:.1e}" for r in reports])
-    line("largest difference", [f"{r['image']['total']['max']:.2f}" for r in reports])
-    for group in PARAMETERS:
-        line(
-            f"gradient of {group}: difference / gradient of `exact`",
-            [percent(r["image"]["total"]["gradient"][group]["of_exact"]) for r in reports],
-        )
-    # What is not on the way to `exact`.
-    detached = [{r["rung"]: r for r in x["asides"]}.get("view direction detached") for x in reports]
-    if all(detached):
-        line(
-            "view direction detached: change of the means' gradient",
-            [percent(r["gradient"]["means"]["of_exact"]) for r in detached],
-        )
-    line("median Gaussian's largest sigma, pixels", [f"{x:.2f}" for x in sizes])
-    if all("far" in x for x in reports):
-        line("float32, RMS (crops)", [f"{rms(x['crops'], 'forward', 'float32'):.0e}" for x in reports])
-        line("response peak to integral, RMS (crops)", [f"{rms(x['far'], 'forward', 'response'):.1e}" for x in reports])
-        line("sorted to true volume, RMS (crops)", [f"{rms(x['far'], 'forward', 'volume'):.1e}" for x in reports])
-        line("start to `exact`, RMS (the same crops)", [f"{x['crops']['total']['rms']:.1e}" for x in reports])
-    return out
-
-
-def apart(heads: list[str], reports: list[dict], others: list[dict]) -> list[str]:
-    """How far the other rasterizer's image shares are from these."""
-    worst = []
-    for head, a, b in zip(heads, reports, others, strict=True):
-        for order in ("forward", "reverse"):
-            rows = [{r["rung"]: r["share"] for r in x["image"][order]} for x in (a, b)]
-            names = rows[0].keys() | rows[1].keys()
-            worst += [(abs(rows[0].get(n, 0.0) - rows[1].get(n, 0.0)), n, head) for n in names]
-    worst.sort(reverse=True)
-    most, name, head = worst[0]
-    sizes = [[x["image"]["total"]["rms"] for x in y] for y in (reports, others)]
-    off = max(abs(b / a - 1) for a, b in zip(*sizes, strict=True))
-    return [
-        f"From `{STARTS[1]}`: every share within {100 * most:.1f} points of these (furthest: {name}, {head}), the RMS "
-        f"within {100 * off:.1f} %; its reports are in benchmarks/ladder.json."
+def shares(report: dict, steps: tuple[str, ...]) -> str:
+    """The share of some steps together, in the stated order / in the reverse."""
+    found = [
+        sum(row["share"] for row in report["image"][order] if row["rung"] in steps) for order in ("forward", "reverse")
     ]
+    return "/".join(dict.fromkeys(map(percent, found)))
+
+
+def apart(result: dict) -> str:
+    """How far the other rasterizer's image shares and sizes are from those that are shown."""
+    worst = off = 0.0
+    places = [x for part in (*(result[scene] for scene in result["order"]), result["widths"]) for x in part.values()]
+    for a, b in ([x[start]["image"] for start in STARTS] for x in places):
+        off = max(off, abs(b["total"]["rms"] / a["total"]["rms"] - 1))
+        for order in ("forward", "reverse"):
+            rows = [{r["rung"]: r["share"] for r in x[order]} for x in (a, b)]
+            worst = max(worst, *(abs(rows[0].get(n, 0.0) - rows[1].get(n, 0.0)) for n in {**rows[0], **rows[1]}))
+    return f"From `{STARTS[1]}` every share is within {100 * worst:.1f} points, the RMS within {100 * off:.1f} %."
+
+
+def data(result: dict) -> list[list[str]]:
+    """The data file: every step of every report, its share, and its norm over that of `exact`; groups are gradients."""
+    out = [["scene", "width", "fov", "start", "part", "order", "step", "rms", "max", "share", "of_exact"]]
+    out[0] += [f"{group}_{what}" for group in PARAMETERS for what in ("share", "of_exact")]
+    places = [(scene, 160, int(fov), x) for scene in result["order"] for fov, x in result[scene].items()]
+    places += [("wolf, one view", int(width), FULL, x) for width, x in result["widths"].items()]
+    for scene, width, fov, found in sorted(places, key=lambda place: place[:3]):
+        for start in STARTS:
+            report = found[start]
+            steps = [("asides", "", row) for row in report["asides"]]
+            for part in ("image", "crops", "far"):
+                for order in ("forward", "reverse") if part in report else ():
+                    steps += [(part, order, row) for row in report[part].get(order, [])]
+                if part in report:
+                    steps.append((part, "", {"rung": "total", **report[part]["total"]}))
+            for part, order, row in steps:
+                numbers = [row["rms"], row["max"], row.get("share"), row.get("of_exact")]
+                for group in PARAMETERS:
+                    numbers += [row["gradient"][group].get(key) for key in ("share", "of_exact")]
+                cells = ["" if x is None else f"{x:.3g}" for x in numbers]
+                out.append([scene, str(width), str(fov), start, part, order, row["rung"], *cells])
+    return out
 
 
 def rms(part: dict, order: str, name: str) -> float:
@@ -321,6 +314,7 @@ def main():
         write(store, result)
         print(f"{name}, {fov} degrees, {width} pixels: {time.perf_counter() - begin:.0f} s", flush=True)
     found = {**result["scenes"], "widths": result["widths"], "order": [x for x in CROP if result["scenes"].get(x)]}
+    studies.write_csv(ROOT / "docs" / "data" / "ladder.csv", data(found))
     plot(found, ROOT / "docs" / "pictures" / "ladder.png")
     fill_between(ROOT / "docs" / "ladder.md", "ladder", page(found, result["made"]))
 

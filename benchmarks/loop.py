@@ -1,6 +1,7 @@
 """What a cache saves a robot that picks a view at each stop.
 
-    python benchmarks/loop.py [--quick] [--print]     the table of docs/information.md, benchmarks/loop.json
+    python benchmarks/loop.py [--quick] [--print]     a paragraph of docs/information.md, benchmarks/loop.json
+    python benchmarks/loop.py --page                  the paragraph of what benchmarks/loop.json has
 
 Ten picks around `wolf` (../shared/data, or DRGS_DATA): the view picked becomes known, and two new candidates come. The
 loop is walked twice in turns, without a cache and with one, and must pick the same. Times are CPU time of the process;
@@ -28,11 +29,13 @@ import drgs  # noqa: E402
 from drgs.cameras import Camera, intrinsics_from_fov, look_at  # noqa: E402
 from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.select import Cache, select  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
+from drgs.studies.tables import fill_between, paragraph  # noqa: E402
 
 KNOWN = 2
 CANDIDATES = 24
 NEW = 2
+PAGE = ROOT / "docs" / "information.md"
+RESULTS = ROOT / "benchmarks" / "loop.json"
 PICKS = 10
 PRESETS = ("fast", "exact")
 
@@ -76,28 +79,32 @@ class Robot:
 
 def report(r: dict) -> str:
     """What docs/information.md says."""
-    lines = [
-        f"Made by `python benchmarks/loop.py`, {r['machine']}, {r['date']}, commit {r['commit']}. {PICKS} picks on "
-        f"`wolf` ({r['gaussians']:,} Gaussians) at {r['size']}: {KNOWN} known views and {CANDIDATES} candidates at "
-        f"first, {NEW} more with each pick; CPU seconds, the two loops taking turns, the same picks. "
-        f"{r['misses']} answers were computed and {r['hits']} found, {r['bytes'] / 1e6:.0f} MB were kept.",
-        "",
-        "| preset | ten picks, without | with a cache | ratio | a later pick, without | with a cache | ratio |",
-        "|---|---|---|---|---|---|---|",
+    told = [
+        f"{PICKS} picks on `wolf` ({r['gaussians']:,} Gaussians) at {r['size']}, {KNOWN} known views and {CANDIDATES} "
+        f"candidates at first, {NEW} more with each pick, CPU time without and with a cache:"
     ]
     for preset, row in r["rows"].items():
-        all_a, all_b = row["all"]
-        one_a, one_b = row["later"]
-        cells = f"{all_a:.0f} s | {all_b:.0f} s | {all_a / all_b:.1f} | {one_a:.1f} s | {one_b:.1f} s"
-        lines.append(f"| `{preset}` | {cells} | {one_a / one_b:.1f} |")
-    return "\n".join(lines)
+        (all_a, all_b), (one_a, one_b) = row["all"], row["later"]
+        told.append(
+            f"`{preset}` {all_a:.0f} and {all_b:.0f} s ({all_a / all_b:.1f} times less), a later pick {one_a:.1f} and "
+            f"{one_b:.1f} s ({one_a / one_b:.1f} times);"
+        )
+    told.append(
+        f"the picks are the same, {r['bytes'] / 1e6:.0f} MB were kept (`python benchmarks/loop.py`, {r['machine']}, "
+        f"{r['date']}, commit {r['commit']})."
+    )
+    return paragraph(" ".join(told))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--quick", action="store_true", help="a few Gaussians of its own: checks that the script runs")
     parser.add_argument("--print", action="store_true", help="do not touch docs/information.md")
+    parser.add_argument("--page", action="store_true", help="measure nothing, write what there is")
     args = parser.parse_args()
+    if args.page:
+        fill_between(PAGE, "loop", report(json.loads(RESULTS.read_text())))
+        return
     if args.quick:
         g = drgs.testing.random_scene(0)[0].detach()
         size = (24, 16)
@@ -125,9 +132,9 @@ def main() -> None:
     text = report(result)
     print(text)
     if not args.quick:
-        (ROOT / "benchmarks" / "loop.json").write_text(json.dumps(result, indent=1) + "\n")
+        RESULTS.write_text(json.dumps(result, indent=1) + "\n")
     if not (args.print or args.quick):
-        fill_between(ROOT / "docs" / "information.md", "loop", text)
+        fill_between(PAGE, "loop", text)
 
 
 if __name__ == "__main__":

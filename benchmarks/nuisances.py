@@ -1,6 +1,9 @@
 """What it costs to eliminate a view's own unknowns from its information, and which views are picked then.
 
     python benchmarks/nuisances.py [--run RUN ...] [--turns 5]     tables, benchmarks/nuisances.json
+    python benchmarks/nuisances.py --page                          measures nothing
+
+Both write docs/data/eliminated-cost.csv and eliminated-picks.csv, data files of docs/information.md.
 
 The cost is of one view of the cube scene, 20,000 Gaussians at 320x240. Picks are of the cube scene and of fitted runs:
 three of the cameras are known, the others are ranked by the default score.
@@ -20,6 +23,7 @@ import cubes  # noqa: E402
 import torch  # noqa: E402
 from clocks import interleaved  # noqa: E402
 from fisher import fitted  # noqa: E402
+from studies import write_csv  # noqa: E402
 from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
@@ -36,6 +40,8 @@ KINDS = {
     "pose": Nuisances(eliminate=("pose",)),
     "exposure, pose": Nuisances(eliminate=("exposure", "pose")),
 }
+RESULTS = ROOT / "benchmarks" / "nuisances.json"
+DATA = ROOT / "docs" / "data"
 _PIXELS = 5_000
 _KNOWN = 3
 
@@ -92,19 +98,44 @@ def spearman(a: list[float], b: list[float]) -> float:
     return float(torch.corrcoef(ranks)[0, 1])
 
 
+def write(found: dict) -> None:
+    """The data files of what was measured."""
+    lines = [[row["what"], row["preset"], *(f"{row[kind]:.0f}" for kind in KINDS)] for row in found["cost"]]
+    write_csv(DATA / "eliminated-cost.csv", [["what", "preset", *(f"{kind}_ms" for kind in KINDS)], *lines])
+    groups = list(found["picks"][0]["lost"])
+    heads = ["scene", "eliminated", "candidates", "spearman", "rank_of_pick", *(f"{group}_lost" for group in groups)]
+    lines = [
+        [
+            row["scene"],
+            row["eliminated"],
+            str(row["candidates"]),
+            f"{row['spearman']:.3f}",
+            str(row["rank of the pick"]),
+            *(f"{row['lost'][group]:.4f}" for group in groups),
+        ]
+        for row in found["picks"]
+    ]
+    write_csv(DATA / "eliminated-picks.csv", [heads, *lines])
+
+
 def main() -> None:
     """Measure, print and write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--run", type=Path, nargs="*", default=[])
     parser.add_argument("--turns", type=int, default=5)
+    parser.add_argument("--page", action="store_true", help="measure nothing, write the data files of what there is")
     args = parser.parse_args()
+    if args.page:
+        write(json.loads(RESULTS.read_text()))
+        return
     times = cost(args.turns)
     ring = orbit((0, 0, 0), 4.0, 16, width=320, height=240, elevation=20.0)
     rows = picks("cube", cubes.cube(6_000), ring)
     for run in args.run:
         rows += picks(run.name, *fitted(run))
     found = {"cost": times, "picks": rows, "where": ran()}
-    (ROOT / "benchmarks/nuisances.json").write_text(json.dumps(found, indent=1) + "\n")
+    RESULTS.write_text(json.dumps(found, indent=1) + "\n")
+    write(found)
     tables.show(
         "ms of one view, 20,000 Gaussians, 320x240",
         ("preset", "what", *KINDS),

@@ -5,7 +5,7 @@
 Of each run the views that it was fitted to are known. A dome of candidates is made as `drgs select --candidates dome`
 makes it, from `COUNTS` cameras, and from `START` of them with picks that are moved. Every pick is then scored by the
 default criterion in one pool: the known views, the densest dome, and all picks. Appends one row a run and way to
-benchmarks/refining.jsonl and leaves out runs that are there; `--page` writes the table of docs/information.md.
+benchmarks/refining.jsonl and leaves out runs that are there; `--page` writes the paragraph of docs/information.md.
 """
 
 from __future__ import annotations
@@ -32,13 +32,14 @@ from drgs.commands.scene_input import SceneInput  # noqa: E402
 from drgs.commands.viewpoints import known_views, other_views  # noqa: E402
 from drgs.select import Refine, Scoring, select  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
+from drgs.studies.tables import fill_between, paragraph  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "refining.jsonl"
 PAGE = ROOT / "docs" / "information.md"
 COUNTS = (20, 40, 80, 160)
 START = 20
 EVALUATIONS = (10, 20, 40, 80)
+SHOWN = (str(START), "160", f"{START} + 40")  # of these, on the page
 PIXELS = 10_000
 
 
@@ -69,18 +70,22 @@ def measure(path: Path) -> None:
         print(row, flush=True)
 
 
-def table(rows: list[dict]) -> str:
-    """The page's table: averages over the runs."""
+def report(rows: list[dict]) -> str:
+    """What the page says: averages over the runs."""
     runs = sorted({row["run"] for row in rows})
-    lines = ["| candidates + views that the pick is moved by | CPU seconds | score, over that of 20 |", "|---|---|---|"]
     of = {(row["run"], row["way"]): row for row in rows}
-    for way in dict.fromkeys(row["way"] for row in rows):
+    told = []
+    for way in SHOWN:
         own = [of[run, way] for run in runs if (run, way) in of]
         gains = [row["score"] / of[row["run"], str(START)]["score"] for row in own]
         seconds = np.mean([row["seconds"] for row in own])
-        lines.append(f"| {way} | {seconds:.1f} | {np.mean(gains):.2f} ({min(gains):.2f} to {max(gains):.2f}) |")
-    made = f"Made by `python benchmarks/refining.py` on {rows[-1]['machine']}, {rows[-1]['date']}, commit "
-    return "\n".join([f"{made}{rows[-1]['commit']}: {', '.join(runs)}; {PIXELS:,} pixels a view.", "", *lines])
+        told.append(f"{way}: {seconds:.1f} s, {np.mean(gains):.2f} ({min(gains):.2f} to {max(gains):.2f})")
+    return paragraph(
+        f"Candidates + views tried by moving, CPU time and the pick's score over that of {START} candidates: "
+        f"{'; '.join(told)}. Averages over {', '.join(f'`{run}`' for run in runs)} (least to most), {PIXELS:,} pixels "
+        f"a view (`python benchmarks/refining.py`, {rows[-1]['machine']}, {rows[-1]['date']}, commit "
+        f"{rows[-1]['commit']})."
+    )
 
 
 def main() -> None:
@@ -93,7 +98,7 @@ def main() -> None:
     for path in args.runs:
         if path.name not in there:
             measure(path)
-    text = table(read_rows(ROWS))
+    text = report(read_rows(ROWS))
     print(text)
     if args.page:
         fill_between(PAGE, "refining", text)

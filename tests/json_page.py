@@ -1,12 +1,16 @@
-"""docs/run-files.md as data: the fields that it names of each JSON file, and whether a real file has just these."""
+"""docs/data/run-files.csv: the fields that it names of each JSON file, and whether a real file has just these."""
 
 from __future__ import annotations
 
+import csv
 import re
 
 from doc_pages import ROOT
 
 PAGE = (ROOT / "docs" / "run-files.md").read_text(encoding="utf-8")
+"""What people read: every field, with fewer words."""
+with (ROOT / "docs" / "data" / "run-files.csv").open(encoding="utf-8", newline="") as _file:
+    ROWS = list(csv.DictReader(_file))
 OF_CAPTURE = ("exposure", "wall", "shadow", "passer_by", "pose_error")
 """Fields of params.json that only `drgs scene capture` writes."""
 _ELSEWHERE = ("settings", "camera", "env")
@@ -14,15 +18,14 @@ _ELSEWHERE = ("settings", "camera", "env")
 
 
 def titles() -> set[str]:
-    """The files that have a section."""
-    return set(re.findall(r"^## (\S+\.jsonl?)$", PAGE, re.MULTILINE))
+    """The files that are told."""
+    return {row["file"] for row in ROWS}
 
 
 def section(title: str) -> list[list[str]]:
-    """The cells of each row of a section's tables that begins with a field."""
-    text = PAGE.split(f"\n## {title}\n")[1].split("\n## ")[0]
-    rows = [line.strip("|").split("|") for line in text.splitlines() if line.startswith("| `")]
-    assert rows, f"no table of {title}"
+    """Fields and their meaning, of each row of a file."""
+    rows = [[row["field"], row["meaning"]] for row in ROWS if row["file"] == title]
+    assert rows, f"no rows of {title}"
     return rows
 
 
@@ -62,13 +65,13 @@ def check(
     absent: tuple[str, ...] = (),
     elsewhere: tuple[str, ...] = (),
 ) -> None:
-    """Assert that a section names every field of real files, and no other.
+    """Assert that the rows of a file name every field of real ones, and no other.
 
     Args:
-        title: Of the section.
+        title: Name of the file.
         records: What such files hold, together every field that there is.
         maps: Fields whose own keys are data; twice, where those of their values are, too.
-        absent: Fields of the page that only other files than these have.
+        absent: Fields of the rows that only other files than these have.
         elsewhere: Further fields whose content is told elsewhere.
     """
     levels = {name: maps.count(name) for name in maps}

@@ -1,7 +1,8 @@
-"""docs/run-files.md against the files that are written: every field is told, and every field that is told is there.
+"""docs/data/run-files.csv against the files that are written: every field is told, and what is told is there.
 
-demo.json, reproduce.json and teach.json are held to the page where tests make them (test_demo.py, test_reproduce.py,
-test_teach.py), a data set's where its scene is rendered (test_room.py, test_kitchen.py).
+docs/run-files.md names the same fields. demo.json, reproduce.json and teach.json are held to the rows where tests make
+them (test_demo.py, test_reproduce.py, test_teach.py), a data set's where its scene is rendered (test_room.py,
+test_kitchen.py).
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import json_page
 import numpy as np
 import pytest
 from doc_pages import ROOT
-from json_page import PAGE, check, section, titles
+from json_page import PAGE, ROWS, check, section, titles
 from json_page import names as _names
 from test_active import SIZE, config, lazily, plan, write_still
 from test_query import decoder, embeddings
@@ -43,7 +44,7 @@ of a fit that begins with the Gaussians of another one.
 
 
 def _rows(title: str) -> list[tuple[set[str], set[str]]]:
-    """The names in the first cell of each row of a section's tables, and those in its other cells."""
+    """The names among the fields of each row of a file, and those in their meaning."""
     return [(_names(first), _names(" ".join(others))) for first, *others in section(title)]
 
 
@@ -168,7 +169,7 @@ _WRITERS = {
     "metrics.py": {"metrics.json"},
     "studies/rows.py": {"rows.jsonl"},
 }
-"""Module that writes JSON for users -> the sections of the page that tell its fields."""
+"""Module that writes JSON for users -> the files whose fields are told."""
 _OTHERS = {
     "codecs/glb.py",  # the header of a .glb
     "codecs/sog.py",  # the index in a .sog
@@ -183,11 +184,28 @@ _OTHERS = {
     "report/page.py",  # a cell of the report
     "sharing/page.py",  # what a page is told
 }
-"""Modules that make JSON which is no file of the page."""
+"""Modules that make JSON which is no such file."""
 
 
-def test_every_writer_has_its_section():
-    """A module that calls `write_json`, or makes JSON itself, has its files on the page; the page has no others."""
+def _on_page(title: str) -> str:
+    """What docs/run-files.md says of a file: its section, or its row of the table of other files."""
+    heading = {"cameras.json": "Cameras in JSON"}.get(title, title)
+    rows = [line for line in PAGE.splitlines() if line.startswith("| `") and f"`{title}`" in line.split("|")[1]]
+    return "\n".join([*PAGE.partition(f"\n## {heading}\n")[2].split("\n## ")[:1], *rows])
+
+
+@pytest.mark.parametrize("title", sorted(titles()))
+def test_the_page_names_every_field(title):
+    """All fields of a file but the common ones are named where the page tells of it."""
+    common = _names(PAGE.partition("**Common fields**")[2].partition("\n\n")[0])
+    values = {"fisher", "select", "capture"}  # of `command`
+    fields = set().union(*(_names(row["field"] + row["meaning"]) for row in ROWS if row["file"] == title))
+    fields = {name for name in fields if name.isidentifier()} - values
+    assert fields - _names(_on_page(title)) - common == set()
+
+
+def test_every_writer_has_its_rows():
+    """A module that calls `write_json`, or makes JSON itself, has rows for its files; no other file has."""
     found = set()
     for path in (ROOT / "drgs").rglob("*.py"):
         if any(
@@ -203,7 +221,7 @@ def test_every_writer_has_its_section():
 def test_the_check_finds_what_is_missing(monkeypatch):
     """A field that is not told, at any depth, and one that no file has."""
     monkeypatch.setattr(
-        json_page, "PAGE", "\n## a.json\n\n| field | meaning |\n|---|---|\n| `one`, `two` | `three` |\n"
+        json_page, "ROWS", [{"file": "a.json", "part": "", "field": "`one`, `two`", "meaning": "`three`"}]
     )
     whole = {"schema": 1, "one": 1, "two": [{"three": 3}]}
     check("a.json", whole)
