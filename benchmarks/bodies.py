@@ -3,11 +3,12 @@
     python benchmarks/bodies.py [NAME ...] [--page] [--pictures FOLDER]
 
 Appends one row a scene, background, seed and kind of fit to benchmarks/bodies.jsonl as it ends, leaves out what is
-there, then writes the table of docs/dynamic.md. Scenes are those of the folder `bodies`: the layout of D-NeRF,
-masks of instances beside the photographs. PSNR is also that of the pixels of bodies that move alone, and their masks
-are compared with what is rendered as moving: where Gaussians that the field moves or that are there for a time make up
-more than half of a pixel. Pixels outside the masks that change all the same, such as those of shadows, count neither
-way: where a photograph differs from the median of those of its camera.
+there, then writes the table of docs/dynamic.md (what is before white) and docs/data/moving-bodies.csv (every fit).
+Scenes are those of the folder `bodies`: the layout of D-NeRF, masks of instances beside the photographs. PSNR is also
+that of the pixels of bodies that move alone, and their masks are compared with what is rendered as moving: where
+Gaussians that the field moves or that are there for a time make up more than half of a pixel. Pixels outside the masks
+that change all the same, such as those of shadows, count neither way: where a photograph differs from the median of
+those of its camera.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import os
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 os.environ.setdefault("DRGS_THREADS", "1")
@@ -29,6 +31,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
+from studies import write_csv  # noqa: E402
 from where import DATA, add_row, ran, read_rows  # noqa: E402
 
 from drgs.data import load  # noqa: E402
@@ -39,11 +42,12 @@ from drgs.fitting.frames import Frame, load_frames  # noqa: E402
 from drgs.fitting.records import load_run  # noqa: E402
 from drgs.integrator import render  # noqa: E402
 from drgs.metrics import psnr  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
+from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
 from drgs.train import fit  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "bodies.jsonl"
 PAGE = ROOT / "docs" / "dynamic.md"
+CSV = ROOT / "docs" / "data" / "moving-bodies.csv"
 SCENES = ("collision", "occlusion", "deformation")
 STILL = ("background", "wall", "cube")
 """Instances that stand still."""
@@ -110,34 +114,50 @@ def measured(scene: str, run: Path, ground: tuple[float, ...], pictures: Path | 
 
 
 def table(rows: list[dict]) -> str:
-    """A row a scene, background and kind of fit: means over seeds, and the worst view of all."""
-    lines = [
-        "| scene | behind | lives | PSNR (worst view) | of moving pixels | overlap (worst view) | that move or live "
-        "| seconds |",
-        "|---" * 8 + "|",
-    ]
+    """A row a scene and kind of fit, before white: means over seeds and, of each number, the worst view of all."""
+    heads = ["scene", "`--lives`", "PSNR (worst view), dB", "moving pixels, dB", "overlap (worst view)"]
     groups: dict[tuple, list[dict]] = {}
     for row in rows:
-        groups.setdefault((SCENES.index(row["scene"]), row["ground"] != "white", row["lives"] != "off"), []).append(row)
+        if row["ground"] == "white":
+            groups.setdefault((SCENES.index(row["scene"]), row["lives"] != "off"), []).append(row)
+    lines = []
     for _, group in sorted(groups.items()):
-        mean = {
-            key: np.mean([row[key] for row in group]) for key in ("psnr", "psnr_moving", "overlap", "share", "seconds")
-        }
+        mean = {key: np.mean([row[key] for row in group]) for key in ("psnr", "psnr_moving", "overlap")}
         worst = {key: min(row[f"worst_{key}"] for row in group) for key in ("psnr", "overlap")}
-        one = group[0]
+        name = f"{group[0]['scene']}, {len(group)} seed{'s' if len(group) > 1 else ''}"
         lines.append(
-            f"| {one['scene']}, {len(group)} seed{'s' if len(group) > 1 else ''} | {one['ground']} | {one['lives']} "
-            f"| {mean['psnr']:.1f} ({worst['psnr']:.1f}) | {mean['psnr_moving']:.1f} | {mean['overlap']:.2f} "
-            f"({worst['overlap']:.2f}) | {100 * mean['share']:.0f} % | {mean['seconds']:.0f} |"
+            [
+                name,
+                group[0]["lives"],
+                f"{mean['psnr']:.1f} ({worst['psnr']:.1f})",
+                f"{mean['psnr_moving']:.1f}",
+                f"{mean['overlap']:.2f} ({worst['overlap']:.2f})",
+            ]
         )
-    return "\n".join(lines)
+    return markdown_table(heads, lines)
+
+
+def csv_lines(rows: list[dict]) -> Iterator[list[str]]:
+    """Every fit: means over its test views, and the worst of them."""
+    kinds = ("scene", "ground", "lives", "seed")
+    digits = {"psnr": 2, "psnr_moving": 2, "overlap": 3}
+    yield [
+        *kinds,
+        *(name for key in digits for name in (key, f"worst_{key}")),
+        *("share_that_moves_or_lives", "seconds", "machine", "date", "commit"),
+    ]
+    order = lambda row: (SCENES.index(row["scene"]), row["ground"] != "white", row["lives"], row["seed"])  # noqa: E731
+    for row in sorted(rows, key=order):
+        values = [f"{row[name]:.{x}f}" for key, x in digits.items() for name in (key, f"worst_{key}")]
+        ran_at = [row["machine"], row["date"], row["commit"]]
+        yield [*(str(row[key]) for key in kinds), *values, f"{row['share']:.3f}", f"{row['seconds']:.0f}", *ran_at]
 
 
 def main() -> None:
     """The program."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", default=SCENES, help="scenes; default all")
-    parser.add_argument("--page", action="store_true", help="measure nothing, write the table of what is there")
+    parser.add_argument("--page", action="store_true", help="measure nothing, write the page of what is there")
     parser.add_argument("--pictures", type=Path, help="where truth, image and both masks of all views are drawn")
     parser.add_argument("--seeds", type=int, default=len(SEEDS), help="how many of them")
     parser.add_argument("--kinds", default="white:auto,white:off,black:auto,black:off", help="background:lives, ...")
@@ -161,9 +181,9 @@ def main() -> None:
                     row |= measured(scene, run, GROUNDS[ground], args.pictures)
                 add_row(ROWS, row | ran())
                 print({k: x for k, x in row.items() if k != "views"}, flush=True)
-    text = table(read_rows(ROWS))
-    print(text)
-    fill_between(PAGE, "bodies", text)
+    rows = read_rows(ROWS)
+    write_csv(CSV, csv_lines(rows))
+    fill_between(PAGE, "bodies", table(rows))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,10 @@
 """What views say about a deformation field: how far the estimates of it are off, whether they rank alike, their cost.
 
-    python benchmarks/deformation.py [--quick] [--print]     the tables of docs/dynamic.md, benchmarks/deformation.json
+    python benchmarks/deformation.py [--quick]     writes benchmarks/deformation.json and the page
+    python benchmarks/deformation.py --page        measures nothing, writes the page of what is there
+
+The page is the table of docs/dynamic.md and, with everything, docs/data/moving-network.csv (errors of the estimates),
+moving-network-tau.csv and moving-network-seconds.csv.
 
 The scene is made here: a cloud of Gaussians, a part of which swings around a pillar, and a small field that is fitted
 to renders of it. All cameras at the first time are known, candidates are these cameras at other times. Times are CPU
@@ -16,6 +20,7 @@ import json
 import os
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -25,7 +30,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: tor
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from clocks import interleaved  # noqa: E402
-from studies import rank_correlation  # noqa: E402
+from studies import rank_correlation, write_csv  # noqa: E402
 from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
@@ -34,12 +39,22 @@ from drgs.cameras import Camera, orbit  # noqa: E402
 from drgs.deform import DeformationField, DynamicGaussians, FieldConfig  # noqa: E402
 from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.gain import Information, information_gain  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
+from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
 
 FAST = drgs.RenderSettings.preset("fast")
 COUNTS = (1, 2, 4, 8, 16)
 SOME = (4, 16)  # of what costs more
 TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)
+RESULT = ROOT / "benchmarks" / "deformation.json"
+DATA = ROOT / "docs" / "data"
+ESTIMATES = {
+    "`ratio`": "ratio, same",
+    "`ratio`, each view its own signs": "ratio, own",
+    "`trace`, reverse": "trace, same",
+    "`trace`, forward": "forward",
+    "`paper`": "paper",
+}
+"""What the page calls an estimate -> what the results do."""
 
 
 def cloud(count: int, rng: np.random.Generator) -> tuple[Gaussians, torch.Tensor]:
@@ -164,45 +179,66 @@ def costs(count: int, size: tuple[int, int], share: float, turns: int) -> dict[s
     return interleaved(runs, turns, time.process_time)
 
 
-def report(r: dict) -> str:
-    """What docs/dynamic.md says."""
-    e = r["errors"]
-    lines = [
-        f"Made by `python benchmarks/deformation.py`, {r['machine']}, {r['date']}, commit {r['commit']}.",
-        f"{r['gaussians']:,} Gaussians, {r['moving']} of which a field of {r['weights']:,} weights moves, fitted in "
-        f"{r['steps']} steps; {r['known']} known views, {r['candidates']} candidates at {r['size']}, preset `fast`. "
-        f"Against {r['exact']:,} probes a view (`paper`: {r['exact'] // 8:,}), whose halves have a tau of "
-        f"{e['halves']['ratio']:.2f} (`ratio`) and {e['halves']['trace']:.2f} (`trace`) between them; averages over "
-        f"{r['seeds']} seeds. In each cell: mean of the scores over the right ones, standard "
-        "deviation of that, Kendall's tau, regret of the best view.",
-        "",
-        "| probes | `ratio` | `ratio`, each view its own signs | `trace`, reverse | `trace`, forward | `paper` |",
-        "|---|---|---|---|---|---|",
-    ]
-    for K in COUNTS:
-        kinds = (f"ratio, same {K}", f"ratio, own {K}", f"trace, same {K}", f"forward {K}", f"paper {K}")
-        cells = [
-            f"{e[x][0]:.2f}, {100 * e[x][1]:.0f} %, {e[x][2]:.2f}, {100 * e[x][3]:.0f} %" if x in e else ""
-            for x in kinds
-        ]
-        lines.append(f"| {K} | " + " | ".join(cells) + " |")
-    names = list(e["tau"])
-    lines += ["", "Kendall's tau between the scores of the candidates:", "", f"| | {' | '.join(names)} |"]
-    lines.append("|---" * (len(names) + 1) + "|")
-    lines += [f"| {a} | " + " | ".join(f"{e['tau'][a][b]:.2f}" for b in names) + " |" for a in names]
-    lines += ["", f"CPU seconds of one view, {r['many']:,} Gaussians at {r['large']}, field `neu3d` for 40 times:", ""]
-    shares = list(r["costs"])
-    lines += [f"| 16 probes | {' | '.join(f'{s} moving' for s in shares)} |", "|---" * (len(shares) + 1) + "|"]
-    for name in r["costs"][shares[0]]:
-        lines.append(f"| {name} | " + " | ".join(f"{r['costs'][share][name]:.2f}" for share in shares) + " |")
-    return "\n".join(lines)
+def table(r: dict) -> str:
+    """The page's: error and rank correlation of the estimates by few probes and many, and the regret by few."""
+    few = SOME[0]
+    heads = ["estimate", *(f"{what}, {K} probes" for K in SOME for what in ("error", "tau"))]
+    heads.append(f"best view lacks, {few} probes")
+    lines = []
+    for title, name in ESTIMATES.items():
+        if name == "ratio, own":
+            continue  # is in the data file
+        cells = []
+        for K in SOME:
+            _, error, tau, _ = r["errors"][f"{name} {K}"]
+            cells += [f"{100 * error:.0f} %", f"{tau:.2f}"]
+        lines.append([title, *cells, f"{100 * r['errors'][f'{name} {few}'][3]:.0f} %"])
+    return markdown_table(heads, lines)
+
+
+def error_lines(r: dict) -> Iterator[list[str]]:
+    """Every estimate by every number of probes."""
+    yield ["estimate", "probes", "mean of scores over the right ones", "standard deviation of that", "tau", "regret"]
+    for title, name in ESTIMATES.items():
+        for K in COUNTS:
+            if found := r["errors"].get(f"{name} {K}"):
+                yield [title.replace("`", ""), str(K), *(f"{x:.3f}" for x in found)]
+    for name, tau in r["errors"]["halves"].items():
+        half = str(r["exact"] // 2)
+        yield [f"{name}, half of the right scores' probes against the others", half, "", "", f"{tau:.3f}", ""]
+
+
+def tau_lines(r: dict) -> Iterator[list[str]]:
+    """Kendall's tau between the right scores of the candidates, by what they are of."""
+    tau = r["errors"]["tau"]
+    yield ["", *tau]
+    for name, found in tau.items():
+        yield [name, *(f"{found[other]:.2f}" for other in tau)]
+
+
+def second_lines(r: dict) -> Iterator[list[str]]:
+    """CPU seconds of one view, by the share of Gaussians that move."""
+    yield ["one view, 16 probes, CPU seconds", *(f"{share} moving" for share in r["costs"])]
+    for name in next(iter(r["costs"].values())):
+        yield [name, *(f"{spent[name]:.2f}" for spent in r["costs"].values())]
+
+
+def write_page(r: dict) -> None:
+    """The table and the data files."""
+    write_csv(DATA / "moving-network.csv", error_lines(r))
+    write_csv(DATA / "moving-network-tau.csv", tau_lines(r))
+    write_csv(DATA / "moving-network-seconds.csv", second_lines(r))
+    fill_between(ROOT / "docs" / "dynamic.md", "deformation", table(r))
 
 
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--quick", action="store_true", help="small and few: checks that the script runs")
-    parser.add_argument("--print", action="store_true", help="do not touch docs/dynamic.md")
+    parser.add_argument("--page", action="store_true", help="measure nothing, write the page of what is there")
     args = parser.parse_args()
+    if args.page:
+        write_page(json.loads(RESULT.read_text()))
+        return
     rng = np.random.default_rng(0)
     count, size, steps = (40, (16, 12), 5) if args.quick else (400, (48, 36), 300)
     g, swings = cloud(count, rng)
@@ -232,12 +268,10 @@ def main():
     print(json.dumps(result), flush=True)  # what follows takes as long again
     turns = 1 if args.quick else 2
     result["costs"] = {f"{share:.0%}": costs(many, large, share, turns) for share in (0.1, 1.0)}
-    text = report(result)
-    print(text)
+    print(table(result))
     if not args.quick:
-        (ROOT / "benchmarks" / "deformation.json").write_text(json.dumps(result, indent=1) + "\n")
-    if not (args.print or args.quick):
-        fill_between(ROOT / "docs" / "dynamic.md", "deformation", text)
+        RESULT.write_text(json.dumps(result, indent=1) + "\n")
+        write_page(result)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,10 @@
 """What a deformation field costs: the share of a training step, with and without gates, and seconds a pick.
 
-    python benchmarks/dynamic.py [--quick]             prints, writes benchmarks/dynamic.json and docs/dynamic.md
+    python benchmarks/dynamic.py [--quick]             prints, writes benchmarks/dynamic.json and the page
     python benchmarks/dynamic.py --run RUN             the same of a fit to what moves, dynamic-run.json; no picks
+    python benchmarks/dynamic.py --page                measures nothing, writes the page of what is there
+
+The page is the table of docs/dynamic.md and, with every part of a step, docs/data/moving-steps.csv.
 
 50,000 Gaussians, 320x240, 40 times; those of a run are split until there are as many. A step is the trainer's own
 (loss, backward pass, optimizer, gates that are ajar in every tenth); steps with a field and without take turns in one
@@ -18,7 +21,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -28,6 +31,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: tor
 import cubes  # noqa: E402
 import torch  # noqa: E402
 from clocks import interleaved  # noqa: E402
+from studies import write_csv  # noqa: E402
 from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
@@ -43,12 +47,13 @@ from drgs.fitting.records import load_run  # noqa: E402
 from drgs.fitting.rows import GaussianRows  # noqa: E402
 from drgs.fitting.trainer import Trainer  # noqa: E402
 from drgs.select import Scoring, select  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
+from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
 
 TIMES = 40
 CAMERAS = 15
 STEPS = 10  # of a turn: gates are ajar in one of them
 SHARES = (0.1, 0.25, 1.0)
+RESULTS = (ROOT / "benchmarks" / "dynamic.json", ROOT / "benchmarks" / "dynamic-run.json")
 
 
 def frames(size: tuple[int, int], cameras: list[Camera]) -> list[Frame]:
@@ -145,35 +150,39 @@ def pick(scene: DynamicGaussians, shown: list[Frame]) -> dict[str, float]:
     return spent
 
 
-def report(result: dict) -> str:
-    """The tables and what they say."""
-    still = result["steps"]["still"]
-    lines = [
-        f"Made by `python benchmarks/dynamic.py` on {result['machine']}, {result['date']}, commit {result['commit']},",
-        f"while {result['load']:.0f} programs wanted its {result['cores']} cores: CPU time, {result['gaussians']:,} "
-        f"Gaussians ({result['scene']}), {result['size'][0]}x{result['size'][1]}, {TIMES} times, field `neu3d`,",
-        f"medians of {result['turns']} turns of {STEPS} steps.",
-        "",
-        "| Gaussians that move | a step | share of the deformation |",
-        "|---|---|---|",
-        f"| none, no field | {1e3 * still:.0f} ms | |",
-    ]
-    for name, spent in result["steps"].items():
-        if name != "still":
-            lines.append(f"| {name} | {1e3 * spent:.0f} ms | {100 * (1 - still / spent):.0f} % |")
-    names = list(result["profile"])
-    lines += [
-        "",
-        "| by itself | " + " | ".join(f"{name} move" for name in names) + " |",
-        "|---" * (1 + len(names)) + "|",
-    ]
-    for part in result["profile"][names[0]]:
-        lines.append(f"| {part} | " + " | ".join(f"{1e3 * result['profile'][n][part]:.0f} ms" for n in names) + " |")
-    if "pick" not in result:
-        return "\n".join(lines)
-    told = ", ".join(f"{spent:.0f} s by {name}" for name, spent in result["pick"].items())
-    lines += ["", f"One of {CAMERAS} cameras at a later time is picked, {CAMERAS} views being known, in {told}."]
-    return "\n".join(lines)
+def table(results: list[dict]) -> str:
+    """A line a scene and share of Gaussians that move."""
+    lines = []
+    for r in results:
+        still = r["steps"]["still"]
+        for name, spent in r["steps"].items():
+            if name != "still":
+                times = [f"{1e3 * x:.0f}" for x in (still, spent)]
+                lines.append([r["scene"], name, *times, f"{100 * (1 - still / spent):.0f} %"])
+    return markdown_table(
+        ["scene", "Gaussians that move", "ms a step without a field", "with", "share of the field"], lines
+    )
+
+
+def csv_lines(results: list[dict]) -> Iterator[list[str]]:
+    """Milliseconds of steps, of their parts by themselves, and of picks, with where and when."""
+    yield ["scene", "Gaussians that move", "what", "milliseconds", "machine", "date", "commit", "load"]
+    for r in results:
+        ran_at = [r["machine"], r["date"], r["commit"], f"{r['load']:.0f} programs on {r['cores']} cores"]
+        first = next(iter(r["profile"]))
+        spent = [(name, "a step", seconds) for name, seconds in r["steps"].items()]
+        spent += [(name, part, seconds) for name, parts in r["profile"].items() for part, seconds in parts.items()]
+        spent += [(first, f"a pick by {name}", seconds) for name, seconds in r.get("pick", {}).items()]
+        for name, what, seconds in spent:
+            moving = "none, no field" if name == "still" else name
+            yield [r["scene"], moving, what, f"{1e3 * seconds:.0f}", *ran_at]
+
+
+def write_page() -> None:
+    """The table and the data file, of the results that are there."""
+    results = [json.loads(path.read_text()) for path in RESULTS if path.exists()]
+    write_csv(ROOT / "docs" / "data" / "moving-steps.csv", csv_lines(results))
+    fill_between(ROOT / "docs" / "dynamic.md", "dynamic", table(results))
 
 
 def main() -> None:
@@ -181,7 +190,11 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="small and few: checks that the script runs")
     parser.add_argument("--run", type=Path, help="take the Gaussians and the gates of a fit to what moves")
     parser.add_argument("--turns", type=int, default=5)
+    parser.add_argument("--page", action="store_true", help="measure nothing, write the page of what is there")
     args = parser.parse_args()
+    if args.page:
+        write_page()
+        return
     count, size, turns = (500, (32, 24), 1) if args.quick else (50_000, (320, 240), args.turns)
     if args.run is not None:
         g, motion, shown = of_run(args.run, size, count)
@@ -209,11 +222,10 @@ def main() -> None:
     if args.run is None:
         result["pick"] = pick(first.parts.scene(first.rows), shown)
     print(json.dumps(result))
-    print(report(result))
+    print(table([result]))
     if not args.quick:
-        name = "dynamic" if args.run is None else "dynamic-run"
-        fill_between(ROOT / "docs" / "dynamic.md", name, report(result))
-        (ROOT / "benchmarks" / f"{name}.json").write_text(json.dumps(result, indent=1) + "\n")
+        RESULTS[args.run is not None].write_text(json.dumps(result, indent=1) + "\n")
+        write_page()
 
 
 if __name__ == "__main__":

@@ -1,7 +1,9 @@
-"""The experiments `dynamic`, `prior` and `blocks` of `drgs reproduce`, blind, as the tables of docs/dynamic.md.
+"""The experiments `dynamic`, `prior` and `blocks` of `drgs reproduce`, blind, for docs/dynamic.md.
 
     python benchmarks/kitchen.py [--scale small] [--seeds 6] [--shard K/N]     fits, rows as they come
-    python benchmarks/kitchen.py --page [--merge ROWS.jsonl ...]               the tables of docs/dynamic.md
+    python benchmarks/kitchen.py --page [--merge ROWS.jsonl ...]               the page
+
+The page is the table of docs/dynamic.md, docs/data/moving-units.csv (every fit) and moving-differences.csv.
 
 The paper's dynamic loop (arXiv 2512.22771): a static stage on the first time of all cameras but the one that is held
 out, then, at each later time, one camera that a policy picks. A unit is a kitchen (seeds 1, 2, 3; constants are fixed
@@ -11,7 +13,7 @@ all times, an upper reference. One thread a process; any number of processes may
 killed ones resumed.
 
 Sizes at `small` are so that three units, 39 cells, take about two hours of two processes (a unit is whole before the
-next one begins); docs/dynamic.md has the seconds of fits and picks.
+next one begins); docs/data/moving-units.csv has the seconds of fits and picks.
 
 As the steps are a nineteenth of the paper's, features and decoder go five times as fast, as in benchmarks/semantic.py,
 and so does the field. That was tried on kitchen 0 (all views, 2,700 pixels, 3,000 Gaussians, color alone; the only
@@ -24,25 +26,29 @@ from __future__ import annotations
 import dataclasses
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 os.environ.setdefault("DRGS_THREADS", "1")
 
+import numpy as np
 import studies
+from policies import DIFFERENCES, Rows, difference
 from studies import ROOT
 
 from drgs.studies import experiments
 from drgs.studies.cells import Study
-from drgs.studies.experiments import EXPERIMENTS
-from drgs.studies.tables import study_report
+from drgs.studies.statistics import FEWEST_UNITS, coverage, differences, estimate, unit_of, values_of
+from drgs.studies.tables import markdown_table, paragraph
 
+DATA = ROOT / "docs" / "data"
 BASELINES = ("random", "uniform", "farthest", "moments", "fisherrf")
 DEFAULT = "joint+backdrop, v_opt"  # the program's own choice where something moves
-COMPARISONS = {
-    "dynamic": tuple((name, other) for name in ("joint", DEFAULT) for other in BASELINES if other != "random"),
-    "prior": (),
-    "blocks": (("joint", "geometry+semantic"), ("joint", "geometry+deformation")),
-}
+SHOWN = (*BASELINES, "geometry", "joint", "all views")
+"""What the table of the page compares the default with."""
+BLOCKS = ("geometry", "geometry+semantic", "geometry+deformation")
+LEADS = {"psnr": "PSNR", "psnr_moving": "moving pixels", "miou": "mIoU"}
+"""Metrics of the table."""
 UNITS = tuple((f"kitchen-{seed}", camera) for camera in ("cam00", "cam03") for seed in (1, 2, 3))
 """In the order in which --seeds takes them: cam00 is in the middle of the arc, cam01, ... go from left to right."""
 SCALES = ("small", "paper")
@@ -59,19 +65,100 @@ def units_of(study: Study, seeds: int) -> list:
     return [(scene, camera, "first", "blind", 0) for scene, camera in UNITS[:seeds]]
 
 
-def report(study: Study, rows: list[dict]) -> str:
-    """The three tables, each a study of its own policies."""
-    parts = []
-    for name, comparisons in COMPARISONS.items():
-        table = EXPERIMENTS[name]
-        part = dataclasses.replace(
-            study,
-            policies={label: study.policies[label] for label in table.policies},
-            reference=table.reference,
-            comparisons=comparisons,
-        )
-        parts += [f"### {table.title}", table.told, study_report(part, rows, level=4)]
-    return "\n\n".join(parts)
+def pairs_of(study: Study) -> list[tuple[str, str]]:
+    """The pairs of policies whose differences are kept."""
+    pairs = [(label, "random") for label in study.policies if label != "random"]
+    pairs += [(DEFAULT, label) for label in study.policies if label not in (DEFAULT, "random")]
+    pairs += [("joint", label) for label in study.policies if label not in ("joint", DEFAULT, "random", "all views")]
+    return pairs + [(label, "geometry") for label in BLOCKS[1:]]
+
+
+def report(study: Study, rows: Rows) -> str:
+    """The table: means of every policy, and by how much the default is ahead of it within units."""
+    metrics = {metric.key: metric for metric in study.metrics if metric.key in LEADS}
+    heads = ["policy", "PSNR", "moving pixels", "mIoU", "s a pick", *(f"default less it: {x}" for x in LEADS.values())]
+    lines = []
+    for label in (DEFAULT, *SHOWN):
+        mine = [row for row in rows if row["policy"] == label]
+        if not mine:
+            continue
+        means = (np.mean(list(values_of(mine, key, label).values())) for key in LEADS)
+        seconds = [x for row in mine if (x := row["pick_seconds"]) is not None]
+        cells = [f"{x:.{metrics[key].digits}f}" for key, x in zip(LEADS, means, strict=True)]
+        cells.append(f"{np.median(seconds):.1f}" if seconds else "–")
+        for key in LEADS:
+            found = differences(rows, key, DEFAULT, label)
+            cells.append(lead(found, metrics[key].digits) if found and label != DEFAULT else "–")
+        lines.append([f"`{label}`", *cells])
+    return "\n\n".join([paragraph(told(rows)), markdown_table(heads, lines)])
+
+
+def lead(found: dict, digits: int) -> str:
+    """A mean difference and its interval; bold where there is a verdict."""
+    one = estimate(found)
+    if one.units == 1:
+        return f"{one.mean:+.{digits}f}"
+    sure = one.units >= FEWEST_UNITS and not one.low <= 0 <= one.high
+    mean = f"{one.mean:+.{digits}f}"
+    return f"{f'**{mean}**' if sure else mean} [{one.low:+.{digits}f}, {one.high:+.{digits}f}]"
+
+
+def told(rows: Rows) -> str:
+    """How many fits the table is of, and how to read it."""
+    units = {unit_of(row) for row in rows}
+    scenes = {unit[0] for unit in units}
+    commits = dict.fromkeys((row.get("commit") or "unknown")[:7] for row in rows)
+    found = differences(rows, "psnr", DEFAULT, "random")
+    size = f"{len(rows)} fits, on commits {', '.join(commits)}; {len(scenes)} kitchens, {len(units)} units. "
+    if len(found) < 2:
+        return size
+    held = f"{100 * coverage(len({unit[0] for unit in found}), len(found)):.0f} %"
+    seen = [
+        one.detectable
+        for label in SHOWN
+        if (values := differences(rows, "psnr", DEFAULT, label)) and (one := estimate(values)).detectable is not None
+    ]
+    verdict = (
+        "Bold: the interval excludes 0. " if len(found) >= FEWEST_UNITS else f"{len(found)} units bear no verdict. "
+    )
+    least = f"A t test would find a difference of {np.median(seen):.2f} dB in 80 % of such studies." if seen else ""
+    return (
+        f"{size}Means over units; behind them differences within units, 95 % intervals from a bootstrap over kitchens "
+        f"first and the units of each then, {held} of which hold the true mean with so few kitchens. {verdict}{least}"
+    )
+
+
+def unit_lines(study: Study, rows: Rows) -> Iterator[list[str]]:
+    """Every fit: means over its test views and, of what has them, medians; seconds of the fit and of a pick."""
+    numbers = [metric.key for metric in study.metrics]
+    medians = [f"{key}_median" for key in numbers]
+    more = ["fit_seconds", "pick_seconds", "picks"]
+    yield ["protocol", "kitchen", "held_out", "seed", "policy", "commit", "test_views", *numbers, *medians, *more]
+    order = list(study.policies)
+    for row in sorted(rows, key=lambda row: (unit_of(row), order.index(row["policy"]), row["seed"])):
+        cells = [
+            "" if (x := (row.get(held) or {}).get(metric.key)) is None else f"{x:.{metric.digits}f}"
+            for held in ("metrics", "medians")
+            for metric in study.metrics
+        ]
+        spent = ["" if row.get(key) is None else f"{row[key]:.2f}" for key in ("seconds", "pick_seconds")]
+        names = [row["protocol"], row["scene"], row["camera"], str(row["seed"]), row["policy"], row["commit"]]
+        yield [*names, str(row.get("views", "")), *cells, *spent, " ".join(row.get("picks") or ())]
+
+
+def difference_lines(study: Study, rows: Rows) -> Iterator[list[str]]:
+    """Differences within units of every pair."""
+    yield ["policy", "against", "metric", *DIFFERENCES]
+    for policy, other in pairs_of(study):
+        for metric in study.metrics:
+            yield from difference([policy, other, metric.key], metric, rows, policy, other)
+
+
+def page(study: Study, rows: Rows) -> str:
+    """Writes the data files; returns the table."""
+    studies.write_csv(DATA / "moving-units.csv", unit_lines(study, rows))
+    studies.write_csv(DATA / "moving-differences.csv", difference_lines(study, rows))
+    return report(study, rows)
 
 
 def main() -> int:
@@ -82,7 +169,7 @@ def main() -> int:
         study_of,
         units_of,
         planned=lambda seeds: min(seeds, len(UNITS)) * len(study_of("small", Path()).policies),
-        report=report,
+        report=page,
         seeds=len(UNITS),
         rows="dynamic",
     )

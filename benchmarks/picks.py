@@ -5,7 +5,7 @@
 Of each run the training cameras of the first time are known, and cameras of later times are scored: by the default
 criterion with all blocks but `semantic`, as a pick of `drgs fit --views active` does. The right scores are those of all
 pixels and `EXACT` probes. Appends one row a run, share of the pixels and number of probes to benchmarks/picks.jsonl,
-leaves out what is there, and writes the table of docs/dynamic.md.
+leaves out what is there; with --page it writes docs/data/moving-picks.csv.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import argparse
 import os
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 os.environ.setdefault("DRGS_THREADS", "1")
@@ -23,7 +24,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 import numpy as np  # noqa: E402
-from studies import rank_correlation  # noqa: E402
+from studies import rank_correlation, write_csv  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
 from drgs.cameras import Camera  # noqa: E402
@@ -33,10 +34,9 @@ from drgs.fitting.records import load_run  # noqa: E402
 from drgs.select import Scoring, select  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.sizes import at_most  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "picks.jsonl"
-PAGE = ROOT / "docs" / "dynamic.md"
+CSV = ROOT / "docs" / "data" / "moving-picks.csv"
 EXACT = 64  # probes of the right scores
 SHARES = (1, 4, 16)  # of all pixels one in so many
 PROBES = (4, 8, 16)
@@ -90,23 +90,15 @@ def measure(path: Path, count: int) -> None:
         print(row, flush=True)
 
 
-def table(rows: list[dict]) -> str:
-    """The page's table: a line for each share of the pixels and number of probes, averages over the runs."""
-    lines = ["| pixels | probes | CPU seconds | Kendall's tau | what the best lacks |", "|---|---|---|---|---|"]
-    for share in SHARES:
-        for probes in PROBES:
-            own = [row for row in rows if (row["share"], row["probes"]) == (share, probes)]
-            if own:
-                seconds, tau, short = (np.mean([row[k] for row in own]) for k in ("seconds", "tau", "short"))
-                what = "all" if share == 1 else f"1 in {share}"
-                lines.append(f"| {what} | {probes} | {seconds:.1f} | {tau:.2f} | {100 * short:.1f} % |")
-    names = ", ".join(
-        f"{row['run']} ({row['gaussians']:,} Gaussians, {row['moving']:,} move, {row['pixels']:,} pixels, "
-        f"{row['known']} known views, {row['candidates']} candidates)"
-        for row in {row["run"]: row for row in rows}.values()
-    )
-    made = f"Made by `python benchmarks/picks.py` on {rows[-1]['machine']}, {rows[-1]['date']}, commit "
-    return "\n".join([f"{made}{rows[-1]['commit']}: {names}.", "", *lines])
+def csv_lines(rows: list[dict]) -> Iterator[list[str]]:
+    """A line a run, share of the pixels and number of probes."""
+    counts = ("gaussians", "moving", "pixels", "known", "candidates")
+    names = ("pixels used, one in", "probes", "CPU seconds", "Kendall's tau", "what the best lacks")
+    yield ["run", *counts, *names, "machine", "date", "commit"]
+    for row in sorted(rows, key=lambda row: (row["run"], row["share"], row["probes"])):
+        found = [f"{row['seconds']:.1f}", f"{row['tau']:.2f}", f"{row['short']:.3f}"]
+        told = [str(row[key]) for key in (*counts, "share", "probes")]
+        yield [row["run"], *told, *found, row["machine"], row["date"], row["commit"]]
 
 
 def main() -> None:
@@ -114,14 +106,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="*", type=Path)
     parser.add_argument("--candidates", type=int, default=30, help="how many are scored")
-    parser.add_argument("--page", action="store_true", help="write the table of what is there")
+    parser.add_argument("--page", action="store_true", help="write the data file of what is there")
     args = parser.parse_args()
     for path in args.runs:
         measure(path, args.candidates)
-    text = table(read_rows(ROWS))
-    print(text)
     if args.page:
-        fill_between(PAGE, "picks", text)
+        write_csv(CSV, csv_lines(read_rows(ROWS)))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """How many cameras a fit of what moves needs: the camera that is held out, met from two to eight others.
 
-    python benchmarks/places.py [--quick] [--print]     a table of docs/dynamic.md, benchmarks/places.json
+    python benchmarks/places.py [--quick]     writes benchmarks/places.json and docs/data/moving-cameras.csv
+    python benchmarks/places.py --page        measures nothing, writes the data file of what is there
 
 Kitchens are made here, small, one a seed; of their cameras the first, in the middle of the arc, is held out, and the
 others are taken evenly from it.
@@ -13,6 +14,7 @@ import json
 import os
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -20,11 +22,11 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: torch's threads shall not spin
 
 import numpy as np  # noqa: E402
+from studies import write_csv  # noqa: E402
 from where import ran  # noqa: E402
 
 from drgs import cli  # noqa: E402
 from drgs.scenes import kitchen  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
 
 COUNTS = (2, 3, 4, 6, 8)
 CAMERAS = 9
@@ -32,6 +34,8 @@ TIMES = 4
 SIZE = (64, 48)
 STEPS = 240
 GAUSSIANS = 1200
+RESULT = ROOT / "benchmarks" / "places.json"
+CSV = ROOT / "docs" / "data" / "moving-cameras.csv"
 
 
 def some(made: Path, folder: Path, count: int) -> Path:
@@ -54,25 +58,21 @@ def held_out(data: Path, run: Path, steps: int) -> float:
     return float(json.loads((run / "metrics.json").read_text())["mean"]["psnr"])
 
 
-def report(r: dict) -> str:
-    """What docs/dynamic.md says."""
-    lines = [
-        f"Made by `python benchmarks/places.py`, {r['machine']}, {r['date']}, commit {r['commit']}. Held-out PSNR "
-        f"in dB of kitchens of {SIZE[0]}x{SIZE[1]} pixels and {TIMES} times, {STEPS} steps.",
-        "",
-        f"| training cameras | {' | '.join(r['rows'])} |",
-        "|---" * (1 + len(r["rows"])) + "|",
-    ]
+def csv_lines(r: dict) -> Iterator[list[str]]:
+    """PSNR in dB of the held-out camera: a line a kitchen, a column a number of training cameras."""
+    yield ["kitchen", *(f"{count} training cameras" for count in r["rows"])]
     for i in range(r["seeds"]):
-        lines.append(f"| kitchen {i} | " + " | ".join(f"{row[i]:.1f}" for row in r["rows"].values()) + " |")
-    return "\n".join(lines)
+        yield [str(i), *(f"{row[i]:.2f}" for row in r["rows"].values())]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--quick", action="store_true", help="one kitchen, few steps: checks that the script runs")
-    parser.add_argument("--print", action="store_true", help="do not touch docs/dynamic.md")
+    parser.add_argument("--page", action="store_true", help="measure nothing, write the data file of what is there")
     args = parser.parse_args()
+    if args.page:
+        write_csv(CSV, csv_lines(json.loads(RESULT.read_text())))
+        return
     seeds, steps, counts = (1, 12, COUNTS[:1]) if args.quick else (3, STEPS, COUNTS)
     result: dict = {**ran(), "seeds": seeds, "rows": {str(count): [] for count in counts}}
     with tempfile.TemporaryDirectory() as name:
@@ -84,12 +84,9 @@ def main() -> None:
                 psnr = held_out(some(made, work / f"of{count}", count), work / f"run{count}", steps)
                 result["rows"][str(count)].append(psnr)
                 print(f"kitchen {seed}, {count} cameras: {psnr:.2f} dB", flush=True)
-    text = report(result)
-    print(text)
     if not args.quick:
-        (ROOT / "benchmarks" / "places.json").write_text(json.dumps(result, indent=1) + "\n")
-    if not (args.print or args.quick):
-        fill_between(ROOT / "docs" / "dynamic.md", "places", text)
+        RESULT.write_text(json.dumps(result, indent=1) + "\n")
+        write_csv(CSV, csv_lines(result))
 
 
 if __name__ == "__main__":

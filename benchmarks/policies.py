@@ -61,6 +61,8 @@ GROUPS = {
     "office": ("office",),
     "statue": ("statue",),
 }
+DIFFERENCES = ("mean", "low", "high", "detectable", "better", "units", "scenes")
+"""What `difference` says."""
 TABLED = ("all", "rooms", "still lifes", "captures")  # of the policies that pick by poses alone
 SHOWN = (4, 6, 8, 12)  # views, of the page's table
 
@@ -183,10 +185,7 @@ def unit_lines(rows: Rows) -> Iterator[list[str]]:
 
 def difference_lines(rows: Rows, metrics: Sequence[Metric] = METRICS) -> Iterator[list[str]]:
     """Differences within units, at every number of views; last, those of one policy by the two protocols."""
-    yield [
-        *("protocol", "policy", "against", "of", "metric", "views"),
-        *("mean", "low", "high", "detectable", "better", "units", "scenes"),
-    ]
+    yield ["protocol", "policy", "against", "of", "metric", "views", *DIFFERENCES]
     counts = view_counts(rows)
     pairs = [(DEFAULT, other) for other in OTHERS] + [(other, "random") for other in OTHERS if other != "random"]
     pairs.append(("fisherrf, from scratch", "fisherrf"))

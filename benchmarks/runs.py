@@ -1,4 +1,4 @@
-"""How runs show views that they were not fitted to: the tables of real runs in docs/semantic.md and docs/dynamic.md.
+"""How runs show views that they were not fitted to: the tables of real runs in docs/semantic.md.
 
     python benchmarks/runs.py RUN [RUN ...] [--page docs/semantic.md] [--part runs] [--print]
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["check_cameras", "check_parallax", "check_times", "go_on_without", "make_unique"]
 
-# of cameras that film what moves (docs/dynamic.md, Data)
+# of cameras that film what moves (docs/dynamic-data.md, Layouts)
 _FEW_PLACES = 4
 _ENOUGH_PLACES = 6
 _FEWEST = 3  # images that a data set must have where others are missing
