@@ -188,3 +188,27 @@ def test_a_gaussian_behind_the_camera_is_listed_where_it_reaches(rng):
     full = np.asarray(projected.alive.numpy()).sum()
     assert full > 20
     assert lists.pairs < 0.1 * full * tiles_of_screen
+
+
+@pytest.mark.parametrize("preset", ["fast", "gsplat"])
+def test_lists_of_other_lengths_need_no_other_kernel(rng, preset):
+    """A kernel that knew how long the lists are would be compiled, and kept, for every picture of a fit."""
+    settings = RenderSettings.preset(preset)
+    g = gaussians(rng, 40, 1).detach()
+    cameras = [camera(rng, (37, 21)) for _ in range(4)]
+    lengths = {_scene(g, cam, settings)[1].pairs for cam in cameras}
+    assert len(lengths) > 2
+
+    def kernels():
+        """Of all pictures, in order, without repeats."""
+        dr.kernel_history_clear()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            yield from ({row["hash"] for row in _drawn(cam)} for cam in cameras)
+
+    def _drawn(cam):
+        render(g, cam, settings)
+        return [row for row in dr.kernel_history() if row["type"] == dr.KernelType.JIT]
+
+    first, *others = kernels()
+    assert first
+    assert all(one == first for one in others)

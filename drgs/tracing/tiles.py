@@ -392,9 +392,12 @@ def _ranges(lib: Lib, group: UInt32, start: UInt32, end: UInt32) -> None:
     pairs = dr.width(group)
     entry = dr.arange(lib.UInt32, pairs)
     before = dr.gather(lib.UInt32, group, entry - 1, entry > 0)
-    after = dr.gather(lib.UInt32, group, entry + 1, entry + 1 < pairs)
+    # A number that Dr.Jit knows is part of a kernel: each count would be a kernel of its own, compiled, and kept in
+    # memory and on disk for good.
+    count = dr.opaque(lib.UInt32, pairs)
+    after = dr.gather(lib.UInt32, group, entry + 1, entry + 1 < count)
     dr.scatter(start, entry, group, (entry == 0) | (before != group))
-    dr.scatter(end, entry + 1, group, (entry + 1 == pairs) | (after != group))
+    dr.scatter(end, entry + 1, group, (entry + 1 == count) | (after != group))
     dr.eval(start, end)
 
 
