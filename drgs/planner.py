@@ -347,7 +347,7 @@ class Planner:
                 "expected": records(expected),
                 "notes": notes,
             }
-        planner_files.save(path, {**fit, **told, **own}, header)
+        planner_files.save_planner(path, {**fit, **told, **own}, header)
 
     @classmethod
     def load(cls, path: str | os.PathLike, *, scoring: Scoring | None = None) -> Planner:
@@ -363,7 +363,7 @@ class Planner:
             FileNotFoundError: If there is no such file.
             ValueError: If it is none that a planner wrote, or damaged, or the scoring is another one.
         """
-        where, tensors, header = planner_files.load(path)
+        where, tensors, header = planner_files.load_planner(path)
         names = ("info_pixels", "max_views", "bound", "look", "max_bytes")
         try:
             found = cls(scoring=scoring, **{name: header[name] for name in names})
@@ -374,13 +374,13 @@ class Planner:
                 f"{where}: scoring must be that of the planner that was saved, is another one; give it to Planner.load"
             )
         cameras = lambda name, pixels=math.inf: [  # noqa: E731
-            planner_files.camera_of(where, one, pixels) for one in header[name]
+            planner_files.recorded_camera(where, one, pixels) for one in header[name]
         ]
         found._fit = OnlineFit.from_state(tensors, header["fit"], cameras("photographs"), where)
         if header["origin"] is not None:
-            found._own = planner_files.scene_of(where, tensors, header["origin"])
+            found._own = planner_files.recorded_scene(where, tensors, header["origin"])
         found._known, found._pool = (cameras(name, found.info_pixels) for name in ("known", "pool"))
-        found._here = None if header["here"] is None else planner_files.camera_of(where, header["here"])
+        found._here = None if header["here"] is None else planner_files.recorded_camera(where, header["here"])
         found._counted = header["counted"]
         costs = header["costs"]
         found._cost = _forgotten if isinstance(costs, bool) else costs
@@ -551,7 +551,7 @@ class _Duration:
     """How long something usually takes, as it was lately: a kernel that had to be compiled is not what is usual.
 
     Attributes:
-        seconds: Of the last times, the oldest first.
+        seconds: What it took the last times, the oldest first.
     """
 
     def __init__(self) -> None:

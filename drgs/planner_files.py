@@ -26,7 +26,15 @@ from drgs.guards.camera_checks import as_numpy
 from drgs.guards.inputs import check_path
 from drgs.guards.json_files import check_json, parse_json
 
-__all__ = ["ADVICE", "camera_of", "camera_record", "load", "save", "scene_of", "scene_record"]
+__all__ = [
+    "ADVICE",
+    "camera_record",
+    "load_planner",
+    "recorded_camera",
+    "recorded_scene",
+    "save_planner",
+    "scene_record",
+]
 
 ADVICE = "restore the file, or begin anew"
 _KIND = "planner"
@@ -66,7 +74,7 @@ _HEADER = {
 }
 
 
-def save(path: str | os.PathLike, tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> None:
+def save_planner(path: str | os.PathLike, tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> None:
     """Write a planner's file; what a killed process left half written beside it is removed.
 
     Args:
@@ -92,8 +100,8 @@ def save(path: str | os.PathLike, tensors: dict[str, torch.Tensor], header: dict
     save_state(path, tensors, {"kind": _KIND, **header, "digest": _digest(tensors, header)})
 
 
-def load(path: str | os.PathLike) -> tuple[Path, dict[str, torch.Tensor], dict[str, Any]]:
-    """The path, the tensors and the header of `save`.
+def load_planner(path: str | os.PathLike) -> tuple[Path, dict[str, torch.Tensor], dict[str, Any]]:
+    """The path, the tensors and the header of `save_planner`.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -122,13 +130,13 @@ def camera_record(camera: Camera) -> dict[str, Any]:
     }
 
 
-def camera_of(where: Path, record: dict[str, Any], pixels: float = math.inf) -> Camera:
-    """The camera of a record that `load` has looked at.
+def recorded_camera(where: Path, record: dict[str, Any], pixels: float = math.inf) -> Camera:
+    """The camera of a record that `load_planner` has looked at.
 
     Args:
         where: The file, for messages.
         record: What `camera_record` made.
-        pixels: Of its image at most.
+        pixels: Number of pixels that its image may have.
     Raises:
         ValueError: If there is no such camera.
     """
@@ -152,7 +160,7 @@ def scene_record(scene: Gaussians | None) -> tuple[dict[str, torch.Tensor], list
     return {f"scene.{name}": x for name, x in scene.parameters().items()}, np.asarray(scene.origin).tolist()
 
 
-def scene_of(where: Path, tensors: Mapping[str, torch.Tensor], origin: list[float]) -> Gaussians:
+def recorded_scene(where: Path, tensors: Mapping[str, torch.Tensor], origin: list[float]) -> Gaussians:
     """The inverse of `scene_record`.
 
     Raises:
