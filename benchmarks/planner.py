@@ -221,25 +221,7 @@ def tables(rows: list[dict]) -> str:
             parts.append(
                 markdown_table(["bound", "views asked", "seconds", "Kendall's tau", "what the best lacks"], lines)
             )
-        parts += memory_table([row for row in mine if row["what"] == "memory"])
     return "\n\n".join(parts)
-
-
-def memory_table(rows: list[dict]) -> list[str]:
-    """What the process held, at every fiftieth photograph; nothing where that was not measured."""
-    if not rows:
-        return []
-    lines = [
-        [str(row["number"] + 1), *(f"{row[k] / 1e6:.0f}" for k in ("resident", "memory", "used", "free", "kernels"))]
-        for row in rows
-        if row["number"] % 50 == 49
-    ]
-    told = (
-        f"Memory after a number of photographs, MB, one more run of the same, {rows[0]['date']}, commit "
-        f"{rows[0]['commit'][:7]}: pages now and at most, allocated and free in them, code of kernels."
-    )
-    heads = ["photographs", "pages", "at most", "allocated", "free", "kernels"]
-    return [paragraph(told), markdown_table(heads, lines)]
 
 
 def main() -> None:
