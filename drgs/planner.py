@@ -7,6 +7,8 @@
     plan = planner.next()
     plan.picks[0].camera, plan.changed         # where to go; how far what was known has changed since
 
+    planner.save("planner.safetensors")        # and after a crash: planner = drgs.Planner.load(...)
+
 What lasts from call to call: the model, what each view tells about it, and the candidates. What a view tells is asked
 again once what it sees has changed by more than a bound (`drgs.information.drift`), so that a new photograph costs what
 is new. An answer within a time budget goes by what is known by then, and says how much that is.
@@ -20,15 +22,18 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import os
 import statistics
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
 
+from drgs import planner_files, runtime
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
 from drgs.fitting.config import FitConfig
@@ -36,7 +41,7 @@ from drgs.fitting.online import OnlineFit
 from drgs.gain import Information
 from drgs.guards.arguments import ArgumentError, kind_of, must_be
 from drgs.guards.inputs import camera_list
-from drgs.information.drift import DriftCache, Unanswered
+from drgs.information.drift import DriftCache, Unanswered, named_by
 from drgs.information.pool import Pick, Pool, Selection
 from drgs.information.refining import Refine
 from drgs.policies.informed import ask_views
@@ -115,6 +120,7 @@ class Planner:
         max_views: Photographs that are kept. Of one more, the one goes whose loss costs least coverage.
         info_pixels: Views are asked at no more pixels than these.
         look: What a photograph itself costs, in the unit of costs.
+        notes: What the caller gave to `save`, in a planner that was loaded.
     """
 
     def __init__(
@@ -150,6 +156,7 @@ class Planner:
         self.info_pixels = info_pixels
         self.max_views = max_views
         self.look = float(look)
+        self.notes: Any = None
         self._scoring = scoring or _FAST
         self._fit = OnlineFit(config or default_config())
         self._cache = DriftCache(bound, max_bytes)
@@ -297,6 +304,96 @@ class Planner:
             self._expect([*known, *self._pool, start])
             found = select(scene, [start], known, 1, scoring=self._scoring, cache=self._cache, refine=refine)
             return found.picks[0]
+
+    # -------------------------------------------------- kill and resume
+
+    def save(self, path: str | os.PathLike, notes: Any = None) -> None:
+        """Write all that the planner knows to one file, from which `load` goes on with the same answers.
+
+        A process that is killed meanwhile leaves the file as it was. One process alone may write a file.
+
+        Args:
+            path: The file, safetensors; a planner's own is replaced, any other refused.
+            notes: Whatever else the caller goes on from, JSON: it is as old as the rest of the file.
+        Raises:
+            ValueError: If there is something else of that name, or notes are no JSON.
+            OSError: If the file cannot be written.
+        """
+        records = lambda cameras: [planner_files.camera_record(camera) for camera in cameras]  # noqa: E731
+        with self._asking, self._fitting:
+            fit, fit_header, photographs = self._fit.state()
+            told, cache_header, expected = self._cache.state()
+            own, origin = planner_files.scene_record(self._own)
+            costs = self._cost if self._cost is None or callable(self._cost) else [float(x) for x in self._cost]
+            header = {
+                "version": runtime.version(),
+                "info_pixels": self.info_pixels,
+                "max_views": self.max_views,
+                "look": self.look,
+                "bound": self._cache.bound,
+                "max_bytes": self._cache.max_bytes,
+                "counted": self._counted,
+                "known": records(self._known),
+                "here": None if self._here is None else planner_files.camera_record(self._here),
+                "pool": records(self._pool),
+                "costs": True if callable(costs) else costs,
+                "scoring": named_by(self._scoring) or "",
+                "asked_in": list(self._asked_in.seconds),
+                "answered_in": list(self._answered_in.seconds),
+                "origin": origin,
+                "fit": fit_header,
+                "photographs": records(photographs),
+                "cache": cache_header,
+                "expected": records(expected),
+                "notes": notes,
+            }
+        planner_files.save_planner(path, {**fit, **told, **own}, header)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike, *, scoring: Scoring | None = None) -> Planner:
+        """A planner that goes on from a file of `save`.
+
+        With one thread its answers have the bits that they would have had without the interruption, except that a
+        limit of time falls elsewhere. Costs that are a function are in no file: `next` needs another `scores` first.
+
+        Args:
+            path: The file.
+            scoring: That of the planner that was saved, where it was not the default.
+        Raises:
+            FileNotFoundError: If there is no such file.
+            ValueError: If it is none that a planner wrote, or damaged, or the scoring is another one.
+        """
+        where, tensors, header = planner_files.load_planner(path)
+        names = ("info_pixels", "max_views", "bound", "look", "max_bytes")
+        try:
+            found = cls(scoring=scoring, **{name: header[name] for name in names})
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from None
+        if header["scoring"] != (named_by(found._scoring) or ""):
+            raise ValueError(
+                f"{where}: scoring must be that of the planner that was saved, is another one; give it to Planner.load"
+            )
+        cameras = lambda name, pixels=math.inf: [  # noqa: E731
+            planner_files.recorded_camera(where, one, pixels) for one in header[name]
+        ]
+        found._fit = OnlineFit.from_state(tensors, header["fit"], cameras("photographs"), where)
+        if header["origin"] is not None:
+            found._own = planner_files.recorded_scene(where, tensors, header["origin"])
+        found._known, found._pool = (cameras(name, found.info_pixels) for name in ("known", "pool"))
+        found._here = None if header["here"] is None else planner_files.recorded_camera(where, header["here"])
+        found._counted = header["counted"]
+        costs = header["costs"]
+        found._cost = _forgotten if isinstance(costs, bool) else costs
+        for name in ("asked_in", "answered_in"):
+            for seconds in header[name]:
+                getattr(found, f"_{name}").note(seconds)
+        expected = cameras("expected", found.info_pixels)
+        if header["version"] == runtime.version():  # another one may ask something else, which is asked anew
+            found._cache.restore(tensors, header["cache"], expected, str(where))
+        found.notes = header.get("notes")
+        if len(found._known) > found.max_views:  # saved by one thread while another had just taken a photograph
+            found._let_go()
+        return found
 
     # -------------------------------------------------- what is known
 
@@ -451,24 +548,28 @@ class Planner:
 
 
 class _Duration:
-    """How long something usually takes, as it was lately: a kernel that had to be compiled is not what is usual."""
+    """How long something usually takes, as it was lately: a kernel that had to be compiled is not what is usual.
+
+    Attributes:
+        seconds: What it took the last times, the oldest first.
+    """
 
     def __init__(self) -> None:
-        self._seconds: deque[float] = deque(maxlen=_LATELY)
+        self.seconds: deque[float] = deque(maxlen=_LATELY)
 
     def note(self, seconds: float) -> None:
         """It took so long."""
-        self._seconds.append(seconds)
+        self.seconds.append(seconds)
 
     @property
     def usual(self) -> float:
         """The median, seconds; 0 as long as nothing is known."""
-        return statistics.median(self._seconds) if self._seconds else 0.0
+        return statistics.median(self.seconds) if self.seconds else 0.0
 
 
-def _spread(queue: list[Camera], count: int) -> list[Camera | None]:
-    """A queue, filled up."""
-    return [*queue, *[None] * (count - len(queue))]
+def _forgotten(here: Camera, there: Camera) -> float:
+    """What is in the place of costs that were a function when a planner was saved."""
+    raise ValueError("Planner.next: costs were a function, which no file holds; give it to Planner.scores again")
 
 
 def _checked_image(image: np.ndarray | None, camera: Camera) -> np.ndarray:

@@ -2,6 +2,8 @@
 
     drgs scene room --views 84 --size 160x120 -o room
     python examples/plan_views.py room --photographs 20 --seconds 1
+    python examples/plan_views.py room --save flight.safetensors               a file before every photograph
+    python examples/plan_views.py room --save flight.safetensors --resume      goes on from it, also after a crash
 
 A robot stands at one of the data set's cameras. It may go to any other, at a cost of one for each meter, and to read
 the photograph of a place is to take it there. After each one the model is fitted for a while, and what it shows of the
@@ -51,17 +53,40 @@ def psnr(scene: drgs.Gaussians, views: Sequence[drgs.View], pixels: int) -> floa
     return float(np.mean(found))
 
 
-def fly(dataset: drgs.Dataset, policy: str, photographs: int, seconds: float, steps: int, seed: int) -> list[float]:
+def fly(
+    dataset: drgs.Dataset,
+    policy: str,
+    photographs: int,
+    seconds: float | None,
+    steps: int,
+    seed: int,
+    file: Path | None = None,
+    resume: bool = False,
+) -> list[float]:
     """PSNR of the held-out views after each photograph, dB."""
     draw = random.Random(seed)
     train, held_out = dataset.split()
     views = {view.name: view for view in train}
-    left = [dataclasses.replace(view.camera.undistorted(), name=view.name) for view in train]
+    places = {view.name: dataclasses.replace(view.camera.undistorted(), name=view.name) for view in train}
     print(f"{len(train)} places; the first photograph takes some seconds, for kernels are compiled", flush=True)
-    planner = drgs.Planner()
-    here = left[0 if policy == "order" else draw.randrange(len(left))]
-    curve = []
-    for number in range(photographs):
+    if resume:
+        assert file is not None, "--resume needs --save"
+        planner = drgs.Planner.load(file)
+        before = planner.notes  # what this program knows beside the planner
+        version, numbers, gauss = before["draw"]
+        draw.setstate((version, tuple(numbers), gauss))
+        curve, left, here = before["curve"], [places[name] for name in before["left"]], places[before["here"]]
+        begin = before["number"]
+    else:
+        planner = drgs.Planner()
+        curve, left, begin = [], list(places.values()), 0
+        here = left[0 if policy == "order" else draw.randrange(len(left))]
+    for number in range(begin, photographs):
+        if file is not None and number > begin:
+            names = [camera.name for camera in left]
+            planner.save(
+                file, {"number": number, "here": here.name, "left": names, "curve": curve, "draw": draw.getstate()}
+            )
         left = [camera for camera in left if camera.name != here.name]
         view = views[here.name]
         planner.observe(view.image(), here, depth_of(dataset, view))
@@ -94,8 +119,13 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=1.0, help="for an answer")
     parser.add_argument("--steps", type=int, default=40, help="of the fit, after each photograph")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--save", type=Path, help="a file that is written before each photograph but the first")
+    parser.add_argument("--resume", action="store_true", help="go on from that file; repeat the other options")
     args = parser.parse_args()
-    fly(drgs.load_data(args.data), args.policy, args.photographs, args.seconds, args.steps, args.seed)
+    if args.resume and (args.save is None or not args.save.is_file()):
+        parser.error("--resume must have the file of --save to go on from, there is none; leave --resume out")
+    how = args.policy, args.photographs, args.seconds, args.steps, args.seed
+    fly(drgs.load_data(args.data), *how, args.save, args.resume)
 
 
 if __name__ == "__main__":

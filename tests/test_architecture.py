@@ -59,7 +59,7 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"fitting"}, "the parts of a fit"),
     ({"metrics"}, "pictures against photographs"),
     ({"train", "evaluation"}, "fits, for users, and what they are worth"),
-    ({"planner"}, "where to look next, photograph by photograph, for a robot"),
+    ({"planner", "planner_files"}, "where to look next, photograph by photograph, for a robot"),
     ({"report"}, "what a fit looked like, as a page"),
     ({"capturing"}, "what photographs are worth, what there is time for, and where to stand next"),
     ({"sharing"}, "a scene as a page that is sent"),

@@ -413,8 +413,13 @@ def test_a_flight(tmp_path):
     write_still(folder)
     script = EXAMPLES / "plan_views.py"
     common = (folder, "--photographs", 4, "--steps", 5)
-    planned = run(script, *common, "--seconds", 0.2).splitlines()
-    ordered = run(script, *common, "--policy", "order").splitlines()
+    here = (EXAMPLES.parent,)  # of one checkout with the script
+    saved = "--seconds", 0.2, "--save", tmp_path / "flight.safetensors"
+    planned = run(script, *common, *saved, path=here).splitlines()
+    again = run(script, *common, *saved, "--resume", path=here).splitlines()
+    assert len(again) == 2, "the places, and what came after the last file"
+    assert again[-1].split(";")[0] == planned[-1].split(";")[0]
+    ordered = run(script, *common, "--policy", "order", path=here).splitlines()
     assert all(re.match(r"\d+ places; ", lines.pop(0)) for lines in (planned, ordered))
     for lines in (planned, ordered):
         names = [re.search(r": ([^,]+),", line)[1] for line in lines]

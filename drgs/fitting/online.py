@@ -7,7 +7,11 @@ shows. Where none has, the fit begins with random points where two cameras look,
 from __future__ import annotations
 
 import logging
+import re
 import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,10 +21,12 @@ from drgs.data import scene_extent
 from drgs.data.guesses import points_along_rays, subset
 from drgs.data.resizing import resize_area
 from drgs.ellipsoids import Gaussians
-from drgs.fitting.config import FitConfig
+from drgs.fitting.config import FitConfig, recorded_config
 from drgs.fitting.frames import Frame
+from drgs.fitting.records import check_checkpoint
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.trainer import Trainer
+from drgs.guards.json_files import check_json
 from drgs.integrator import render
 from drgs.sizes import at_most
 
@@ -33,6 +39,9 @@ _OPEN = 0.5  # opacity below which a pixel is open
 _BEHIND = 0.1  # relative: how far behind what a depth map shows surfaces are wrong
 _SHARE = 0.25  # of the room that is left which one photograph may fill
 _GUESSED = 10_000  # random points at most
+
+_STATE = {"config": dict, "rng": {"state": str, "inc": str, "has_uint32": int, "uinteger": int}, "fit": (None, dict)}
+_WHOLE = re.compile("[0-9a-f]{1,32}")  # 128 bits
 
 
 class OnlineFit:
@@ -101,6 +110,61 @@ class OnlineFit:
         assert self.trainer is not None, "nothing to show yet"
         g = self.trainer.gaussians()
         return g.replace(**{name: x.clone() for name, x in g.parameters().items()})
+
+    def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any], list[Camera]]:
+        """Tensors, which further steps leave alone, a header in JSON, and the cameras of the photographs."""
+        frames = self._waiting if self.trainer is None else self.trainer.frames
+        tensors = {f"photograph.{i}": frame.pixels for i, frame in enumerate(frames)}
+        rng: Any = self._rng.bit_generator.state  # whose numbers have 128 bits, which few readers of JSON keep
+        told = {name: f"{rng['state'][name]:x}" for name in ("state", "inc")}
+        told |= {name: rng[name] for name in ("has_uint32", "uinteger")}
+        fit = None
+        if self.trainer is not None:
+            more, fit = self.trainer.state()
+            tensors |= {f"fit.{name}": x.clone() for name, x in more.items()}
+            fit |= {"point_source": "photographs"}
+        return tensors, {"config": self.config.to_json(), "rng": told, "fit": fit}, [one.camera for one in frames]
+
+    @classmethod
+    def from_state(
+        cls, tensors: Mapping[str, torch.Tensor], header: dict, cameras: Sequence[Camera], where: Path
+    ) -> OnlineFit:
+        """The inverse of `state`.
+
+        Raises:
+            ValueError: If it is no such state, or damaged.
+        """
+        advice = "restore the file, or begin anew"
+        check_json(str(where), header, _STATE, advice)
+        for name in ("state", "inc"):
+            if not _WHOLE.fullmatch(header["rng"][name]):
+                raise ValueError(f"{where}: rng.{name} must be a hexadecimal number of 128 bits, is none; {advice}")
+        if header["config"].get("selection") is not None:
+            raise ValueError(f"{where}: config must have no selection, got one; {advice}")
+        found = cls(recorded_config(header["config"]))
+        found._rng.bit_generator.state = {
+            "bit_generator": "PCG64",
+            "state": {name: int(header["rng"][name], 16) for name in ("state", "inc")},
+            "has_uint32": header["rng"]["has_uint32"],
+            "uinteger": header["rng"]["uinteger"],
+        }
+        frames = []
+        for i, camera in enumerate(cameras):
+            pixels = tensors.get(f"photograph.{i}")
+            shape = (camera.height, camera.width, 3)
+            if pixels is None or pixels.dtype != torch.uint8 or tuple(pixels.shape) != shape:
+                raise ValueError(f"{where}: photograph {i} must be 8 bits of shape {shape}, is not; {advice}")
+            frames.append(Frame(camera.name, camera, pixels))
+        if header["fit"] is None:
+            found._waiting = frames
+            return found
+        own = {name.removeprefix("fit."): x for name, x in tensors.items() if name.startswith("fit.")}
+        check_checkpoint(where, own, header["fit"])
+        config = recorded_config(header["fit"]["config"])  # whose steps may be more by now
+        if config.selection is not None:
+            raise ValueError(f"{where}: config must have no selection, got one; {advice}")
+        found.trainer = Trainer.from_state(config, frames, own, header["fit"], str(where))
+        return found
 
     def _begin(self, points: np.ndarray, colors: np.ndarray, dense: bool) -> int:
         if not len(points):

@@ -18,9 +18,11 @@ change is at most `bound`; the default was measured (docs/planner.md).
 from __future__ import annotations
 
 import dataclasses
+import functools
+import inspect
 import math
-from collections.abc import Hashable, Iterable
-from typing import cast
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -28,13 +30,16 @@ import torch
 from drgs.cameras import Camera
 from drgs.ellipsoids import Y_00, Gaussians, Scene
 from drgs.gain import Information
-from drgs.information.cache import Cache, camera_key
+from drgs.guards.json_files import check_json
+from drgs.information.cache import Cache, camera_key, value_key
 from drgs.information.groups import GROUPS
 
-__all__ = ["DriftCache", "Shapes", "Unanswered"]
+__all__ = ["DriftCache", "Shapes", "Unanswered", "named_by"]
 
 _COLORS = "sh"  # whose information about base colors is the sum of w^2
 _OF_GAUSSIANS = (*GROUPS, "coverage")
+_STATE = {"answers": [{"question": str, "view": int, "shapes": int}], "sh": [int], "now": (None, int)}
+_ADVICE = "restore the file, or begin anew"
 
 
 class Unanswered(Exception):  # noqa: N818  # no error: the caller does without the view
@@ -47,6 +52,13 @@ class Unanswered(Exception):  # noqa: N818  # no error: the caller does without 
     def __init__(self, question: Hashable) -> None:
         super().__init__("nothing is known of a view")
         self.question = question
+
+
+@dataclasses.dataclass(frozen=True)
+class _Saved:
+    """A question that a file names, as long as it has not been asked again."""
+
+    name: str
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -133,7 +145,8 @@ class DriftCache(Cache):
         self._cameras: dict[Hashable, Camera] = {}
         self._shapes: dict[Hashable, Shapes] = {}  # key -> the Gaussians that an answer is of
         self._seen: dict[Hashable, torch.Tensor] = {}  # camera -> (N,) how much of its image each Gaussian makes up
-        self._now: tuple[Scene, Shapes] | None = None
+        self._now: tuple[Scene | None, Shapes] | None = None
+        self._unclaimed: set[str] = set()  # questions of a file that have not been asked again
         # Since then, to the Gaussians as they are now: id of shapes -> (N,); key -> of its view.
         self._changes: dict[int, torch.Tensor] = {}
         self._views_changes: dict[Hashable, float] = {}
@@ -142,7 +155,7 @@ class DriftCache(Cache):
         """Forget everything, but not which cameras are expected."""
         with self._lock:
             super().invalidate()
-            for known in (self._shapes, self._seen, self._changes, self._views_changes):
+            for known in (self._shapes, self._seen, self._changes, self._views_changes, self._unclaimed):
                 known.clear()
 
     def expect(self, cameras: Iterable[Camera]) -> None:
@@ -172,6 +185,7 @@ class DriftCache(Cache):
 
     def answered(self, question: Hashable, camera: Camera) -> bool:
         """Whether there is an answer of a view to a question, of whatever age."""
+        self._claim(question)
         asked = (question, camera_key(camera))
         return any(_parts(key) == asked for key in self._answers)
 
@@ -183,6 +197,7 @@ class DriftCache(Cache):
         """
         question, view = _parts(key)
         with self._lock:
+            self._claim(question)
             self._look_at(scene)
             if key not in self._answers:
                 if self.asks:
@@ -209,6 +224,93 @@ class DriftCache(Cache):
                 self._shapes[key] = self._shapes_now()
                 if _COLORS in answer:
                     self._seen[view] = answer[_COLORS][:, 0].sum(-1).float()
+
+    def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any], list[Camera]]:
+        """Tensors, a header in JSON, and the cameras that are expected.
+
+        Left out are answers of views with a mask, and to a question that `named_by` has no name for.
+        """
+        with self._lock:
+            views = {view: i for i, view in enumerate(self._cameras)}
+            shapes = list({id(one): one for one in self._shapes.values()}.values())
+            if self._now is not None and all(self._now[1] is not one for one in shapes):
+                shapes.append(self._now[1])
+            places = {id(one): i for i, one in enumerate(shapes)}
+            tensors = {f"seen.{views[view]}": x for view, x in self._seen.items()}
+            for i, one in enumerate(shapes):
+                tensors |= {f"shapes.{i}.{name}": x for name, x in vars(one).items() if name != "sh"}
+            answers: list[dict[str, Any]] = []
+            for key, answer in self._answers.items():
+                question, view = _parts(key)
+                name = question.name if isinstance(question, _Saved) else named_by(question)
+                if name is None or key != (question, view, None):
+                    continue
+                tensors |= {f"answer.{len(answers)}.{group}": x for group, x in answer.items()}
+                answers.append({"question": name, "view": views[view], "shapes": places[id(self._shapes[key])]})
+            now = None if self._now is None else places[id(self._now[1])]
+            header = {"answers": answers, "sh": [one.sh for one in shapes], "now": now}
+            return tensors, header, list(self._cameras.values())
+
+    def restore(self, tensors: Mapping[str, torch.Tensor], header: dict, cameras: Sequence[Camera], where: str) -> None:
+        """Go on from a `state`. Once a question is asked that none of its answers is to, the others are forgotten.
+
+        Raises:
+            ValueError: If it is no such state, or damaged.
+        """
+        check_json(where, header, _STATE, _ADVICE)
+        shapes = [_shapes_of(tensors, i, sh, where) for i, sh in enumerate(header["sh"])]
+        now = header["now"]
+        places = [row["shapes"] for row in header["answers"]] + ([] if now is None else [now])
+        if not all(0 <= i < len(shapes) for i in places) or (now is None and shapes):
+            raise ValueError(f"{where}: answers must be of {len(shapes)} states of the Gaussians, are not; {_ADVICE}")
+        most = 0 if now is None else len(shapes[now])
+        with self._lock:
+            self.invalidate()
+            self.expect(cameras)
+            views = [camera_key(camera) for camera in cameras]
+            self._now = None if now is None else (None, shapes[now])
+            groups: dict[int, dict[str, torch.Tensor]] = {}
+            for name, x in tensors.items():
+                kind, _, rest = name.partition(".")
+                number, _, group = rest.partition(".")
+                if kind == "answer" and number.isdecimal():
+                    groups.setdefault(int(number), {})[group] = x
+            for i, row in enumerate(header["answers"]):
+                of, answer = shapes[row["shapes"]], groups.get(i)
+                if not 0 <= row["view"] < len(views) or not answer or len(of) > most:
+                    raise ValueError(f"{where}: answer {i} must be of a view and of Gaussians, is not; {_ADVICE}")
+                bad = [k for k, x in answer.items() if not x.ndim or k in _OF_GAUSSIANS and len(x) != len(of)]
+                if bad:
+                    raise ValueError(f"{where}: answer {i}: {bad[0]} must be of {len(of)} Gaussians, is not; {_ADVICE}")
+                key = _Saved(row["question"]), views[row["view"]], None
+                self._store(key, answer)
+                if key in self._answers:
+                    self._shapes[key] = of
+                    self._unclaimed.add(row["question"])
+                    seen = tensors.get(f"seen.{row['view']}")
+                    if seen is not None and seen.ndim == 1 and len(seen) <= most:
+                        self._seen[views[row["view"]]] = seen
+
+    def _claim(self, question: Hashable) -> None:
+        """Answers of a file that are to this question are found under it from now on."""
+        if not self._unclaimed:
+            return
+        with self._lock:
+            name = named_by(question)
+            if name not in self._unclaimed:
+                if all(_parts(key)[0] != question for key in self._answers):  # what is asked has changed
+                    for key in [key for key in self._answers if isinstance(_parts(key)[0], _Saved)]:
+                        self._forget(key)
+                    self._unclaimed.clear()
+                return
+            self._unclaimed.discard(name)
+            for key in list(self._answers):  # in their order, which is that of their use
+                answer, before = self._answers.pop(key), key
+                if _parts(key)[0] == _Saved(name):
+                    key = question, *cast("tuple[Hashable, Hashable, Hashable]", key)[1:]
+                    self._shapes[key] = self._shapes.pop(before)
+                self._answers[key] = answer
+            self._views_changes.clear()
 
     def _look_at(self, scene: Scene) -> None:
         """A scene that has changed is compared with what answers are of."""
@@ -281,6 +383,49 @@ def _parts(key: Hashable) -> tuple[Hashable, Hashable]:
     """What was asked, and the view's camera, of a key as `ViewQuestion` makes them."""
     question, view, _ = cast("tuple[Hashable, Hashable, Hashable]", key)
     return question, view
+
+
+def named_by(x: Any) -> str | None:
+    """A name that equal values have in every process, for a file; None where there is none, as of a lambda."""
+    if x is None or isinstance(x, str | int | float):
+        return repr(x)
+    if isinstance(x, torch.Tensor | np.ndarray):
+        shape, kind, digest = cast("tuple[Any, str, bytes]", value_key(x))
+        return f"array({shape}, {kind}, {digest.hex()})"
+    parts: dict[str, Any]
+    if inspect.isfunction(x) or inspect.isclass(x):
+        name = f"{x.__module__}.{x.__qualname__}"
+        return None if "<" in name else name
+    if isinstance(x, functools.partial):
+        parts = {"func": x.func, "args": x.args, **x.keywords}
+    elif dataclasses.is_dataclass(x):
+        parts = {field.name: getattr(x, field.name) for field in dataclasses.fields(x)}
+    elif isinstance(x, Mapping):
+        parts = {repr(key): x[key] for key in sorted(x, key=repr)}
+    elif isinstance(x, tuple | list):
+        parts = {str(i): one for i, one in enumerate(x)}
+    else:
+        return None
+    names = {key: named_by(one) for key, one in parts.items()}
+    if None in names.values():
+        return None
+    return f"{type(x).__qualname__}({', '.join(f'{key}={name}' for key, name in names.items())})"
+
+
+def _shapes_of(tensors: Mapping[str, torch.Tensor], number: int, sh: int, where: str) -> Shapes:
+    """The shapes of that number in a file."""
+    kinds = {"means": 3, "log_scales": 3, "quats": 4, "opacities": 0, "colors": 3}
+    found = {name: tensors.get(f"shapes.{number}.{name}") for name in kinds}
+    means = found["means"]
+    count = 0 if means is None or not means.ndim else len(means)
+    parts: dict[str, torch.Tensor] = {}
+    for name, width in kinds.items():
+        x, dtype = found[name], torch.float64 if name == "means" else torch.float32
+        shape = (count, width) if width else (count,)
+        if x is None or x.dtype != dtype or tuple(x.shape) != shape:
+            raise ValueError(f"{where}: {name} of shapes {number} must be {dtype} of shape {shape}, is not; {_ADVICE}")
+        parts[name] = x
+    return Shapes(**parts, sh=sh)
 
 
 def _inside(camera: Camera, points: torch.Tensor) -> torch.Tensor:
