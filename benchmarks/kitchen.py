@@ -4,8 +4,8 @@
     python benchmarks/kitchen.py --page [--merge ROWS.jsonl ...]               the page
 
 The page is two tables of docs/dynamic.md, docs/data/moving-units.csv (every fit of the first) and
-moving-differences.csv. The rows of the second, benchmarks/kitchens.jsonl, are of six kitchens by color alone, with 1,500
-steps (max_steps = 1500 and semantics = "ignore" in fit.toml):
+moving-differences.csv. The rows of the second, benchmarks/kitchens.jsonl, are of six kitchens by color alone, with
+1,500 steps (max_steps = 1500 and semantics = "ignore" in fit.toml):
 
     drgs reproduce dynamic --protocol blind --seeds 6 --config fit.toml --policy uniform --policy farthest \
         --policy "joint+backdrop, v_opt" -o OUT --no-figures

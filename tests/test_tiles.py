@@ -195,20 +195,20 @@ def test_lists_of_other_lengths_need_no_other_kernel(rng, preset):
     """A kernel that knew how long the lists are would be compiled, and kept, for every picture of a fit."""
     settings = RenderSettings.preset(preset)
     g = gaussians(rng, 40, 1).detach()
-    cameras = [camera(rng, (37, 21)) for _ in range(4)]
+    cameras = [camera(rng, (37, 21)) for _ in range(16)]
     lengths = {_scene(g, cam, settings)[1].pairs for cam in cameras}
-    assert len(lengths) > 2
+    assert len(lengths) > 10
 
-    def kernels():
-        """Of all pictures, in order, without repeats."""
+    def kernels(cam):
+        """Of a picture."""
         dr.kernel_history_clear()
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-            yield from ({row["hash"] for row in _drawn(cam)} for cam in cameras)
+            render(g, cam, settings)
+            return {row["hash"] for row in dr.kernel_history() if row["type"] == dr.KernelType.JIT}
 
-    def _drawn(cam):
-        render(g, cam, settings)
-        return [row for row in dr.kernel_history() if row["type"] == dr.KernelType.JIT]
-
-    first, *others = kernels()
+    kernels(cameras[0])  # what tests before this one have left to be evaluated is no picture's
+    first = kernels(cameras[0])
     assert first
-    assert all(one == first for one in others)
+    # Dr.Jit may put the same operations in another order, which is another kernel; it does so now and then.
+    others = set().union(*map(kernels, cameras)) - first
+    assert len(others) < len(lengths) // 2
