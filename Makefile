@@ -2,6 +2,7 @@
 # make test      environment, then the tests
 # make numerics  the tests of images, gradients, information and extremes once more, compiled for other processors
 # make browser   Chromium by apt, for tests of the report and the viewer that are skipped without one
+# make cuda-check  on a machine with an NVIDIA card: suite, stress, gsplat, times, in one file to send back
 # make docs      environment, then the documentation as a site: out/site/index.html
 #
 # PYTHON      interpreter for the environment, >= 3.11                     make PYTHON=python3.12 setup
@@ -20,7 +21,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.drgs-installed
 
-.PHONY: setup demo test numerics browser smoke docs lint llvm clean
+.PHONY: setup demo test numerics cuda-check browser smoke docs lint llvm clean
 .DEFAULT_GOAL := setup
 
 setup: $(STAMP) llvm
@@ -37,6 +38,10 @@ numerics: setup
 	  echo "numerics compiled for $$target"; \
 	  DRGS_LLVM_TARGET=$$target $(BIN)/python -m pytest $(PYTEST_FLAGS) $(NUMERICS:%=tests/test_%.py); \
 	done
+
+# gsplat compiles its kernels when they are first called, which takes minutes.
+cuda-check: setup
+	$(BIN)/python benchmarks/cuda/check.py -o out/cuda-check.json
 
 browser:
 	command -v chromium || command -v google-chrome || { apt-get update && apt-get install -y --no-install-recommends chromium; }

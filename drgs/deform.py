@@ -161,7 +161,7 @@ class DeformationField(torch.nn.Module):
     ) -> Deltas:
         """`forward` of a field with these weights, named as in `named_parameters`; from any number of threads."""
         planes = [weights[f"grid.{k}"] for k in range(len(self.grid))]
-        return _deltas(weights, features(planes, self._places(means, origin), self._moment(time)))
+        return _deltas(weights, features(planes, self._places(means, origin), self._moment(time, means.device)))
 
     def squared_slopes(
         self, means: torch.Tensor, time: float, slopes: Deltas, origin: ArrayLike | None = None
@@ -180,7 +180,7 @@ class DeformationField(torch.nn.Module):
         planes = {name: x for name, x in weights.items() if name.startswith("grid.")}
         mlp = {name: x.requires_grad_() for name, x in weights.items() if name not in planes}
         with torch.no_grad():  # which nodes are read, and of which weights, is the derivative by the planes
-            corners = corners_of(list(planes.values()), self._places(means, origin), self._moment(time))
+            corners = corners_of(list(planes.values()), self._places(means, origin), self._moment(time, means.device))
             found = [own.read(plane) for own, plane in zip(corners, planes.values(), strict=True)]
         leaves = [*mlp.values(), *(x.requires_grad_() for x in found)]
         with torch.enable_grad():
@@ -196,11 +196,11 @@ class DeformationField(torch.nn.Module):
 
     def _places(self, means: torch.Tensor, origin: ArrayLike | None) -> torch.Tensor:
         """Means as parts of the way from the lower to the upper bound: float64 differences of what is far from 0."""
-        low, high = self.grid.bounds
+        low, high = self.grid.bounds.to(means.device)  # a call on a card moves parameters there, and no buffers
         start = low if origin is None else low - torch.as_tensor(np.asarray(origin, np.float64), device=low.device)
         return (means - start.to(means.dtype)) / (high - low).to(means.dtype)
 
-    def _moment(self, time: float | torch.Tensor) -> torch.Tensor:
+    def _moment(self, time: float | torch.Tensor, device: torch.device) -> torch.Tensor:
         """The time as a part of the span."""
         first, last = (float(x) for x in self.grid.span)
         value = float(time.detach() if isinstance(time, torch.Tensor) else time)  # a check
@@ -211,7 +211,8 @@ class DeformationField(torch.nn.Module):
                 "for a time in it"
             )
         given = time if isinstance(time, torch.Tensor) else torch.tensor(value, dtype=torch.float64)
-        return (given.to(self.grid.span) - first) / ((last - first) or math.inf)  # of one time there is no other
+        moment = given.to(device, self.grid.span.dtype)
+        return (moment - first) / ((last - first) or math.inf)  # of one time there is no other
 
 
 def _mlp(config: FieldConfig) -> torch.nn.ModuleDict:
@@ -337,7 +338,7 @@ class DynamicGaussians:
         fields = dict(parameters)
         phi = {name.removeprefix(PHI): fields.pop(name) for name in parameters if name.startswith(PHI)}
         motion = fields.pop("motion", None)
-        lives = None if self.lives is None else Lives.of(fields, self.lives.births)
+        lives = None if self.lives is None else Lives.of(fields, self.lives.births.to(fields["means"].device))
         fields = {name: x for name, x in fields.items() if name not in LIVES}
         means = fields["means"]
         index = None

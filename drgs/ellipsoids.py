@@ -326,7 +326,7 @@ def ellipsoids_shape(gaussians: Gaussians, extent: float = 3.0) -> dict:
     mi = runtime.mitsuba()
     g = gaussians.detach()  # Mitsuba takes values; gradients of its scene parameters are its own
     quats = torch.nn.functional.normalize(g.quats.double(), dim=1)[:, [1, 2, 3, 0]]
-    means = g.means.double() + torch.from_numpy(np.asarray(g.origin, np.float64))
+    means = g.means.double().cpu() + torch.from_numpy(np.asarray(g.origin, np.float64))
     arrays = {
         "centers": means,
         "scales": g.scales,

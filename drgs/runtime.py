@@ -41,6 +41,7 @@ __all__ = [
     "backend",
     "cuda_status",
     "dr_types",
+    "exactly",
     "info",
     "mitsuba",
     "optix_status",
@@ -373,6 +374,25 @@ def optix_status() -> tuple[bool, str | None]:
     except OSError:
         return False, f"{name} was not found (containers: NVIDIA_DRIVER_CAPABILITIES=all)"
     return True, None
+
+
+def exactly(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Lets a function that computes in float64 do so on a card, too.
+
+    There Dr.Jit takes reciprocals and reciprocal roots of float64 by `rcp.approx.ftz.f64`, which reads and returns 20
+    bits of the mantissa: worse than float32. Without `FastMath` they are rounded to nearest. LLVM has no such function.
+    """
+
+    @functools.wraps(function)
+    def rounded(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        if backend().name != "cuda":
+            return function(*args, **kwargs)
+        import drjit as dr
+
+        with dr.scoped_set_flag(dr.JitFlag.FastMath, False):
+            return function(*args, **kwargs)
+
+    return rounded
 
 
 def version() -> str:

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import drjit as dr
 
+from drgs import runtime
 from drgs.ellipsoids import Y_00
 from drgs.tracing.arrays import Float, Lib, Mask, UInt32
 from drgs.tracing.derivatives import if_any_hit
@@ -33,6 +34,7 @@ _COLOR = 1
 _SHAPE = 10
 
 
+@runtime.exactly
 def extras(
     lib: Lib,
     response: Response,

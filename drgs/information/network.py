@@ -119,7 +119,7 @@ def network(
         with own_errors():
             for part in _ESTIMATORS[estimate, mode](view, groups, probes, torch.Generator().manual_seed(seed)):
                 for name, x in part.items():
-                    total[name] += x
+                    total[name] += x.cpu()  # where the field's parameters live is the caller's
     return {name: x / probes for name, x in total.items()}
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import drjit as dr
 import torch
 
+from drgs import runtime
 from drgs.information.groups import GROUPS, Information
 from drgs.information.jacobian import GEOMETRY, Blocks, Diagonal, Rows, Together, Variance, extras
 from drgs.tracing.arrays import Float
@@ -132,6 +133,7 @@ class Replay:
         )
         dr.eval(self.extras)
 
+    @runtime.exactly
     def _colors(self, p: dict) -> tuple[list[Float], list[Float], list[list[Float]] | None]:
         """Per channel where the color is not clamped, the SH basis, and dc/dmu (None for degree 0)."""
         lib, K = self.lib, self.call.coefficients

@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 import drjit as dr
 
+from drgs import runtime
 from drgs.settings import RenderSettings
 from drgs.tracing.arrays import Float, Lib, Mask
 from drgs.tracing.lens_rays import LensRays, on_side
@@ -26,6 +27,7 @@ Cull = Callable[[Activated], tuple[list[Float], Mask]]
 """Bounds x0, y0, x1, y1 in pixels that Gaussians are seen within, and which of them are there."""
 
 
+@runtime.exactly
 def project_screen(
     lib: Lib,
     p: dict,
@@ -113,6 +115,7 @@ def _screen(lib: Lib, c: list[Float], pinhole: list[Float], width: int, height: 
     return Screen(pinhole, width, height, ax, ay, lens)
 
 
+@runtime.exactly
 def project_world(
     lib: Lib,
     p: dict,
