@@ -98,6 +98,7 @@ class DrgsIntegrator(mi.ad.integrators.common.RBIntegrator):  # type: ignore[nam
         return f"DrgsIntegrator[{self.settings}]"
 
 
+@runtime.exactly
 def _camera_axes(lib: Lib, pose: Any, origins: list[Float]) -> list[list[Float]]:
     """Rows of w2c: of the sensor (whose x and y point the other way), or at the first ray's origin in world axes."""
     # Float64, as a pose of `Call` is: what is projected with it cancels in float32 far from the origin.

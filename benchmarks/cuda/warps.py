@@ -171,6 +171,8 @@ def main() -> None:
     for case, layouts in found.items():
         first = next(iter(layouts.values()))
         for layout, x in layouts.items():
+            if layout.startswith("16") and not layout.endswith("4 pixels a lane"):
+                continue
             share = f"{x['slots'] / first['slots']:.2f}x"
             lines.append(f"| {case} | {layout} | {share} | {x['busy']:.0%} | {x['turns'] / first['turns']:.2f}x |")
     print("\n".join(lines))
