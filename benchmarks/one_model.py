@@ -25,6 +25,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 from fits import fitted, psnr_by_renderer  # noqa: E402
+from studies import PAGE_DATA, table_lines, write_csv  # noqa: E402
 from where import UNITS, add_row, ran, read_rows  # noqa: E402
 
 from drgs.fitting.config import FitConfig  # noqa: E402
@@ -32,7 +33,7 @@ from drgs.fitting.frames import frames_for  # noqa: E402
 from drgs.fitting.renderers import ANY, RendererSchedule, renderers_to_measure  # noqa: E402
 from drgs.settings import PRESETS, RenderSettings  # noqa: E402
 from drgs.studies.statistics import Unit, estimate  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
+from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "one_model.jsonl"
 PAGES = dict.fromkeys(("behind", "longer"), ROOT / "docs" / "one-model.md")
@@ -148,6 +149,22 @@ def tables(found: list[dict]) -> str:
     return "\n".join(lines)
 
 
+def beside_specialists(found: list[dict]) -> str:
+    """Held-out PSNR of `any` by capture and renderer, and what that is behind the fit for this renderer alone."""
+    shown = [name for name in ANY if name != "inria"]  # of which there is a single seed
+    lines = []
+    for scene in dict.fromkeys(row["scene"] for row in found):
+        group = [row for row in found if (row["scene"], row["trained"]) == (scene, "any")]
+        cells = [f"{scene} ({'+'.join(str(len(row['psnr'][ANY[0]])) for row in group)})"]
+        for name in shown:
+            lags = [statistics.mean(x) for unit, x in _lags(found, "any", name).items() if unit[0] == scene]
+            mean = statistics.mean(statistics.mean(row["psnr"][name]) for row in group)
+            cells.append(f"{mean:.2f} ({statistics.mean(lags):+.2f})")
+        ratios = [row["over_fast"] for row in group if row["over_fast"]]
+        lines.append([*cells, f"{statistics.mean(ratios):.2f}"])
+    return markdown_table(["capture (held out)", *(f"`{name}`" for name in shown), "step / `fast`"], lines)
+
+
 def main() -> None:
     """The program."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -169,9 +186,10 @@ def main() -> None:
                     print(scene, trained, seed, means, flush=True)
     found = read_rows(ROWS)
     short = [row for row in found if row["max_steps"] == SIZE["max_steps"]]
-    for name, text in (("behind", behind(short)), ("longer", longer(found)), ("one_model", tables(short))):
+    for name, text in (("behind", behind(short)), ("longer", longer(found)), ("one_model", beside_specialists(short))):
         print(text)
         fill_between(PAGES[name], name, text)
+    write_csv(PAGE_DATA / "one-model.csv", table_lines(tables(short)))
 
 
 if __name__ == "__main__":

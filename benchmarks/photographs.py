@@ -4,10 +4,10 @@
 
 Every fit has the defaults of `drgs fit` but for its size, the one term that its row names, and no skybox if that is not
 its term; what is said of a term is a difference to the fit without, of the same scene, split and seed. Appends one row
-a fit to benchmarks/photographs.jsonl as it ends, leaves out what is there, then writes the tables of docs/real-data.md,
-and that of skyboxes, in each renderer, of docs/one-model.md. Scenes are captures by name, or folders, as `drgs sfm`
-makes one of `watch` and `drgs scene capture` the made one. Each seed holds out other views, but of data sets that have
-a split of their own. One thread.
+a fit to benchmarks/photographs.jsonl as it ends, leaves out what is there, then writes the table of docs/real-data.md,
+that of skyboxes, in each renderer, of docs/one-model.md, and docs/data/photographs.csv. Scenes are captures by name, or
+folders, as `drgs sfm` makes one of `watch` and `drgs scene capture` the made one. Each seed holds out other views, but
+of data sets that have a split of their own. One thread.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
+from studies import PAGE_DATA, table_lines, write_csv  # noqa: E402
 from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
 
 from drgs.data import load  # noqa: E402
@@ -35,8 +36,7 @@ from drgs.studies.tables import fill_between  # noqa: E402
 from drgs.train import fit  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "photographs.jsonl"
-PAGES = {name: ROOT / "docs" / "real-data.md" for name in ("terms", "photographs")}
-PAGES["skyboxes"] = ROOT / "docs" / "one-model.md"
+PAGES = {"terms": ROOT / "docs" / "real-data.md", "skyboxes": ROOT / "docs" / "one-model.md"}
 SCENES = ("office", "head", "banana", "fern", "statue")
 TERMS = ("", "exposure=points", "exposure=learned", "poses=refined", "transients=mask")
 SIZE = {"max_steps": 400, "max_pixels": 12_000, "max_gaussians": 8_000}
@@ -189,9 +189,10 @@ def main() -> None:
                     print(scene, term or "none", means, row["found"], f"{row['seconds']:.0f} s", flush=True)
     found = read_rows(ROWS)
     others = [row for row in found if not row["term"].startswith("skybox")]
-    for name, text in (("terms", summary(others)), ("photographs", table(others)), ("skyboxes", skyboxes(found))):
+    for name, text in (("terms", summary(others)), ("skyboxes", skyboxes(found))):
         print(text)
         fill_between(PAGES[name], name, text)
+    write_csv(PAGE_DATA / "photographs.csv", table_lines(table(others)))
 
 
 if __name__ == "__main__":

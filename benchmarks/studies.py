@@ -10,6 +10,7 @@ import argparse
 import csv
 import io
 import json
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -49,6 +50,7 @@ __all__ = [
     "read_rows",
     "stamp",
     "study_sheets",
+    "table_lines",
     "write_csv",
     "write_rows",
 ]
@@ -150,6 +152,33 @@ def csv_text(lines: Iterable[Sequence[str]]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(lines)
     return text.getvalue()
+
+
+def table_lines(text: str) -> list[list[str]]:
+    """A table of Markdown as lines of a data file; columns of `mean / worst` become two, an empty first cell is that
+    of the line above.
+    """
+    lines = [
+        [re.sub(r"(?<=\d),(?=\d{3}\b)", "", cell.strip().replace("`", "")) for cell in line[1:-1].split("|")]
+        for line in text.splitlines()
+    ]
+    heads, rows = lines[0], lines[2:]
+    pairs = [any(" / " in row[i] for row in rows) for i in range(len(heads))]
+    found = [[]]
+    for head, pair in zip(heads, pairs, strict=True):
+        left, cut, right = head.partition(" / ")
+        two = (
+            [left, f"{left.rpartition(',')[0]}, {right}"] if cut and "," in left else [f"{head} mean", f"{head} worst"]
+        )
+        found[0] += two if pair else [head]
+    for row in rows:
+        cells = []
+        for cell, pair in zip(row, pairs, strict=True):
+            left, _, right = cell.partition(" / ")
+            cells += [left, right] if pair else [cell]
+        cells[0] = cells[0] or found[-1][0]
+        found.append(cells)
+    return found
 
 
 def write_csv(path: Path, lines: Iterable[Sequence[str]]) -> None:
