@@ -2,11 +2,11 @@
 
     python benchmarks/coarse.py [--scenes fern statue] [--steps 150] [--trained fast] [--same] [--page]
 
-Appends one row a fit to benchmarks/coarse.jsonl as it ends, leaves out what is there, then writes the table of
-docs/one-model.md. Fits of a scene have the same number of steps, with 0, 1 and 2 downscales or those that are named;
-then those with more than 0 are made once more, with as many steps as take the time of the fit without, but not with
-`--same`. Photographs have their full size, of at most 200,000 pixels unless `--max-pixels` says less. Seconds are those
-that the process computed in its steps, whatever ran beside it. One thread.
+Appends one row a fit to benchmarks/coarse.jsonl as it ends, leaves out what is there, then writes docs/data/coarse.csv.
+Fits of a scene have the same number of steps, with 0, 1 and 2 downscales or those that are named; then those with more
+than 0 are made once more, with as many steps as take the time of the fit without, but not with `--same`. Photographs
+have their full size, of at most 200,000 pixels unless `--max-pixels` says less. Seconds are those that the process
+computed in its steps, whatever ran beside it. One thread.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 from fits import fitted, psnr_by_renderer  # noqa: E402
+from studies import PAGE_DATA, table_lines, write_csv  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
 from drgs.fitting.config import FitConfig  # noqa: E402
@@ -30,10 +31,8 @@ from drgs.fitting.frames import frames_for  # noqa: E402
 from drgs.fitting.renderers import own_preset  # noqa: E402
 from drgs.fitting.resolution import FULL  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "coarse.jsonl"
-PAGE = ROOT / "docs" / "one-model.md"
 SCENES = ("fern", "statue")
 SIZE = {"max_pixels": 200_000, "max_gaussians": 20_000}
 DOWNSCALES = (0, 1, 2)
@@ -141,7 +140,7 @@ def main() -> None:
             seconds_of(scene, n, round(args.steps * same[scene][0] / same[scene][n]))
     text = table(read_rows(ROWS))
     print(text)
-    fill_between(PAGE, "coarse", text)
+    write_csv(PAGE_DATA / "coarse.csv", table_lines(text))
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@
 Every fourth step also renders the Gaussians with `fast` and with `gsplat`, from a camera between those of two
 photographs that are near each other, and adds the L1 distance of the two images to the loss, times four times the
 weight: gradients reach both. Appends one row a fit to benchmarks/consistency.jsonl as it ends, leaves out what is
-there, then writes the table of docs/one-model.md. Scenes are captures by name, or folders. One thread.
+there, then writes docs/data/consistency.csv. Scenes are captures by name, or folders. One thread.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from fits import fitted, psnr_by_renderer  # noqa: E402
+from studies import PAGE_DATA, table_lines, write_csv  # noqa: E402
 from where import UNITS, add_row, ran, read_rows  # noqa: E402
 
 from drgs.cameras import Camera  # noqa: E402
@@ -36,10 +37,8 @@ from drgs.fitting.renderers import renderers_to_measure  # noqa: E402
 from drgs.integrator import Output, render  # noqa: E402
 from drgs.metrics import psnr  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "consistency.jsonl"
-PAGE = ROOT / "docs" / "one-model.md"
 SCENES = ("lego", "statue", "fern", "banana")
 SIZE = {"max_steps": 400, "max_pixels": 12_000, "max_gaussians": 8_000}
 KEY = ("scene", "weight", "seed", "offset", "max_steps", "max_pixels", "max_gaussians")
@@ -143,7 +142,7 @@ def main() -> None:
                     print(scene, weight, seed, means, f"alike {statistics.mean(row['alike']):.2f} dB", flush=True)
     text = table(read_rows(ROWS))
     print(text)
-    fill_between(PAGE, "consistency", text)
+    write_csv(PAGE_DATA / "consistency.csv", table_lines(text))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """What it costs to know what features say about the geometry, and how far the estimates of it are off.
 
-    python benchmarks/coupled.py RUN [--quick] [--print]     the table of docs/semantic.md, benchmarks/coupled.json
+    python benchmarks/coupled.py RUN [--quick] [--print]     benchmarks/coupled.json and what --page writes
+    python benchmarks/coupled.py --page                      the table of docs/semantic.md, docs/data/coupled.csv
 
 RUN is a run that was fitted with features. Times are CPU time of the process, which other programs on the machine
 change little, peers taking turns, medians; run it with DRGS_THREADS=1. Errors are against the estimate `exact`.
@@ -23,7 +24,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: tor
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from clocks import interleaved  # noqa: E402
-from studies import rank_correlation  # noqa: E402
+from studies import PAGE_DATA, rank_correlation, write_csv  # noqa: E402
 from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
@@ -35,11 +36,14 @@ from drgs.files import Run  # noqa: E402
 from drgs.fisher import SemanticMetric  # noqa: E402
 from drgs.fitting.records import load_run  # noqa: E402
 from drgs.gain import information_gain  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
+from drgs.studies.tables import fill_between, paragraph  # noqa: E402
 
 Preset = drgs.RenderSettings.preset
 GEOMETRY = ("means", "rotations", "log_scales", "logit_opacities")
 COUNTS = (1, 2, 4, 8, 16)
+SHOWN = (("collapsed", 1), ("principal", 4), ("principal", 8), ("principal", 16))
+"""Estimates of the page; the data file has all."""
+RESULTS = ROOT / "benchmarks" / "coupled.json"
 CRITERIA = ("eig", "logdet")
 
 
@@ -118,47 +122,60 @@ def report(r: dict) -> str:
     """What docs/semantic.md says."""
     e, fast, exact = r["errors"], r["fast"], r["exact"]
     lines = [
-        f"Made by `python benchmarks/coupled.py`, {r['machine']}, {r['date']}, commit {r['commit']}.",
-        f"Run `{r['run']}`: {r['gaussians']:,} Gaussians with {r['width']} feature channels, a decoder of rank "
-        f"{r['rank']}.",
-        f"CPU time of one view's diagonal in ms, `fast` at {r['size']['fast']}, `exact` at {r['size']['exact']},",
-        "in brackets its ratio to that of the colors. Errors against `exact`, `fast` at 80x60: of the entries of what",
-        f"features say about the geometry, and of the scores of {e['views']} views, two being known.",
+        paragraph(
+            f"`python benchmarks/coupled.py RUN`, {r['machine']}, {r['date']}, commit {r['commit']}; RUN is "
+            f"`{r['run']}`, {r['gaussians']:,} Gaussians with {r['width']} channels, a decoder of rank {r['rank']}; "
+            f"times are of `fast` at {r['size']['fast']} and `exact` at {r['size']['exact']}, errors against `exact` "
+            f"are of `fast` at 80x60 and the scores of {e['views']} views where two are known."
+        ),
         "",
-        "| estimate | `fast` | `exact` | entries: median, rms | `eig`: error, tau, regret "
-        "| `logdet`: error, tau, regret |",
-        "|---|---|---|---|---|---|",
-        f"| colors alone | {1e3 * fast['colors']:.0f} (1) | {1e3 * exact['colors']:.0f} (1) | | "
-        f"tau {e['tau of uncoupled']:.2f} (uncoupled) | |",
+        "| estimate | time, `fast` | time, `exact` | median error of an entry | `eig`: error, tau, regret |",
+        "|---|---|---|---|---|",
     ]
+    for estimate, K in SHOWN:
+        x = e[f"{estimate} {K}"]
+        cells = [f"{t[str(K)] / t['colors']:.2f}x" for t in (fast, exact)]
+        judged = f"{100 * x[2]:.2g} %, {x[3]:.2f}, {100 * x[4]:.2g} %"
+        lines.append(f"| `{estimate}`, {K} | {cells[0]} | {cells[1]} | {100 * x[0]:.2g} % | {judged} |")
+    cells = [f"{t['exact'] / t['colors']:.1f}x" for t in (fast, exact)]
+    lines.append(f"| `exact` | {cells[0]} | {cells[1]} | 0 | 0 |")
+    return "\n".join(lines)
+
+
+def sheet(r: dict) -> list[list[str]]:
+    """The data file: every estimate, one view's diagonal in milliseconds of the processor, and all errors."""
+    errors = [f"{of}_{what}" for of in ("eig", "logdet") for what in ("error", "tau", "regret")]
+    lines = [["estimate", "channels", "fast_ms", "exact_ms", "entries_median", "entries_rms", *errors]]
+    times = [f"{1e3 * r[preset]['colors']:.1f}" for preset in ("fast", "exact")]
+    uncoupled = f"{r['errors']['tau of uncoupled']:.3f}"
+    lines.append(["colors and uncoupled features", "0", *times, "", "", "", uncoupled, "", "", "", ""])
     for estimate in ("collapsed", "principal"):
         for K in COUNTS:
-            x = e[f"{estimate} {K}"]
-            cells = [f"{1e3 * t[str(K)]:.0f} ({t[str(K)] / t['colors']:.2f})" for t in (fast, exact)]
-            judged = [f"{100 * x[i]:.2g} %, {x[i + 1]:.2f}, {100 * x[i + 2]:.2g} %" for i in (2, 5)]
-            lines.append(
-                f"| `{estimate}`, {K} | {cells[0]} | {cells[1]} | {100 * x[0]:.2g} %, {100 * x[1]:.2g} % | "
-                f"{judged[0]} | {judged[1]} |"
-            )
-    cells = [f"{1e3 * t['exact']:.0f} ({t['exact'] / t['colors']:.1f})" for t in (fast, exact)]
-    blocks = [t["8, blocks"] / t["colors, blocks"] for t in (fast, exact)]
-    lines += [
-        f"| `exact` | {cells[0]} | {cells[1]} | 0 | 0 | 0 |",
-        "",
-        f"Blocks with 8 channels beside the colors take {blocks[0]:.2f} times those of the colors with `fast`, "
-        f"{blocks[1]:.2f} times with `exact`.",
-        f"Features make {100 * e['share of the trace']:.0f} % of the summed information about the geometry here.",
-        f"The best view's margin is {100 * e['margin']:.2g} % of its `eig`.",
-    ]
-    return "\n".join(lines)
+            times = [f"{1e3 * r[preset][str(K)]:.1f}" for preset in ("fast", "exact")]
+            lines.append([estimate, str(K), *times, *(f"{x:.3g}" for x in r["errors"][f"{estimate} {K}"])])
+    times = [f"{1e3 * r[preset]['exact']:.1f}" for preset in ("fast", "exact")]
+    lines.append(["exact", str(r["rank"]), *times, "0", "0", "0", "1", "0", "0", "1", "0"])
+    return lines
+
+
+def write_page(r: dict) -> None:
+    """The table and the data file."""
+    fill_between(ROOT / "docs" / "semantic.md", "coupled", report(r))
+    write_csv(PAGE_DATA / "coupled.csv", sheet(r))
 
 
 def main():
     parser = argparse.ArgumentParser()
-    parser.add_argument("run", type=Path, help="a run that was fitted with features")
+    parser.add_argument("run", type=Path, nargs="?", help="a run that was fitted with features")
+    parser.add_argument("--page", action="store_true", help="measure nothing, write what is in coupled.json")
     parser.add_argument("--quick", action="store_true", help="small and few: checks that the script runs")
     parser.add_argument("--print", action="store_true", help="do not touch docs/semantic.md")
     args = parser.parse_args()
+    if args.page:
+        write_page(json.loads(RESULTS.read_text()))
+        return
+    if args.run is None:
+        parser.error("needs RUN, a run folder, or --page")
     loaded = load_run(Run(args.run))
     if loaded.decoder is None or loaded.gaussians.features is None:
         sys.exit(f"{args.run}: must be a run with features, has none; fit a data set with teacher maps")
@@ -185,8 +202,8 @@ def main():
     text = report(result)
     print(text)
     if not (args.print or args.quick):
-        fill_between(ROOT / "docs" / "semantic.md", "coupled", text)
-        (ROOT / "benchmarks" / "coupled.json").write_text(json.dumps(result, indent=1) + "\n")
+        write_page(result)
+        RESULTS.write_text(json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":

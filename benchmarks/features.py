@@ -1,6 +1,7 @@
 """What feature channels cost: forward + backward of 0 to 512 channels beside the colors.
 
     python benchmarks/features.py [--quick] [--clock cpu]     prints, writes benchmarks/features.json, docs/semantic.md
+    python benchmarks/features.py --page                      the page alone, of what has been measured
 
 100,000 Gaussians, 320x240. Peers take turns in one process; what counts are the ratios to the colors alone. Three ways:
 products with the weights of a tile (drgs/tracing/weights.py), coupled to the geometry and not, and the traversals of 32
@@ -31,12 +32,15 @@ from clocks import in_turns  # noqa: E402
 from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
+from drgs.studies.tables import fill_between, paragraph  # noqa: E402
 from drgs.tracing import weights  # noqa: E402
 from drgs.tracing.tiles import TileTraversal  # noqa: E402
 
 Preset = drgs.RenderSettings.preset
 WIDTHS = (3, 16, 32, 64, 128, 512)
+SHOWN = (3, 16, 128, 512)  # on the page; features.json has all
+PAGE = ROOT / "docs" / "semantic.md"
+RESULTS = ROOT / "benchmarks" / "features.json"
 
 
 @contextlib.contextmanager
@@ -138,33 +142,29 @@ def growth(rows: list[dict], way: str) -> dict:
 
 def report(result: dict) -> str:
     """The table and what it says."""
+    told = f"""`python benchmarks/features.py`, {result["machine"]}, {result["date"]}, commit {result["commit"]}:
+        {result["gaussians"]:,} Gaussians, 320x240, forward and backward, over the time of the colors alone (medians of
+        {result["turns"]} interleaved turns, {result["clock"]} time)."""
     lines = [
-        f"Made by `python benchmarks/features.py` on {result['machine']}, {result['date']}, commit {result['commit']}:",
-        f"{result['gaussians']:,} Gaussians, 320x240, forward + backward, times that of the colors alone "
-        f"(medians of {result['turns']} interleaved turns, {result['clock']} time).",
+        paragraph(" ".join(told.split())),
         "",
         "| preset | channels | not coupled | coupled | coupled, by traversals |",
         "|---|---|---|---|---|",
     ]
-    for row in result["rows"]:
+    for row in (row for row in result["rows"] if row["width"] in SHOWN):
         r = row["ratios"]
         old = f"{r['traversals']:.1f}x" if "traversals" in r else ""
         cells = f"{r['not coupled']:.2f}x | {r['coupled']:.2f}x | {old}"
         lines.append(f"| `{row['preset']}` | {row['width']} | {cells} |")
     lines.append("")
-    for way, fit in result["growth"].items():
-        lines.append(
-            f"{way.capitalize()}, the cost of `fast` is {fit['at 0']:.1f} + {fit['per 100']:.2f} per 100 channels, "
-            f"within {100 * fit['error']:.0f} %."
-        )
-    lines += ["", "Weights held at once (the bound is 128 MiB, or what a single tile needs):", ""]
-    for preset, x in result["held"].items():
-        lines.append(
-            f"- `{preset}`: {x['bytes'] / 2**20:.0f} MiB in {x['blocks']} block(s), {100 * x['share']:.0f} % not 0."
-        )
+    costs = " and ".join(
+        f"{fit['at 0']:.1f} + {fit['per 100']:.2f} per 100 channels ({way}; within {100 * fit['error']:.0f} %)"
+        for way, fit in result["growth"].items()
+    )
     added = ", ".join(f"{int(x) / 2**20:.0f} MiB with {width} channels" for width, x in result["grown"].items())
-    lines += ["", "A coupled `fast` frame and its gradients add to a process that has the Gaussians and the kernels:"]
-    lines.append(f"{added}.")
+    told = f"""`fast` costs {costs}, times the colors. Other widths and what weights take are in
+        [features.json](../benchmarks/features.json). A coupled `fast` frame and its gradients add {added}."""
+    lines.append(paragraph(" ".join(told.split())))
     return "\n".join(lines)
 
 
@@ -173,7 +173,11 @@ def main():
     parser.add_argument("--quick", action="store_true", help="small and few: checks that the script runs")
     parser.add_argument("--clock", choices=("wall", "cpu"), default="wall", help="cpu: where others compute as well")
     parser.add_argument("--turns", type=int, default=7)
+    parser.add_argument("--page", action="store_true", help="measure nothing, write what is in features.json")
     args = parser.parse_args()
+    if args.page:
+        fill_between(PAGE, "features", report(json.loads(RESULTS.read_text())))
+        return
     clock = {"wall": time.perf_counter, "cpu": time.process_time}[args.clock]
     count, turns = (2000, 2) if args.quick else (100_000, args.turns)
     both = {"not coupled": (False,), "coupled": (True,)}
@@ -199,8 +203,8 @@ def main():
     text = report(result)
     print(text)
     if not args.quick:
-        fill_between(ROOT / "docs" / "semantic.md", "features", text)
-        (ROOT / "benchmarks" / "features.json").write_text(json.dumps(result, indent=1) + "\n")
+        fill_between(PAGE, "features", text)
+        RESULTS.write_text(json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":

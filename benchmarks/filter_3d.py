@@ -2,9 +2,9 @@
 
     python benchmarks/filter_3d.py [--scenes head ...] [--trained any gsplat] [--seeds 1] [--page]
 
-Appends one row a fit to benchmarks/filter_3d.jsonl as it ends, leaves out what is there, then writes the table of
-docs/one-model.md. The same held-out photographs are rendered at one, two and four times the width and height at which
-the others were fitted. Scenes are captures by name. One thread.
+Appends one row a fit to benchmarks/filter_3d.jsonl as it ends, leaves out what is there, then writes
+docs/data/filter-3d.csv. The same held-out photographs are rendered at one, two and four times the width and height at
+which the others were fitted. Scenes are captures by name. One thread.
 """
 
 from __future__ import annotations
@@ -22,16 +22,15 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 from fits import fitted, psnr_by_renderer  # noqa: E402
+from studies import PAGE_DATA, table_lines, write_csv  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.fitting.frames import frames_for  # noqa: E402
 from drgs.fitting.renderers import own_preset  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "filter_3d.jsonl"
-PAGE = ROOT / "docs" / "one-model.md"
 SCENES = ("banana", "fern", "statue", "head", "lego")
 PIXELS = {"lego": 10_000}  # whose photographs have 400x400; of others 12,000
 SIZE = {"max_steps": 400, "max_gaussians": 8_000}
@@ -69,7 +68,7 @@ def measured(scene: str, trained: str, filter_3d: str, seed: int) -> dict:
 
 def table(found: list[dict]) -> str:
     """Held-out PSNR without the filter and what the filter adds, on average, least and most."""
-    lines = ["| fitted for | size | " + " | ".join(f"`{name}`" for name in SEEN) + " |", "|---" * (2 + len(SEEN)) + "|"]
+    lines = ["| fitted for | size | seen with | PSNR without | filter adds | least | most |", "|---" * 7 + "|"]
     for trained in dict.fromkeys(row["trained"] for row in found):
         mine = {row["scene"]: {} for row in found if row["trained"] == trained}
         for row in found:
@@ -77,16 +76,15 @@ def table(found: list[dict]) -> str:
                 mine[row["scene"]].setdefault(row["filter"], []).append(row["psnr"])
         pairs = [uses for uses in mine.values() if len(uses) == 2]
         for scale in SCALES if pairs else ():
-            cells = []
             for name in SEEN:
                 off, on = (
                     [statistics.mean(statistics.mean(psnr[str(scale)][name]) for psnr in uses[use]) for uses in pairs]
                     for use in ("off", "on")
                 )
                 added = [y - x for x, y in zip(off, on, strict=True)]
-                span = f"{min(added):+.2f} to {max(added):+.2f}"
-                cells.append(f"{statistics.mean(off):.2f}, {statistics.mean(added):+.2f} ({span})")
-            lines.append(f"| {trained} | {scale}x | {' | '.join(cells)} |")
+                cells = [f"{statistics.mean(off):.2f}"]
+                cells += [f"{x:+.2f}" for x in (statistics.mean(added), min(added), max(added))]
+                lines.append(f"| {trained} | {scale}x | {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -109,7 +107,7 @@ def main() -> None:
                         print(scene, trained, use, seed, f"{row['seconds']:.0f} s", flush=True)
     text = table(read_rows(ROWS))
     print(text)
-    fill_between(PAGE, "filter_3d", text)
+    write_csv(PAGE_DATA / "filter-3d.csv", table_lines(text))
 
 
 if __name__ == "__main__":

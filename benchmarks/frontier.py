@@ -3,8 +3,8 @@
     python benchmarks/frontier.py [--scenes lego watch] [--steps 1600]
     python benchmarks/frontier.py --page
 
-Appends one row a fit to benchmarks/frontier.jsonl as it ends, leaves out what is there, then writes the table of
-docs/one-model.md. Size and views are those of benchmarks/one_model.py. One thread.
+Appends one row a fit to benchmarks/frontier.jsonl as it ends, leaves out what is there, then writes
+docs/data/frontier.csv. Size and views are those of benchmarks/one_model.py. One thread.
 """
 
 from __future__ import annotations
@@ -22,15 +22,14 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 from fits import fitted, psnr_by_renderer  # noqa: E402
+from studies import PAGE_DATA, table_lines, write_csv  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.fitting.frames import frames_for  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "frontier.jsonl"
-PAGE = ROOT / "docs" / "one-model.md"
 PAIR = ("fast", "gsplat")
 EIGHTHS = (0, 1, 2, 4, 6, 7, 8)  # of the steps that are rendered with `gsplat`
 SIZE = {"max_pixels": 12_000, "max_gaussians": 8_000}
@@ -49,7 +48,9 @@ def measured(scene: str, eighths: int, steps: int) -> dict:
 
 def table(found: list[dict]) -> str:
     """Mean held-out PSNR by share, and how far each is behind the fit for that renderer alone."""
-    lines = ["| capture | steps with `gsplat` | seen with `fast` | behind | seen with `gsplat` | behind |"]
+    lines = [
+        "| capture | steps with `gsplat` | seen with `fast` | behind there | seen with `gsplat` | behind in `gsplat` |"
+    ]
     lines += ["|---|---|---|---|---|---|"]
     means = {
         (row["scene"], row["eighths"]): {name: statistics.mean(row["psnr"][name]) for name in PAIR} for row in found
@@ -82,7 +83,7 @@ def main() -> None:
                 )
     text = table(read_rows(ROWS))
     print(text)
-    fill_between(PAGE, "frontier", text)
+    write_csv(PAGE_DATA / "frontier.csv", table_lines(text))
 
 
 if __name__ == "__main__":

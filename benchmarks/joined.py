@@ -3,9 +3,9 @@
     python benchmarks/joined.py [--scenes banana FOLDER ...] [--seeds 2] [--page]
 
 Each fit begins with three photographs and adds eight, one every 40 of 400 steps, for `fast` alone. Appends one row a
-fit to benchmarks/joined.jsonl as it ends, leaves out what is there, then writes the table of docs/one-model.md. Scenes
-are captures by name, or folders; `capture` is made by `drgs scene capture`, whose true gains are compared with those
-that were found. One thread.
+fit to benchmarks/joined.jsonl as it ends, leaves out what is there, then writes docs/data/joined.csv. Scenes are
+captures by name, or folders; `capture` is made by `drgs scene capture`, whose true gains are compared with those that
+were found. One thread.
 """
 
 from __future__ import annotations
@@ -25,16 +25,15 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 import numpy as np  # noqa: E402
+from studies import PAGE_DATA, table_lines, write_csv  # noqa: E402
 from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
 
 from drgs.data import load  # noqa: E402
 from drgs.fitting.config import FitConfig, SelectionConfig  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
 from drgs.train import fit  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "joined.jsonl"
-PAGE = ROOT / "docs" / "one-model.md"
 SCENES = ("banana",)
 SIZE = {"max_steps": 400, "max_pixels": 12_000, "max_gaussians": 8_000}
 # Name -> options of a fit.
@@ -159,7 +158,7 @@ def main() -> None:
                     print(scene, policy, term, seed, means, row["found"], f"{row['seconds']:.0f} s", flush=True)
     text = table(read_rows(ROWS))
     print(text)
-    fill_between(PAGE, "joined", text)
+    write_csv(PAGE_DATA / "joined.csv", table_lines(text))
 
 
 if __name__ == "__main__":

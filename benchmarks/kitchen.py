@@ -38,8 +38,8 @@ os.environ.setdefault("DRGS_THREADS", "1")
 
 import numpy as np
 import studies
-from policies import DIFFERENCES, Rows, difference
-from studies import ROOT
+from policies import Rows
+from studies import DIFFERENCE, ROOT, difference
 
 from drgs.studies import experiments
 from drgs.studies.cells import Study
@@ -157,7 +157,7 @@ def unit_lines(study: Study, rows: Rows) -> Iterator[list[str]]:
 
 def difference_lines(study: Study, rows: Rows) -> Iterator[list[str]]:
     """Differences within units of every pair."""
-    yield ["policy", "against", "metric", *DIFFERENCES]
+    yield ["policy", "against", "metric", *DIFFERENCE]
     for policy, other in pairs_of(study):
         for metric in study.metrics:
             yield from difference([policy, other, metric.key], metric, rows, policy, other)

@@ -3,10 +3,10 @@
     python benchmarks/lenses.py [--scenes street banana fisheye] [--seeds 2] [--page]
     python benchmarks/lenses.py --times
 
-Fits with and without --undistort, both seen on the held-out photographs as they were taken and on undistorted ones:
-one row a fit in benchmarks/lenses.jsonl, and the table of docs/real-data.md. `--times` measures a frame of the wolf
-through lenses and a rolling shutter, in turn in one process, and writes the other table. Scenes are captures by name,
-or folders; `fisheye` is made: photographs of 150 degrees, walked along Gaussians that are all around. One thread.
+Fits with and without --undistort, both seen on the held-out photographs as they were taken and on undistorted ones: one
+row a fit in benchmarks/lenses.jsonl, and docs/data/lenses.csv. `--times` measures a frame of the wolf through lenses
+and a rolling shutter, in turn in one process, and writes lens-times.csv beside it. Scenes are captures by name, or
+folders; `fisheye` is made: photographs of 150 degrees, walked along Gaussians that are all around. One thread.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from clocks import interleaved  # noqa: E402
 from fits import fitted, psnr_by_renderer  # noqa: E402
+from studies import PAGE_DATA, table_lines, write_csv  # noqa: E402
 from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
 
 import drgs  # noqa: E402
@@ -40,11 +41,9 @@ from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.fitting.frames import load_frames  # noqa: E402
 from drgs.fitting.lenses import lost_share  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "lenses.jsonl"
 TIMES = ROOT / "benchmarks" / "lenses.json"
-PAGE = ROOT / "docs" / "real-data.md"
 MADE = "fisheye"
 SCENES = ("street", "banana", MADE)
 SIZE = {"max_steps": 400, "max_pixels": 12_000, "max_gaussians": 8_000}
@@ -225,10 +224,10 @@ def main() -> None:
     made.cleanup()
     texts = {"lenses": table(read_rows(ROWS))}
     if TIMES.exists():
-        texts["lens_times"] = times_table(json.loads(TIMES.read_text()))
+        texts["lens-times"] = times_table(json.loads(TIMES.read_text()))
     for name, text in texts.items():
         print(text)
-        fill_between(PAGE, name, text)
+        write_csv(PAGE_DATA / f"{name}.csv", table_lines(text))
 
 
 if __name__ == "__main__":

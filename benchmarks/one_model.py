@@ -16,6 +16,7 @@ import argparse
 import os
 import statistics
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 os.environ.setdefault("DRGS_THREADS", "1")
@@ -25,6 +26,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 from fits import fitted, psnr_by_renderer  # noqa: E402
+from studies import PAGE_DATA, table_lines, write_csv  # noqa: E402
 from where import UNITS, add_row, ran, read_rows  # noqa: E402
 
 from drgs.fitting.config import FitConfig  # noqa: E402
@@ -32,11 +34,11 @@ from drgs.fitting.frames import frames_for  # noqa: E402
 from drgs.fitting.renderers import ANY, RendererSchedule, renderers_to_measure  # noqa: E402
 from drgs.settings import PRESETS, RenderSettings  # noqa: E402
 from drgs.studies.statistics import Unit, estimate  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
+from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
 
+SHOWN = tuple(name for name in ANY if name != "inria")  # on the pages; of `inria` there is one seed
 ROWS = ROOT / "benchmarks" / "one_model.jsonl"
-PAGES = dict.fromkeys(("behind", "longer"), ROOT / "docs" / "one-model.md")
-PAGES["one_model"] = ROOT / "docs" / "real-data.md"
+PAGES = {"behind": ROOT / "docs" / "one-model.md", "one_model": ROOT / "docs" / "real-data.md"}
 SCENES = ("head", "bonsai", "office", "lego", "banana", "fern", "statue")
 TUNED_ON = ("banana", "fern", "statue", "lego")
 SIZE = {"max_steps": 400, "max_pixels": 12_000, "max_gaussians": 8_000}
@@ -82,15 +84,20 @@ def _lags(found: list[dict], trained: str, name: str) -> dict[tuple, list[float]
     }
 
 
-def behind(found: list[dict]) -> str:
-    """How far fits are behind the one for each renderer alone, of the same capture, split and seed."""
+def behind(found: list[dict], seen: Sequence[str] = ANY) -> str:
+    """How far fits are behind the one for each renderer alone, of the same capture, split and seed.
+
+    Args:
+        found: Rows of one length.
+        seen: Renderers that they are seen with.
+    """
     lines = [
         "| trained with | seen with | behind, on average (95 %) | most, of a capture | most, of a view | captures |"
     ]
     lines += ["|---|---|---|---|---|---|"]
     reported = [row for row in found if row["scene"] not in TUNED_ON]
     for trained in ("any", "fast", "gsplat"):
-        for name in ANY:
+        for name in seen:
             lags: dict[Unit, list[float]] = {}
             if name != trained:
                 lags = {(unit[0], unit[1:], ()): views for unit, views in _lags(reported, trained, name).items()}
@@ -148,6 +155,21 @@ def tables(found: list[dict]) -> str:
     return "\n".join(lines)
 
 
+def beside_specialists(found: list[dict]) -> str:
+    """Held-out PSNR of `any` by capture and renderer, and what that is behind the fit for this renderer alone."""
+    lines = []
+    for scene in dict.fromkeys(row["scene"] for row in found):
+        group = [row for row in found if (row["scene"], row["trained"]) == (scene, "any")]
+        cells = [f"{scene} ({'+'.join(str(len(row['psnr'][ANY[0]])) for row in group)})"]
+        for name in SHOWN:
+            lags = [statistics.mean(x) for unit, x in _lags(found, "any", name).items() if unit[0] == scene]
+            mean = statistics.mean(statistics.mean(row["psnr"][name]) for row in group)
+            cells.append(f"{mean:.2f} ({statistics.mean(lags):+.2f})")
+        ratios = [row["over_fast"] for row in group if row["over_fast"]]
+        lines.append([*cells, f"{statistics.mean(ratios):.2f}"])
+    return markdown_table(["capture (held out)", *(f"`{name}`" for name in SHOWN), "step / `fast`"], lines)
+
+
 def main() -> None:
     """The program."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -169,9 +191,12 @@ def main() -> None:
                     print(scene, trained, seed, means, flush=True)
     found = read_rows(ROWS)
     short = [row for row in found if row["max_steps"] == SIZE["max_steps"]]
-    for name, text in (("behind", behind(short)), ("longer", longer(found)), ("one_model", tables(short))):
+    for name, text in (("behind", behind(short, SHOWN)), ("one_model", beside_specialists(short))):
         print(text)
         fill_between(PAGES[name], name, text)
+    write_csv(PAGE_DATA / "one-model.csv", table_lines(tables(short)))
+    write_csv(PAGE_DATA / "one-model-behind.csv", table_lines(behind(short)))
+    write_csv(PAGE_DATA / "one-model-steps.csv", table_lines(longer(found)))
 
 
 if __name__ == "__main__":

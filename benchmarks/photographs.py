@@ -4,10 +4,10 @@
 
 Every fit has the defaults of `drgs fit` but for its size, the one term that its row names, and no skybox if that is not
 its term; what is said of a term is a difference to the fit without, of the same scene, split and seed. Appends one row
-a fit to benchmarks/photographs.jsonl as it ends, leaves out what is there, then writes the tables of docs/real-data.md,
-and that of skyboxes, in each renderer, of docs/one-model.md. Scenes are captures by name, or folders, as `drgs sfm`
-makes one of `watch` and `drgs scene capture` the made one. Each seed holds out other views, but of data sets that have
-a split of their own. One thread.
+a fit to benchmarks/photographs.jsonl as it ends, leaves out what is there, then writes the table of docs/real-data.md,
+docs/data/photographs.csv and skyboxes.csv, which has every renderer. Scenes are captures by name, or folders, as `drgs
+sfm` makes one of `watch` and `drgs scene capture` the made one. Each seed holds out other views, but of data sets that
+have a split of their own. One thread.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
+from studies import PAGE_DATA, table_lines, write_csv  # noqa: E402
 from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
 
 from drgs.data import load  # noqa: E402
@@ -35,8 +36,7 @@ from drgs.studies.tables import fill_between  # noqa: E402
 from drgs.train import fit  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "photographs.jsonl"
-PAGES = {name: ROOT / "docs" / "real-data.md" for name in ("terms", "photographs")}
-PAGES["skyboxes"] = ROOT / "docs" / "one-model.md"
+PAGE = ROOT / "docs" / "real-data.md"
 SCENES = ("office", "head", "banana", "fern", "statue")
 TERMS = ("", "exposure=points", "exposure=learned", "poses=refined", "transients=mask")
 SIZE = {"max_steps": 400, "max_pixels": 12_000, "max_gaussians": 8_000}
@@ -131,22 +131,23 @@ def summary(found: list[dict]) -> str:
 
 def skyboxes(found: list[dict]) -> str:
     """What a skybox changes of held-out views in each of three renderers, against the fit without of the same unit."""
-    lines = ["| capture, seed | term | agree on what is far / show it | `exact` | `fast` | `gsplat` | seconds |"]
-    lines += ["|---|---|---|---|---|---|---|"]
+    heads = ["capture, seed", "term", "directions that agree on what is far", "pixels that show it"]
+    heads += [*(f"`{name}`" for name in RENDERERS), "seconds"]
+    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     plain = {_unit(row): row for row in found if not row["term"] and "renderers" in row}
     with_sky = [row for row in found if "skybox" in row["found"] and _unit(row) in plain]
     for unit in sorted({_unit(row) for row in with_sky}):
         base = plain[unit]
         cells = [f"{base['renderers'][x]['mean']:.2f} / {base['renderers'][x]['worst']:.2f}" for x in RENDERERS]
-        lines.append(f"| {unit[0]}, {unit[1]} | none | - | {' | '.join(cells)} | {base['seconds']:.0f} |")
+        lines.append(f"| {unit[0]}, {unit[1]} | none | | | {' | '.join(cells)} | {base['seconds']:.0f} |")
         for row in (row for row in with_sky if _unit(row) == unit):
             cells = [
                 " / ".join(f"{row['renderers'][x][key] - base['renderers'][x][key]:+.2f}" for key in ("mean", "worst"))
                 for x in RENDERERS
             ]
             sky = row["found"]["skybox"]
-            shown = f"{100 * sky['visible']:.0f} % of the pixels" if sky["gaussians"] else "none"
-            seen = f"{100 * sky['share']:.0f} % of directions / {shown}"
+            shown = f"{100 * sky['visible']:.0f} %" if sky["gaussians"] else "none"
+            seen = f"{100 * sky['share']:.0f} % | {shown}"
             lines.append(f"|  | {row['term']} | {seen} | {' | '.join(cells)} | {row['seconds']:.0f} |")
     return "\n".join(lines)
 
@@ -189,9 +190,10 @@ def main() -> None:
                     print(scene, term or "none", means, row["found"], f"{row['seconds']:.0f} s", flush=True)
     found = read_rows(ROWS)
     others = [row for row in found if not row["term"].startswith("skybox")]
-    for name, text in (("terms", summary(others)), ("photographs", table(others)), ("skyboxes", skyboxes(found))):
+    fill_between(PAGE, "terms", summary(others))
+    for name, text in (("photographs", table(others)), ("skyboxes", skyboxes(found))):
         print(text)
-        fill_between(PAGES[name], name, text)
+        write_csv(PAGE_DATA / f"{name}.csv", table_lines(text))
 
 
 if __name__ == "__main__":

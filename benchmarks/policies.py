@@ -61,7 +61,6 @@ GROUPS = {
     "office": ("office",),
     "statue": ("statue",),
 }
-DIFFERENCES = ("mean", "low", "high", "detectable", "better", "units", "scenes")
 """What `difference` says."""
 TABLED = ("all", "rooms", "still lifes", "captures")  # of the policies that pick by poses alone
 SHOWN = (4, 6, 8, 12)  # views, of the page's table
@@ -185,7 +184,7 @@ def unit_lines(rows: Rows) -> Iterator[list[str]]:
 
 def difference_lines(rows: Rows, metrics: Sequence[Metric] = METRICS) -> Iterator[list[str]]:
     """Differences within units, at every number of views; last, those of one policy by the two protocols."""
-    yield ["protocol", "policy", "against", "of", "metric", "views", *DIFFERENCES]
+    yield [*("protocol", "policy", "against", "of", "metric", "views"), *studies.DIFFERENCE]
     counts = view_counts(rows)
     pairs = [(DEFAULT, other) for other in OTHERS] + [(other, "random") for other in OTHERS if other != "random"]
     pairs.append(("fisherrf, from scratch", "fisherrf"))
@@ -196,23 +195,12 @@ def difference_lines(rows: Rows, metrics: Sequence[Metric] = METRICS) -> Iterato
                 for metric in metrics:
                     for count in counts:
                         named = [protocol, policy, other, group, metric.key, str(count)]
-                        yield from difference(named, metric, at_views(mine, count), policy, other)
+                        yield from studies.difference(named, metric, at_views(mine, count), policy, other)
     for policy in (DEFAULT, *OTHERS):
         both = [{**row, "policy": row["protocol"]} for row in rows if row["policy"] == policy]
         for metric in metrics:
             named = ["paper against blind", policy, policy, "all", metric.key, str(counts[-1])]
-            yield from difference(named, metric, both, "paper", "blind")
-
-
-def difference(named: list[str], metric: Metric, rows: Rows, policy: str, other: str) -> Iterator[list[str]]:
-    """A line, where there are fits of one unit by both."""
-    values = differences(rows, metric.key, policy, other)
-    if values:
-        one = estimate(values)
-        numbers = (f"{x:+.{metric.digits}f}" for x in (one.mean, one.low, one.high))
-        detectable = "" if one.detectable is None else f"{one.detectable:.{metric.digits}f}"
-        better = one.positive if metric.larger else one.negative
-        yield [*named, *numbers, detectable, str(better), str(one.units), str(one.scenes)]
+            yield from studies.difference(named, metric, both, "paper", "blind")
 
 
 def choosing_lines(rows: Rows) -> Iterator[list[str]]:

@@ -3,8 +3,8 @@
     python benchmarks/rates.py [--scenes banana ...] [--steps 400 1500] [--page]
 
 Appends one row a fit to benchmarks/rates.jsonl as it ends, leaves out what is there, then writes the table of
-docs/real-data.md. Scenes are captures by name, or paths of scenes that move or have a teacher: those are fitted with
-the defaults of `drgs fit`, and have a table of their own. One thread, one seed.
+docs/real-data.md, docs/data/rates.csv and rates-whole.csv. Scenes are captures by name, or paths of scenes that move or
+have a teacher: those are fitted with the defaults of `drgs fit`, and have a table of their own. One thread, one seed.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 from fits import fitted, psnr_by_renderer  # noqa: E402
+from studies import PAGE_DATA, table_lines, write_csv  # noqa: E402
 from where import DATA, add_row, ran, read_rows  # noqa: E402
 
 from drgs.data import load  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.fitting.frames import frames_for  # noqa: E402
 from drgs.fitting.renderers import renderers_to_measure  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
+from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
 from drgs.train import fit  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "rates.jsonl"
@@ -135,6 +136,24 @@ def table(found: list[dict]) -> str:
     return "\n".join(lines)
 
 
+def short_table(found: list[dict]) -> str:
+    """What the page has of `table`: what larger rates add in `fast` to those of 3DGS."""
+    shown = ("scales, means, SH x 4", "scales, means, SH x 8")
+    lines = []
+    by = {(row["scene"], row["steps"], row["rates"]): row["psnr"]["fast"] for row in found if "psnr" in row}
+    for scene, steps, rates in sorted(by):
+        if rates != "3DGS":
+            continue
+        plain = by[scene, steps, rates]
+        cells = [scene, f"{steps:,}", f"{statistics.mean(plain):.2f} / {min(plain):.2f}"]
+        for name in shown:
+            views = by.get((scene, steps, name))
+            more = statistics.mean(views) - statistics.mean(plain) if views else 0.0
+            cells.append(f"{more:+.2f} / {min(views) - min(plain):+.2f}" if views else "")
+        lines.append(cells)
+    return markdown_table(["capture", "steps", "3DGS", *shown], lines)
+
+
 def main() -> None:
     """The program."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -153,9 +172,10 @@ def main() -> None:
                     said = row.get("scores") or {x: statistics.mean(row["psnr"][x]) for x in SEEN}
                     print(scene, steps, rates, {name: round(x, 3) for name, x in said.items()}, flush=True)
     rows = read_rows(ROWS)
-    for name, text in (("rates", table(rows)), ("rates_whole", whole_table(rows))):
+    fill_between(PAGE, "rates", short_table(rows))
+    for name, text in (("rates", table(rows)), ("rates-whole", whole_table(rows))):
         print(text)
-        fill_between(PAGE, name, text)
+        write_csv(PAGE_DATA / f"{name}.csv", table_lines(text))
 
 
 if __name__ == "__main__":

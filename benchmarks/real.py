@@ -4,8 +4,8 @@
     python benchmarks/real.py --page
 
 Fits with the defaults of `drgs fit` but for what FITS says, appends one row a fit to benchmarks/real.jsonl as it ends,
-then writes the tables of docs/real-data.md and small pictures beside it. A fit that was stopped goes on from its last
-checkpoint. Where captures are, and with how many threads: DRGS_DATA and DRGS_THREADS.
+then writes the tables of docs/real-data.md, docs/data/real.csv and small pictures. A fit that was stopped goes on from
+its last checkpoint. Where captures are, and with how many threads: DRGS_DATA and DRGS_THREADS.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 import cv2  # noqa: E402
+from studies import PAGE_DATA, table_lines, write_csv  # noqa: E402
 from where import DATA, add_row, ran, read_rows  # noqa: E402
 
 from drgs.data import load  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
+from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
 from drgs.train import fit  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "real.jsonl"
@@ -133,6 +134,21 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
+def short_table(rows: list[dict]) -> str:
+    """What the page has of `table`, and what others print of the same photographs, which they had a GPU for."""
+    heads = ["fit", "for", "views", "pixels", "steps", "Gaussians", "minutes", "PSNR", "SSIM", "FLIP", "others, PSNR"]
+    lines = []
+    for row in rows:
+        others = OTHERS.get(FITS[row["name"]][0], {})
+        size, views = "x".join(map(str, row["size"])), "+".join(map(str, row["views"]))
+        took = row.get("processor_seconds")
+        minutes = f"{took / 60:.1f}" if took else f"{row['seconds'] / 60:.1f} (clock)"
+        cells = [row["name"], row["renderers"], views, size, f"{row['steps']:,}", f"{row['gaussians']:,}", minutes]
+        cells += [f"{row['psnr']:.2f}", f"{row['ssim']:.3f}", f"{row['flip']:.3f}"]
+        lines.append([*cells, ", ".join(f"{name} {value:.2f}" for name, value in others.items())])
+    return markdown_table(heads, lines)
+
+
 def beside_opensplat(rows: list[dict]) -> str:
     """Previews of fits beside another program's figures."""
     lines = ["| capture | OpenSplat | dB | ours after | dB |", "|---|---|---|---|---|"]
@@ -140,19 +156,6 @@ def beside_opensplat(rows: list[dict]) -> str:
         for limit, theirs, what in OPENSPLAT.get(row["name"], []):
             step, ours = [preview for preview in row["previews"] if preview[0] <= limit][-1]
             lines.append(f"| {row['name']} | {what} | {theirs} | {step:,} of {row['steps']:,} | {ours:.2f} |")
-    return "\n".join(lines)
-
-
-def beside_others(rows: list[dict]) -> str:
-    """What others print of the same photographs, which they had a graphics card for."""
-    lines = ["| capture | ours, minutes of a processor | dB | others |", "|---|---|---|---|"]
-    for row in rows:
-        capture, _ = FITS[row["name"]]
-        if capture in OTHERS:
-            others = ", ".join(f"{name} {value:.2f}" for name, value in OTHERS[capture].items())
-            took = row["processor_seconds"]
-            minutes = f"{took / 60:.0f}" if took else f"{row['seconds'] / 60:.0f} on the clock"
-            lines.append(f"| {row['name']} | {minutes} | {row['psnr']:.2f} | {others} |")
     return "\n".join(lines)
 
 
@@ -167,12 +170,12 @@ def main() -> None:
         add_row(ROWS, measured(name, args.runs))
     rows = read_rows(ROWS)
     for name, text in (
-        ("real", table(rows)),
+        ("real", short_table(rows)),
         ("opensplat", beside_opensplat(rows)),
-        ("others", beside_others(rows)),
     ):
         print(text)
         fill_between(PAGE, name, text)
+    write_csv(PAGE_DATA / "real.csv", table_lines(table(rows)))
 
 
 if __name__ == "__main__":

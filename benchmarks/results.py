@@ -3,41 +3,117 @@
     python benchmarks/results.py        runs nothing
 
 The cells are those of `drgs reproduce static|dynamic|prior|blocks --scale small`; benchmarks/semantic.py and kitchen.py
-have run them (both the protocols `blind` and `paper` on the first room), and other scenes and policies besides.
+have run them (both the protocols `blind` and `paper` on the first room), and other scenes and policies besides. What is
+not on the page is in docs/data/results.csv and results-differences.csv.
 """
 
 from __future__ import annotations
 
 import sys
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
+from studies import DIFFERENCE, PAGE_DATA, ROOT, difference, write_csv
 
-from where import ran  # noqa: E402
-
-from drgs.studies.experiments import EXPERIMENTS, study_of  # noqa: E402
-from drgs.studies.results import results_page  # noqa: E402
-from drgs.studies.rows import read_study  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
+from drgs.studies.cells import Study
+from drgs.studies.experiments import EXPERIMENTS, Experiment, study_of
+from drgs.studies.results import results_rows
+from drgs.studies.rows import read_study
+from drgs.studies.statistics import differences, estimate
+from drgs.studies.tables import fill_between, markdown_table
 
 PAGE = ROOT / "docs" / "results.md"
-TOLD = {
-    "static": "Besides the made rooms, `statue`, a capture that people labelled.",
-    "dynamic": "Rows that were measured before class means and peak memory were recorded have none.",
-}
+TABLES = ("static", "dynamic", "prior", "blocks")
+"""Experiments of the page, and its parts."""
+
+Rows = Sequence[Mapping[str, Any]]
 
 
-def text() -> str:
-    """The four sections."""
-    at = ran()
-    parts = []
-    for name, experiment in EXPERIMENTS.items():
-        study = study_of(experiment.study, "small", ROOT / "runs" / "studies" / "scenes")
-        rows = read_study(ROOT / "benchmarks" / f"{experiment.study}.jsonl")
-        parts.append(results_page(study, experiment, rows, told=[TOLD[name]] if name in TOLD else []))
-    return "\n\n".join([f"`python benchmarks/results.py`, {at['machine']}, {at['date']}.", *parts])
+def cells(name: str) -> tuple[Study, Experiment, Rows]:
+    """An experiment's study, itself, and the rows of its policies."""
+    experiment = EXPERIMENTS[name]
+    study = study_of(experiment.study, "small", ROOT / "runs" / "studies" / "scenes")
+    rows = read_study(ROOT / "benchmarks" / f"{experiment.study}.jsonl")
+    mine = [row for row in rows if row["study"] == study.name and row["policy"] in experiment.policies]
+    return study, experiment, mine
+
+
+def table(name: str) -> str:
+    """Means by protocol `blind`, PSNR less that of the reference, and the paper's PSNR; of `static` also ours by
+    protocol `paper`.
+    """
+    study, experiment, rows = cells(name)
+    blind = [row for row in rows if row["protocol"] == "blind"]
+    found = {(line["protocol"], line["policy"]): line for line in results_rows(study, experiment, rows)}
+    reference = experiment.policies[experiment.reference]
+    both = name == "static"
+    lines = []
+    for policy, title in experiment.policies.items():
+        line = found["blind", policy]
+        less = ""
+        if policy != experiment.reference:
+            one = estimate(differences(blind, "psnr", policy, experiment.reference))
+            less = f"{one.mean:+.2f} [{one.low:+.2f}, {one.high:+.2f}]"
+        numbers = [f"{line['psnr']:.2f}", less]
+        seconds = line["pick_seconds"]
+        numbers += [f"{line['miou']:.3f}", "" if seconds is None else f"{seconds:.1f}"]
+        numbers += [f"{found['paper', policy][key]:.{digits}f}" for key, digits in (("psnr", 2), ("miou", 3)) if both]
+        theirs = line["paper"].get("psnr")
+        told = (
+            f"`{policy}`: {title.partition(':')[0]}"
+            if policy != title and name in ("static", "dynamic")
+            else f"`{policy}`"
+        )
+        lines.append([told, *numbers, f"{theirs:.2f}" if theirs else "–"])
+    heads = ["label and name", "PSNR", f"less that of {reference}"]
+    heads += ["mIoU", "seconds a pick", *(["PSNR, `paper`", "mIoU, `paper`"] if both else []), "PSNR in the paper"]
+    return markdown_table(heads, lines)
+
+
+def mean_lines() -> list[list[str]]:
+    """The data file of means, every scene counting alike, and what a fit cost."""
+    lines: list[list[str]] = []
+    keys: list[str] = []
+    every: list[tuple[str, dict[str, Any]]] = []
+    for name in TABLES:
+        every += [(name, line) for line in results_rows(*cells(name))]
+    for _, line in every:
+        keys += [key for key in line if key not in keys]
+    lines.append(
+        ["table", *(key for key in keys if key not in ("best", "paper")), "best_psnr", "of_units", "psnr_paper"]
+    )
+    for name, line in every:
+        row = [name]
+        for key in keys:
+            value = line.get(key)
+            if key not in ("best", "paper"):
+                row.append("" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value))
+        theirs = line["paper"].get("psnr")
+        lines.append([*row, str(line["best"]["units"]), str(line["best"]["of"]), f"{theirs:.2f}" if theirs else ""])
+    return lines
+
+
+def difference_lines() -> list[list[str]]:
+    """The data file of differences within units from the table's reference."""
+    lines = [["table", "protocol", "policy", "against", "metric", *DIFFERENCE]]
+    for name in TABLES:
+        study, experiment, rows = cells(name)
+        for protocol in sorted({row["protocol"] for row in rows}):
+            mine = [row for row in rows if row["protocol"] == protocol]
+            for policy in experiment.policies:
+                for metric in study.metrics if policy != experiment.reference else ():
+                    named = [name, protocol, policy, experiment.reference, metric.key]
+                    lines += difference(named, metric, mine, policy, experiment.reference)
+    return lines
+
+
+def main() -> int:
+    for name in TABLES:
+        fill_between(PAGE, name, table(name))
+    write_csv(PAGE_DATA / "results.csv", mean_lines())
+    write_csv(PAGE_DATA / "results-differences.csv", difference_lines())
+    return 0
 
 
 if __name__ == "__main__":
-    fill_between(PAGE, "results", text())
+    sys.exit(main())

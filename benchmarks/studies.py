@@ -10,9 +10,13 @@ import argparse
 import csv
 import io
 import json
+import re
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
@@ -26,21 +30,27 @@ from drgs.fitting.frames import load_frames  # noqa: E402
 from drgs.fitting.rows import GaussianRows  # noqa: E402
 from drgs.fitting.timetable import initial_views  # noqa: E402
 from drgs.fitting.trainer import Trainer  # noqa: E402
-from drgs.studies.cells import Study, run_cells  # noqa: E402
+from drgs.studies.cells import Metric, Study, run_cells  # noqa: E402
 from drgs.studies.rows import append_row, read_study  # noqa: E402
+from drgs.studies.statistics import differences, estimate, unit_of, values_of  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
 
 __all__ = [
     "DATA",
+    "DIFFERENCE",
+    "PAGE_DATA",
     "SCENES",
     "base",
     "command",
     "csv_text",
     "dataset",
+    "difference",
     "folder",
     "rank_correlation",
     "read_rows",
     "stamp",
+    "study_sheets",
+    "table_lines",
     "write_csv",
     "write_rows",
 ]
@@ -48,6 +58,10 @@ __all__ = [
 SCENES = ("office", "head", "still_life")
 BASE = {"renderers": ("fast",), "max_pixels": 12_000, "max_gaussians": 15_000}
 """Size of the base models."""
+PAGE_DATA = ROOT / "docs" / "data"
+"""Data files of the pages."""
+DIFFERENCE = ("mean", "low", "high", "detectable", "better", "units", "scenes")
+"""Heads of what `difference` says of a pair of policies."""
 
 
 def folder(name: str, runs: Path) -> Path:
@@ -140,10 +154,107 @@ def csv_text(lines: Iterable[Sequence[str]]) -> str:
     return text.getvalue()
 
 
+def table_lines(text: str) -> list[list[str]]:
+    """A table of Markdown as lines of a data file; columns of `mean / worst` become two, an empty first cell is that
+    of the line above.
+    """
+    lines = [
+        [re.sub(r"(?<=\d),(?=\d{3}\b)", "", cell.strip().replace("`", "")) for cell in line[1:-1].split("|")]
+        for line in text.splitlines()
+    ]
+    heads, rows = lines[0], lines[2:]
+    pairs = [any(" / " in row[i] for row in rows) for i in range(len(heads))]
+    found = [[]]
+    for head, pair in zip(heads, pairs, strict=True):
+        left, cut, right = head.partition(" / ")
+        two = (
+            [left, f"{left.rpartition(',')[0]}, {right}"] if cut and "," in left else [f"{head} mean", f"{head} worst"]
+        )
+        found[0] += two if pair else [head]
+    for row in rows:
+        cells = []
+        for cell, pair in zip(row, pairs, strict=True):
+            left, _, right = cell.partition(" / ")
+            cells += [left, right] if pair else [cell]
+        cells[0] = cells[0] or found[-1][0]
+        found.append(cells)
+    return found
+
+
 def write_csv(path: Path, lines: Iterable[Sequence[str]]) -> None:
     """A data file of a page."""
     with atomic_write(path) as file:
         file.write(csv_text(lines).encode())
+
+
+def difference(
+    named: list[str], metric: Metric, rows: Sequence[Mapping[str, Any]], policy: str, other: str
+) -> Iterator[list[str]]:
+    """A line of a data file, where there are fits of one unit by both: what it is of, then `DIFFERENCE`."""
+    values = differences(rows, metric.key, policy, other)
+    if values:
+        one = estimate(values)
+        numbers = (f"{x:+.{metric.digits}f}" for x in (one.mean, one.low, one.high))
+        detectable = "" if one.detectable is None else f"{one.detectable:.{metric.digits}f}"
+        better = one.positive if metric.larger else one.negative
+        yield [*named, *numbers, detectable, str(better), str(one.units), str(one.scenes)]
+
+
+def study_sheets(study: Study, rows: Sequence[Mapping[str, Any]]) -> dict[str, list[list[str]]]:
+    """The data files of a study's page: name -> lines, the first one the heads.
+
+    Args:
+        study: What was studied.
+        rows: Its rows.
+    Returns:
+        `units`, every fit; `scenes`, means over the units of a scene, with medians over test views and, at the end,
+        median seconds of a pick; `differences` within units, of all policies against the reference, of the study's
+        comparisons, and of each policy by the two protocols.
+    """
+    keys = [metric.key for metric in study.metrics]
+    middle = [{**row, "metrics": row["medians"]} for row in rows if row.get("medians")]
+    medians = [metric for metric in study.metrics if any(row["metrics"].get(metric.key) for row in middle)]
+    heads = [*keys, *(f"{metric.key}_median" for metric in medians), "seconds_a_pick"]
+    units = [["protocol", "scene", "held_out_every", "from_index", "initial_views", "policy", "seed", "commit", *heads]]
+    scenes = [["protocol", "scene", "policy", "units", *heads]]
+    groups: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
+    order = list(study.policies)
+    for row in sorted(rows, key=lambda row: (row["protocol"], row["scene"], order.index(row["policy"]))):
+        groups.setdefault((row["protocol"], row["scene"], row["policy"]), []).append(row)
+    for (protocol, scene, policy), mine in groups.items():
+        for row in sorted(mine, key=lambda row: (unit_of(row), row["seed"])):
+            every, offset = row["split"]
+            start = row.get("camera") or " ".join(sorted(row["initial"]))
+            given = [scene, str(every), str(offset), start, policy, str(row["seed"]), row.get("commit") or ""]
+            units.append([protocol, *given, *_numbers(study.metrics, medians, [row], policy)])
+        count = str(len({unit_of(row) for row in mine}))
+        scenes.append([protocol, scene, policy, count, *_numbers(study.metrics, medians, mine, policy)])
+    against = [["protocol", "policy", "against", "metric", *DIFFERENCE]]
+    pairs = [(policy, study.reference) for policy in study.policies if policy != study.reference]
+    for protocol in sorted({row["protocol"] for row in rows}):
+        own = [row for row in rows if row["protocol"] == protocol]
+        for policy, other in (*pairs, *study.comparisons):
+            for metric in study.metrics:
+                against += difference([protocol, policy, other, metric.key], metric, own, policy, other)
+    for policy in study.policies:
+        both = [{**row, "policy": row["protocol"]} for row in rows if row["policy"] == policy]
+        for metric in study.metrics:
+            named = ["paper against blind", policy, policy, metric.key]
+            against += difference(named, metric, both, "paper", "blind")
+    return {"units": units, "scenes": scenes, "differences": against}
+
+
+def _numbers(
+    metrics: Sequence[Metric], medians: Sequence[Metric], rows: Sequence[Mapping[str, Any]], policy: str
+) -> list[str]:
+    """Means over units of the metrics, and of their medians over test views; the median of the seconds of a pick."""
+    cells = []
+    by_median = [{**row, "metrics": row["medians"]} for row in rows if row.get("medians")]
+    for metric, found in (*((one, rows) for one in metrics), *((one, by_median) for one in medians)):
+        values = list(values_of(found, metric.key, policy).values())
+        cells.append(f"{np.mean(values):.{metric.digits}f}" if values else "")
+    seconds = [row["pick_seconds"] for row in rows if row["pick_seconds"] is not None]
+    return [*cells, f"{np.median(seconds):.2f}" if seconds else ""]
 
 
 def command(
@@ -156,6 +267,7 @@ def command(
     report: Callable[[Study, list[dict]], str],
     rows: str,
     seeds: int = 3,
+    sheets: bool = False,
 ) -> int:
     """The command line of a study of fits; rows go to benchmarks/ROWS.jsonl.
 
@@ -169,6 +281,7 @@ def command(
         report: Study, its rows -> tables.
         rows: Name of the file of rows.
         seeds: The default of --seeds.
+        sheets: With the tables, write `study_sheets` to docs/data/SCRIPT-NAME.csv.
     Returns:
         The exit code.
     """
@@ -191,6 +304,8 @@ def command(
         done = f"{len(found)} of {planned(args.seeds)} cells are finished."
         text = f"`python benchmarks/{script}.py --scale {args.scale}`: {done}\n\n"
         fill_between(page, script, text + report(study, found))
+        for name, lines in study_sheets(study, found).items() if sheets else ():
+            write_csv(PAGE_DATA / f"{script}-{name}.csv", lines)
         return 0
     shard, shards = map(int, args.shard.split("/"))
     units = units_of(study, args.seeds)

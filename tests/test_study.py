@@ -672,6 +672,22 @@ def test_a_page_comes_from_its_rows(monkeypatch):
     assert made == "".join(line for line in there if ",psnr," in line or line is there[0])
 
 
+def test_the_semantic_page_comes_from_its_rows(monkeypatch, tmp_path):
+    """The table of docs/semantic.md, and the data files that have no intervals, which take long."""
+    root = Path(__file__).parents[1]
+    monkeypatch.syspath_prepend(root / "benchmarks")
+    semantic, studies = importlib.import_module("semantic"), importlib.import_module("studies")
+    study = dataclasses.replace(semantic.study_of("small", tmp_path), comparisons=())
+    rows = [row for row in read_study(root / "benchmarks" / "static.jsonl") if row["study"] == study.name]
+    assert semantic.table(study, rows) in (root / "docs" / "semantic.md").read_text()
+    monkeypatch.setattr(studies, "difference", lambda *args: iter(()))
+    sheets = studies.study_sheets(study, rows)
+    assert sheets["differences"] == [["protocol", "policy", "against", "metric", *studies.DIFFERENCE]]
+    for name in ("units", "scenes"):
+        there = (studies.PAGE_DATA / f"semantic-{name}.csv").read_text()
+        assert there == studies.csv_text(sheets[name]), name
+
+
 def test_data_files_come_from_their_rows(monkeypatch):
     """Those of benchmarks/predict.py and benchmarks/uncertainty.py, which make them without running anything."""
     pytest.importorskip("scipy.stats")
