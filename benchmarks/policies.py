@@ -61,7 +61,6 @@ GROUPS = {
     "office": ("office",),
     "statue": ("statue",),
 }
-"""What `difference` says."""
 TABLED = ("all", "rooms", "still lifes", "captures")  # of the policies that pick by poses alone
 SHOWN = (4, 6, 8, 12)  # views, of the page's table
 

@@ -28,6 +28,7 @@ _INSIDE = {
     "libllvm",
     "llvm_target",
     "machine",
+    "planner_files",
     "projected",
     "scenes",
     "sizes",

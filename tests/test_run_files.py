@@ -181,6 +181,7 @@ _OTHERS = {
     "guards/locks.py",  # .drgs.lock
     "guards/outputs.py",  # .drgs.jsonl
     "guards/writing.py",  # for log.jsonl
+    "planner_files.py",  # the header of Planner.save's file: docs/planner.md
     "report/page.py",  # a cell of the report
     "sharing/page.py",  # what a page is told
 }
