@@ -24,6 +24,7 @@ from __future__ import annotations
 import dataclasses
 import numbers
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,6 +58,7 @@ __all__ = [
     "intrinsics_from_fov",
     "look_at",
     "orbit",
+    "places_in_time",
     "rigid",
 ]
 
@@ -482,3 +484,18 @@ def orbit(
         w2c = look_at(center + radius * outward, center, axis)
         cameras.append(Camera(K=K, w2c=w2c, width=width, height=height, name=f"orbit_{index:04d}"))
     return cameras
+
+
+def places_in_time(cameras: Sequence[Camera]) -> np.ndarray:
+    """Where cameras stand, and when, in numbers whose distances can be compared.
+
+    Args:
+        cameras: At least one. Those without a time have time 0.
+    Returns:
+        (N, 4) center and time, each divided by its own range: the largest distance between two centers is as far as
+        the first time is from the last one.
+    """
+    centers = np.stack([camera.center for camera in cameras])
+    times = np.array([[camera.time or 0.0] for camera in cameras])
+    size = max(float(np.linalg.norm(centers - center, axis=1).max()) for center in centers)
+    return np.c_[centers / (size or 1.0), times / (float(np.ptp(times)) or 1.0)]

@@ -175,6 +175,33 @@ def test_pairs_are_picked_freely(swing, tmp_path):
     assert Timetable.of(lazily(swing).split()[0], config(selection=plan(schedule="pairs")), True).add == TIMES - 1
 
 
+def test_one_camera_that_moves_about_begins_with_views_spread_in_time(swing, tmp_path):
+    """With one photograph at each time nothing could be fitted to the first time: --initial says with how many views,
+    and any other is a candidate, earlier ones included. Without it a line says so.
+    """
+    views = [view for view in lazily(swing).split()[0] if int(view.name[3]) == 1 + int(view.name[5]) % (CAMERAS - 1)]
+    assert len({view.camera.time for view in views}) == len(views) == TIMES
+    for schedule in ("times", "pairs"):
+        with pytest.raises(ValueError, match="two cameras or more at the first time, got one, .*--initial, e.g. 4"):
+            ActiveViews(views, config(selection=plan(schedule=schedule)), moves=True)
+    for seed in range(4):
+        active = plan(schedule="pairs", initial=3, start="seed", add=1)
+        table = ActiveViews(views, config(selection=active, seed=seed), moves=True).timetable
+        assert len(set(table.start)) == 3
+        assert set(table.start) | set(table.left(0, table.start)) == set(range(TIMES))
+    with pytest.raises(ValueError, match="at most the 1 training views besides the initial ones, got 10"):
+        ActiveViews(views, config(selection=plan(schedule="pairs", initial=3)), moves=True)
+
+    line = f"fit {swing} -o {tmp_path / 'run'} --views active --schedule pairs --initial 6 --start seed --add 2"
+    line += " --every 2 --policy uniform --max-steps 24 --max-gaussians 60 --sh-degree 1 --quiet"
+    assert cli.main(line.split()) == 0
+    record = selection_of(tmp_path / "run")
+    assert record["initial"] == 6
+    start = fitted_views(Run(tmp_path / "run"))[:6]
+    assert len({name.split("/")[1] for name in start}) == TIMES
+    assert len(record["picks"][0]["candidates"]) == (CAMERAS - 1) * TIMES - 6
+
+
 def test_the_first_pick_knows_of_the_field(swing, tmp_path):
     """The field begins at rest, where its first layers have no information; at the first pick both of its groups have
     some, in the pick and in every candidate, and the parts add up to the score.
@@ -238,6 +265,7 @@ def test_killed_fits_pick_the_same(swing, tmp_path, monkeypatch):
         ({"schedule": "pairs", "add": 13}, "at most the 12 training views at later times, got 13"),
         ({"initial": 3}, "must begin with all cameras at the first time, got --initial 3; drop it"),
         ({"start": "seed"}, "must begin with all cameras at the first time, got --start seed; drop it"),
+        ({"start": "seed", "schedule": "pairs"}, "got --start seed; drop it, or name --initial, too"),
         ({"pick_points": "uncovered"}, "must have --pick-points auto or none, got uncovered"),
         ({"schedule": "views", "add": 2}, "--schedule must be times or pairs where a deformation is fitted, got views"),
     ],

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from json_page import check
 from test_active import write_still
-from test_dynamic_data import cameras, coded, write_poses, write_video
+from test_dynamic_data import cameras, coded, write_dnerf, write_poses, write_video
 
 from drgs import cli
 from drgs.studies.experiments import EXPERIMENTS, SIZES, study_of
@@ -137,6 +137,21 @@ def test_cameras_that_are_given(tmp_path):
     assert [(cell.camera, cell.seed) for cell in plan.cells] == [("cam00", 0), ("cam00", 1)]
     with pytest.raises(ValueError, match="must show a scene at one time, shows several"):
         plan_of("static", "tiny", tmp_path, [folder])
+
+
+def test_one_camera_that_films_what_moves(tmp_path):
+    """In D-NeRF's layout each time has one photograph: seeds draw the views that a fit begins with, and the split is
+    that of the files.
+    """
+    folder = tmp_path / "ball"
+    folder.mkdir()
+    write_dnerf(folder, {"train": tuple(t / 8 for t in range(9)), "test": (0.25, 0.75)})
+    plan = plan_of("dynamic", "tiny", tmp_path, [folder], seeds=2, policies=["random"])
+    assert [(cell.camera, cell.split, cell.start, cell.seed) for cell in plan.cells] == [
+        ("", (0, 0), "seed", seed) for seed in range(2)
+    ]
+    selection = plan.study.config_of(plan.cells[0]).selection
+    assert (selection.schedule, selection.initial, selection.add) == ("pairs", 6, 3)
 
 
 @pytest.mark.parametrize(

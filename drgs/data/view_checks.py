@@ -21,6 +21,7 @@ _FEW_PLACES = 4
 _ENOUGH_PLACES = 6
 _FEWEST = 3  # images that a data set must have where others are missing
 _SHOWN = 5  # of those are named at once
+_ALSO = 50  # more of them at most, by the names of their files
 _LONGEST = 400  # characters of a path in messages
 
 _log = logging.getLogger(__name__)
@@ -49,7 +50,9 @@ def go_on_without(where: Path, missing: list[Path], left: int, strict: bool) -> 
         raise FileNotFoundError(f"{told}; {rule}: restore them{hint}")
     _log.warning("%s; going on with the other %d (--strict refuses that)", told, left)
     if len(names) > _SHOWN:
-        _log.info("also not there: %s", ", ".join(names[_SHOWN:]))
+        others = [path.name[:_LONGEST] for path in missing[_SHOWN : _SHOWN + _ALSO]]
+        more = len(names) - _SHOWN - len(others)
+        _log.info("also not there: %s%s", ", ".join(others), f" and {more} more" if more else "")
 
 
 def check_parallax(views: list[View]) -> None:

@@ -307,8 +307,8 @@ class SelectionConfig(Record):
     """How views are chosen during a fit that begins with a few.
 
     `schedule`: `views` takes `initial` views, then one after the other. `times`: the static stage on all cameras at the
-    first time, then one camera at each later time, in order. `pairs`: the same start, then any (camera, time). More in
-    `drgs.fitting.timetable`. The first view that a seed draws comes from a generator of its own, so that no policy's
+    first time, then one camera at each later time, in order. `pairs`: the same start, or `initial` views spread over
+    cameras and times, then any (camera, time). More in `drgs.fitting.timetable`. The first view that a seed draws comes from a generator of its own, so that no policy's
     draws depend on it.
 
     `pick_points`: with `uncovered` a picked view brings the points that can be triangulated with it, and more where the
@@ -326,7 +326,8 @@ class SelectionConfig(Record):
         scoring: What counts, and how; its settings and the metric of its features are the fit's.
         schedule: Pick view by view (views), one camera at each later time (times), or any camera at any (pairs); auto:
             times where a deformation is fitted.
-        initial: Views at the start: that of --start, then those farthest away.
+        initial: Views at the start: that of --start, then those farthest away; default 2, or all cameras at the first
+            time.
         start: The first of the initial views: the first training view by name, or one that the seed draws.
         add: Views to be chosen on the way, others are not read; default 10, or one for every time after the first.
         every: Steps before the first pick, and between picks; default 200, with --schedule times or pairs 200 of

@@ -2,7 +2,8 @@
 
     views   a few views at the start, then any other of the training split
     times   all cameras at the first time, then one camera at each later time, in order: the dynamic loop of [1]
-    pairs   all cameras at the first time, then any (camera, time) of the others
+    pairs   all cameras at the first time, then any (camera, time) of the others; with `initial` views at the start
+            these instead, spread over cameras and times, as where one camera moves about and films
 
 [1] fits a static scene to the first time for 3,000 steps, then a dynamic one for 14,000, with a pick every 200 of
 these at the 39 later times. `times` and `pairs` do so at any number of steps: the first pick comes when the dynamic
@@ -23,6 +24,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.cameras import places_in_time
+
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.data import View
@@ -35,7 +38,7 @@ _EVERY = 200  # steps between two picks, as in [1]
 _PART = 200 / 17_000  # of the steps between two picks at times, as in [1]
 
 VIEWS_TO_ADD = 10
-"""As in [1], where things stand still and `SelectionConfig` does not say."""
+"""As in [1], where a few views are there at the start and `SelectionConfig` does not say."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,9 +132,20 @@ class Timetable:
             raise ValueError(f"{where} must have training views of two times or more, got one; use --schedule views")
         start, *later = (tuple(times[time]) for time in sorted(times))
         add = active.add or len(later)
+        what = "later times" if schedule == "times" else "training views at later times"
+        if schedule == "pairs" and active.initial != type(active).initial:
+            first = _drawn(len(views), config.seed) if active.start == "seed" else 0
+            start = tuple(initial_views([view.camera for view in views], min(active.initial, len(views)), first))
+            later = [tuple(i for i in range(len(views)) if i not in start)]
+            add = active.add or VIEWS_TO_ADD
+            what = "training views besides the initial ones"
+        elif len(start) == 1:
+            raise ValueError(
+                f"{where} must have two cameras or more at the first time, got one, {views[start[0]].name!r}; use "
+                f"--schedule pairs with --initial, e.g. {min(len(views), 24)}"
+            )
         room = len(later) if schedule == "times" else sum(map(len, later))
         if add > room:
-            what = "later times" if schedule == "times" else "training views at later times"
             raise ValueError(f"{where} must have --add of at most the {room} {what}, got {add}; lower it")
         static = round(config.motion.static_share * config.max_steps)
         least = math.ceil(_PART * config.max_steps)
@@ -154,9 +168,13 @@ def _check_times(where: str, active: SelectionConfig, views: Sequence[View], con
     if timeless := next((view.name for view in views if view.camera.time is None), None):
         raise ValueError(f"{where} must have a time of every view, {timeless!r} has none; use --schedule views")
     default = type(active)()
-    for name, always in (("initial", "all cameras at the first time"), ("start", "all cameras at the first time")):
+    spread = active.schedule == "pairs" and active.initial != default.initial
+    for name in () if spread else ("initial", "start"):
         if getattr(active, name) != getattr(default, name):
-            raise ValueError(f"{where} must begin with {always}, got --{name} {getattr(active, name)}; drop it")
+            hint = "drop it" if active.schedule != "pairs" else "drop it, or name --initial, too"
+            raise ValueError(
+                f"{where} must begin with all cameras at the first time, got --{name} {getattr(active, name)}; {hint}"
+            )
     if active.pick_points == "uncovered":
         raise ValueError(
             f"{where} must have --pick-points auto or none, got uncovered: what has moved is not triangulated with "
@@ -165,7 +183,9 @@ def _check_times(where: str, active: SelectionConfig, views: Sequence[View], con
 
 
 def initial_views(cameras: list[Camera], count: int, first: int = 0) -> list[int]:
-    """One camera, then always the one whose center is farthest from all chosen ones; ties to the lower index.
+    """One camera, then always the one that is farthest from all chosen ones; ties to the lower index.
+
+    Distances are between centers; of cameras at several times, between centers and times (`places_in_time`).
 
     Args:
         cameras: Cameras to choose from, at least `count`.
@@ -173,6 +193,8 @@ def initial_views(cameras: list[Camera], count: int, first: int = 0) -> list[int
         first: Index of the one to begin with.
     """
     centers = np.stack([camera.center for camera in cameras])
+    if len({camera.time for camera in cameras}) > 1:
+        centers = places_in_time(cameras)
     chosen = [first]
     distance = np.linalg.norm(centers - centers[first], axis=1)
     while len(chosen) < count:

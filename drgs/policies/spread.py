@@ -16,7 +16,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from drgs.cameras import Camera
+from drgs.cameras import Camera, places_in_time
 from drgs.information.pool import Pool, Selection
 
 __all__ = ["farthest", "random", "uniform"]
@@ -109,7 +109,8 @@ def _farthest_in_time(pool: Pool) -> Selection:
     Of candidates as far from their nearest view, the one is taken whose second nearest view is farther, and so on: at
     the second time all cameras are as far from themselves at the first one.
     """
-    known, new = _points(pool)
+    points = places_in_time([*pool.train, *pool.candidates])
+    known, new = points[: len(pool.train)], points[len(pool.train) :]
     distances = np.linalg.norm(new[:, None] - known[None], axis=2).round(_DIGITS)
     scores = distances.min(1).tolist() if len(known) else [0.0] * len(new)
     picks = []
@@ -125,16 +126,6 @@ def _farthest_in_time(pool: Pool) -> Selection:
         reach = np.linalg.norm(new - new[best], axis=1).round(_DIGITS)
         distances = np.c_[distances, reach]
     return Selection(picks, scores, evaluations=pool.k * len(new))
-
-
-def _points(pool: Pool) -> tuple[np.ndarray, np.ndarray]:
-    """(V, 4) center and time of the known views, and (C, 4) of the candidates, each in parts of its own range."""
-    views = [*pool.train, *pool.candidates]
-    centers = np.stack([camera.center for camera in views])
-    times = np.array([[camera.time or 0.0] for camera in views])
-    size = max(float(np.linalg.norm(centers - center, axis=1).max()) for center in centers)
-    points = np.c_[centers / (size or 1.0), times / (float(np.ptp(times)) or 1.0)]
-    return points[: len(pool.train)], points[len(pool.train) :]
 
 
 def _uniform_in_time(pool: Pool) -> Selection:

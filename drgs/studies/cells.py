@@ -101,6 +101,8 @@ class Study:
         comparisons: More pairs (policy, reference) to be compared.
         lpips: Weights of a backbone: every row then has LPIPS, those of finished runs, too.
         race: A policy has no more fits once its difference from the reference is known (`drgs.studies.race`).
+        of_one_camera: Fields of the selection in cells without a held-out camera, where things move: the views of one
+            camera that moves about and films.
     """
 
     name: str
@@ -112,6 +114,7 @@ class Study:
     comparisons: tuple[tuple[str, str], ...] = ()
     lpips: Path | None = None
     race: bool = False
+    of_one_camera: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     @property
     def measured_later(self) -> tuple[str, ...]:
@@ -139,7 +142,8 @@ class Study:
         fields = self.policies[cell.policy]
         if fields is None:
             return self.fit.replace(**changed, selection=None)
-        return self.fit.replace(**changed, start=cell.start, **{**protocol.selection, **fields})
+        start = self.of_one_camera if self.of_one_camera and not cell.camera else {}
+        return self.fit.replace(**changed, start=cell.start, **{**start, **protocol.selection, **fields})
 
     def _made(self, cell: Cell) -> Path:
         """The folder of a cell's data set, once no other process is making it any more."""

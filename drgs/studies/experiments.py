@@ -226,6 +226,7 @@ SIZES: Mapping[tuple[str, StudyScale], Sizes] = {
         (32, 24),
         (16, 12),
         cameras=5,
+        of_one_camera=(6, 3),
     ),
     ("dynamic", "small"): Sizes(
         _fit(
@@ -240,8 +241,11 @@ SIZES: Mapping[tuple[str, StudyScale], Sizes] = {
         (40, 30),
         cameras=10,
         info_pixels=2_700,
+        of_one_camera=(24, 12),
     ),
-    ("dynamic", "paper"): Sizes(FitConfig(renderers=("fast",), max_steps=17_000), (240, 180), (60, 45), cameras=15),
+    ("dynamic", "paper"): Sizes(
+        FitConfig(renderers=("fast",), max_steps=17_000), (240, 180), (60, 45), cameras=15, of_one_camera=(24, 39)
+    ),
 }
 """Of the fits, and of the scenes that are made. As `small` has a fifth of the paper's steps on static scenes, and a
 nineteenth on those that move, features and decoder go five times as fast, and there the field, too."""
@@ -287,6 +291,7 @@ def study_of(
     selection = SelectionConfig(
         add=sizes.add, every=sizes.every, info_pixels=sizes.info_pixels, schedule=schedule, measure=sizes.measure
     )
+    one = None if sizes.of_one_camera is None else dict(zip(("initial", "add"), sizes.of_one_camera, strict=True))
     return Study(
         name=f"{study}-{scale}",
         folder=made_folder(study, sizes, made / scale, given or {}),
@@ -295,5 +300,6 @@ def study_of(
         metrics=metrics_of(study, lpips is not None),
         reference=next(x.reference for x in EXPERIMENTS.values() if x.study == study),
         race=any(x.race for x in EXPERIMENTS.values() if x.study == study),
+        of_one_camera={} if one is None else {"schedule": "pairs", **one},
         lpips=lpips,
     )

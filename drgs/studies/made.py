@@ -29,6 +29,7 @@ class Sizes:
         measure: Numbers of views at which the held-out views are measured, before the end.
         views: Views of a room.
         cameras: Cameras of a kitchen; it has as many times as the fit takes.
+        of_one_camera: Views at the start and views to be picked, where one camera moves about and films what moves.
         info_pixels: Pixels of the views that information is computed from; None: those of the fit.
     """
 
@@ -41,6 +42,7 @@ class Sizes:
     views: int = 0
     cameras: int = 0
     info_pixels: int | None = None
+    of_one_camera: tuple[int, int] | None = None
 
 
 def made_folder(

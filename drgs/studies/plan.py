@@ -133,10 +133,12 @@ def _units_of(
         raise ValueError(f"{dataset.path}: must hold out views, holds out none; give --test-every")
     if moves:
         cameras = sorted({view.camera_name for view in test})
-        if len(cameras) != 1 or not cameras[0]:
+        if cameras == [""]:  # one camera that moves about and films, whose files state a split
+            return [(scene, _UNKNOWN, "seed", protocol, seed) for seed in range(seeds)]
+        if len(cameras) > 1:
             raise ValueError(
                 f"{dataset.path}: must hold out one of several synchronous cameras, holds out "
-                f"{', '.join(cameras) or 'views of none'}; correct its split"
+                f"{', '.join(cameras)}; correct its split"
             )
         return [(scene, cameras[0], "first", protocol, seed) for seed in range(seeds)]
     names = sorted(view.name for view in (*train, *test, *dataset.absent))
