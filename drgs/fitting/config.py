@@ -308,8 +308,8 @@ class SelectionConfig(Record):
 
     `schedule`: `views` takes `initial` views, then one after the other. `times`: the static stage on all cameras at the
     first time, then one camera at each later time, in order. `pairs`: the same start, or `initial` views spread over
-    cameras and times, then any (camera, time). More in `drgs.fitting.timetable`. The first view that a seed draws comes from a generator of its own, so that no policy's
-    draws depend on it.
+    cameras and times, then any (camera, time). More in `drgs.fitting.timetable`. The first view that a seed draws comes
+    from a generator of its own, so that no policy's draws depend on it.
 
     `pick_points`: with `uncovered` a picked view brings the points that can be triangulated with it, and more where the
     Gaussians are transparent in it, for density control never leaves what it has covered; the budget is divided evenly
