@@ -191,6 +191,16 @@ def test_transforms_with_masks_and_depth(tmp_path):
     assert view.image(12, 8).dtype == view.depth().dtype == view.mask().dtype == np.float32
 
 
+def test_a_mask_is_within_its_bounds_at_every_size(tmp_path):
+    """Averages of ones can be 1 + 1e-7 in float32, which picks of views refuse: as of `head`, at 34x34."""
+    write_image(tmp_path / "m.png", np.full((104, 104), 255, np.uint8))
+    view = View(Camera(K, np.eye(4), 104, 104), "a", mask_path=tmp_path / "m.png")
+    for size in range(8, 104):
+        mask = view.mask(size, size)
+        assert mask.dtype == np.float32
+        assert 1 - 1e-6 < mask.min() <= mask.max() <= 1
+
+
 def test_transforms_depth_units(tmp_path):
     """npy depths are in scene units unless the file says otherwise."""
     data = write_transforms(tmp_path, extra={"depth_file_path": "d.npy"})

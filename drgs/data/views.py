@@ -159,7 +159,7 @@ class View:
             data = self._nearest(read_mask(self.mask_path), self.mask_path)
         if unseen is not None:
             data = np.where(unseen, np.float32(0), data)
-        return resize_area(data, *self._size(width, height))
+        return resize_area(data, *self._size(width, height)).clip(0, 1)  # averages of ones can be 1 + 1e-7
 
     def depth(self, width: int | None = None, height: int | None = None) -> np.ndarray | None:
         """(H,W) float32 z-depth in scene units, 0 where unknown, nearest pixel; None if there is no depth map."""
