@@ -1,8 +1,8 @@
 """docs/data/run-files.csv against the files that are written: every field is told, and what is told is there.
 
 docs/run-files.md names the files, and the fields of those that a fit leaves. demo.json, reproduce.json and teach.json
-are held to the rows where tests make them (test_demo.py, test_reproduce.py, test_teach.py), a data set's where its scene
-is rendered (test_room.py, test_kitchen.py).
+are held to the rows where tests make them (test_demo.py, test_reproduce.py, test_teach.py), a data set's where its
+scene is rendered (test_room.py, test_kitchen.py).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import json_page
 import numpy as np
 import pytest
 from doc_pages import ROOT
-from json_page import PAGE, ROWS, check, section, titles
+from json_page import PAGE, check, section, titles
 from json_page import names as _names
 from test_active import SIZE, config, lazily, plan, write_still
 from test_query import decoder, embeddings
