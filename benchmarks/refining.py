@@ -83,10 +83,10 @@ def report(rows: list[dict]) -> str:
         tried = way.partition(" + ")
         what = f"{tried[0]} candidates" + (f" and {tried[2]} views tried by moving" if tried[2] else "")
         told.append(f"{what}: {seconds:.1f} s{gained}")
+    names = ", ".join(f"`{run}`" for run in runs)
     return paragraph(
-        f"CPU time, and the pick's score over that of {START} candidates, on average over "
-        f"{', '.join(f'`{run}`' for run in runs)} (least to most): {'; '.join(told)}. {PIXELS:,} pixels a view (`python "
-        f"benchmarks/refining.py`, {rows[-1]['machine']}, {rows[-1]['date']}, commit {rows[-1]['commit']})."
+        f"CPU time, and the pick's score over that of {START} candidates, on average over {names} (least to most): "
+        f"{'; '.join(told)}. {PIXELS:,} pixels a view (`python benchmarks/refining.py`, {rows[-1]['machine']}, {rows[-1]['date']}, commit {rows[-1]['commit']})."
     )
 
 
