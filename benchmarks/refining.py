@@ -86,7 +86,8 @@ def report(rows: list[dict]) -> str:
     names = ", ".join(f"`{run}`" for run in runs)
     return paragraph(
         f"CPU time, and the pick's score over that of {START} candidates, on average over {names} (least to most): "
-        f"{'; '.join(told)}. {PIXELS:,} pixels a view (`python benchmarks/refining.py`, {rows[-1]['machine']}, {rows[-1]['date']}, commit {rows[-1]['commit']})."
+        f"{'; '.join(told)}. {PIXELS:,} pixels a view (`python benchmarks/refining.py`, "
+        f"{rows[-1]['machine']}, {rows[-1]['date']}, commit {rows[-1]['commit']})."
     )
 
 
