@@ -4,9 +4,9 @@
     python benchmarks/codecs.py --page
 
 Appends one row a run and format to benchmarks/codecs.jsonl, leaves out what is there, then writes the table of
-docs/files.md. The PSNR is that of images of what was written and read again against images of the run's own Gaussians,
-both by preset `gsplat`, at photographs of the run, evenly over them; seconds are those that the process computed while
-it wrote. The palette and the weights of SOG were chosen on `bonsai`, which is therefore no row.
+docs/files.md and docs/data/codecs.csv. The PSNR is that of images of what was written and read again against images of
+the run's own Gaussians, both by preset `gsplat`, at photographs of the run, evenly over them; seconds are those that
+the process computed while it wrote. SOG's palette and weights were chosen on `bonsai`, which is therefore no row.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
+from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
 from drgs.codecs import load_gaussians, save_gaussians  # noqa: E402
@@ -34,7 +35,7 @@ from drgs.commands.share import shared_of  # noqa: E402
 from drgs.integrator import render  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.sizes import at_most  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
+from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "codecs.jsonl"
 PAGE = ROOT / "docs" / "files.md"
@@ -81,15 +82,33 @@ def measure(run: Path, views: int, pixels: int) -> None:
 
 
 def table(rows: list[dict]) -> str:
-    """A row a run and format."""
-    lines = ["| fit | Gaussians | format | bytes a Gaussian | PSNR (dB) | seconds to write |", "|---" * 6 + "|"]
-    for row in rows:
-        psnr = ", ".join("same" if x is None else f"{x:.1f}" for x in row["psnr"])
-        each = f"{row['bytes'] / row['gaussians']:.1f}"
+    """A row a format: from the least to the most over fits and pictures."""
+    lines = []
+    for suffix in dict.fromkeys(row["format"] for row in rows):
+        own = [row for row in rows if row["format"] == suffix]
+        each = [row["bytes"] / row["gaussians"] for row in own]
+        psnr = [x for row in own for x in row["psnr"] if x is not None]
+        seconds = [row["seconds"] for row in own]
         lines.append(
-            f"| `{row['run']}` | {row['gaussians']:,} | `{row['format']}` | {each} | {psnr} | {row['seconds']:.2f} |"
+            [
+                f"`{suffix}`",
+                f"{min(each):.1f}" if max(each) - min(each) < 0.1 else f"{min(each):.1f} to {max(each):.1f}",
+                f"{min(psnr):.1f} to {max(psnr):.1f}" if psnr else "the same",
+                f"{min(seconds):.2f} to {max(seconds):.2f}",
+            ]
         )
-    return "\n".join(lines)
+    return markdown_table(["format", "bytes a Gaussian", "PSNR (dB)", "seconds to write"], lines)
+
+
+def sheet(rows: list[dict]) -> list[list[str]]:
+    """The data file: a line for each fit and format; no PSNR where images are the same."""
+    views = max(len(row["psnr"]) for row in rows)
+    lines = [["fit", "gaussians", "format", "bytes_a_gaussian", *(f"psnr_{k + 1}" for k in range(views)), "seconds"]]
+    for row in rows:
+        psnr = ["" if x is None else f"{x:.1f}" for x in row["psnr"]]
+        each = f"{row['bytes'] / row['gaussians']:.1f}"
+        lines.append([row["run"], str(row["gaussians"]), row["format"], each, *psnr, f"{row['seconds']:.2f}"])
+    return lines
 
 
 def main() -> None:
@@ -102,9 +121,11 @@ def main() -> None:
     args = parser.parse_args()
     for run in [] if args.page else args.runs:
         measure(run, args.views, args.pixels)
-    text = table(read_rows(ROWS))
+    rows = read_rows(ROWS)
+    text = table(rows)
     print(text)
     fill_between(PAGE, "codecs", text)
+    write_csv(PAGE_DATA / "codecs.csv", sheet(rows))
 
 
 if __name__ == "__main__":

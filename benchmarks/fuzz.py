@@ -36,10 +36,11 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 from clocks import processor_seconds  # noqa: E402
 from fuzz_targets import TARGETS, Bench  # noqa: E402
-from fuzz_worker import GREEDY, SLOW  # noqa: E402
+from fuzz_worker import SLOW  # noqa: E402
+from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import ran  # noqa: E402
 
-from drgs.studies.tables import fill_between  # noqa: E402
+from drgs.studies.tables import fill_between, paragraph  # noqa: E402
 
 COUNTS = ROOT / "benchmarks" / "fuzz.json"
 PAGE = ROOT / "docs" / "reliability.md"
@@ -186,42 +187,38 @@ def again(name: str, number: int) -> None:
 
 
 def table(result: dict[str, Any]) -> str:
-    """The part of docs/reliability.md."""
-    rows = result["readers"]
-    names = [name for name in TARGETS if name in rows]
+    """The part of docs/reliability.md: all readers together."""
+    rows = [result["readers"][name] for name in TARGETS if name in result["readers"]]
+    ways = ", ".join(f"{row['ends'].get('ended', 0):,} of the videos" for row in rows if row["ends"].get("ended"))
     lines = [
-        f"`python benchmarks/fuzz.py`, {result['machine']}, {result['date']}, commit {result['commit']}.",
-        "",
-        "| reader | inputs | read all the same | refused in one line | slowest | memory | findings |",
+        "| readers | inputs | read all the same | refused in one line | slowest | most memory | findings |",
         "|---|---|---|---|---|---|---|",
     ]
-    total: Counter[str] = Counter()
-    for name in names:
-        row = rows[name]
-        known = sum(row["ends"].values()) or 1
-        read = row["ends"].get("read", 0) / known
-        total.update(inputs=row["inputs"], found=_found(row))
-        lines.append(
-            f"| {name} | {row['inputs']:,} | {read:.0%} | {1 - read:.0%} | {row['slowest']:.2f} s | "
-            f"{row['grown'] / 2**20:.0f} MiB | {_found(row)} |"
-        )
-    lines += [f"| all | {total['inputs']:,} | | | | | {total['found']} |", ""]
+    shares = [row["ends"].get("read", 0) / (sum(row["ends"].values()) or 1) for row in rows]
     lines.append(
-        f"Slowest: processor time of one input; more than {SLOW:g} s is a finding. Memory: what the processes grew by "
-        f"over all inputs; one that asks for more than {GREEDY >> 30} GiB is a finding."
+        f"| {len(rows)} | {sum(row['inputs'] for row in rows):,} | {min(shares):.0%} to {max(shares):.0%} | "
+        f"{1 - max(shares):.0%} to {1 - min(shares):.0%} | {max(row['slowest'] for row in rows):.2f} s | "
+        f"{max(row['grown'] for row in rows) / 2**20:.0f} MiB | {sum(map(_found, rows))} |"
     )
-    if ended := rows.get("videos", {}).get("ends", {}).get("ended", 0):
-        lines[-1] += f" {ended:,} of the videos ended the process that decodes, in one line."
-    if reached := result.get("reached"):
-        lines += ["", "Chosen by what they reach in drgs (atheris), beside these:", ""]
-        lines += ["| reader | inputs | kept, since they reached new lines | findings |", "|---|---|---|---|"]
-        for name in TARGETS:
-            if reached.get(name, {}).get("inputs"):
-                row = reached[name]
-                lines.append(f"| {name} | {row['inputs']:,} | {row['kept']:,} | {_found(row)} |")
-                total.update(reached=row["inputs"], found_so=_found(row))
-        lines.append(f"| all | {total['reached']:,} | | {total['found_so']} |")
+    made = f"`python benchmarks/fuzz.py`, {result['machine']}, {result['date']}, commit {result['commit']}"
+    reached = [row for row in result.get("reached", {}).values() if row.get("inputs")]
+    more = f"; {sum(row['inputs'] for row in reached):,} more by atheris, {sum(map(_found, reached))} findings"
+    ended = f" {ways} ended the process that decodes, in one line." if ways else ""
+    lines += ["", paragraph(f"{made} ([each reader](data/fuzz.csv){more if reached else ''}).{ended}")]
     return "\n".join(lines)
+
+
+def sheet(result: dict[str, Any]) -> list[list[str]]:
+    """The data file: each reader; `reached` are inputs that atheris chose by the lines that they reach."""
+    lines = [["reader", "inputs", "read", "slowest_s", "grown_MiB", "findings", "reached", "kept", "reached_findings"]]
+    for name in TARGETS:
+        if row := result["readers"].get(name):
+            read = row["ends"].get("read", 0) / (sum(row["ends"].values()) or 1)
+            cells = [f"{row['inputs']}", f"{read:.3f}", f"{row['slowest']:.2f}", f"{row['grown'] / 2**20:.0f}"]
+            more = result.get("reached", {}).get(name, {})
+            chosen = [str(more["inputs"]), str(more["kept"]), str(_found(more))] if more.get("inputs") else [""] * 3
+            lines.append([name, *cells, str(_found(row)), *chosen])
+    return lines
 
 
 def _found(row: dict[str, Any]) -> int:
@@ -240,7 +237,13 @@ def save(kind: str, name: str, row: dict[str, Any]) -> None:
         result = counted() | ran()
         result.setdefault(kind, {})[name] = row
         COUNTS.write_text(json.dumps(result, indent=1) + "\n")
-        fill_between(PAGE, "fuzz", table(result))
+        write_page(result)
+
+
+def write_page(result: dict[str, Any]) -> None:
+    """The table and the data file."""
+    fill_between(PAGE, "fuzz", table(result))
+    write_csv(PAGE_DATA / "fuzz.csv", sheet(result))
 
 
 def main() -> None:
@@ -250,8 +253,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0, help="for each reader, this time")
     parser.add_argument("--again", type=int, help="repeat this input of one reader")
     parser.add_argument("--fresh", action="store_true", help="count from 0, by the first inputs")
+    parser.add_argument("--page", action="store_true", help="read nothing, write the table of what is there")
     parser.add_argument("--atheris", action="store_true", help="choose inputs by what they reach")
     args = parser.parse_args()
+    if args.page:
+        write_page(counted())
+        return
     if args.again is not None:
         again(args.readers[0], args.again)
         return

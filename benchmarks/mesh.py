@@ -32,6 +32,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 import numpy as np  # noqa: E402
 from fits import Fit, fitted  # noqa: E402
+from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
 from drgs.fitting.config import FitConfig  # noqa: E402
@@ -40,7 +41,7 @@ from drgs.meshing.extraction import TriangleMesh, deviations_of, mesh_of_depths 
 from drgs.meshing.options import MeshOptions  # noqa: E402
 from drgs.scenes import room, still_life  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
+from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "mesh.jsonl"
 PAGE = ROOT / "docs" / "mesh.md"
@@ -263,25 +264,46 @@ def measure(scene: str, count: int, steps: int, ways: list[str], folder: Path) -
 # ------------------------------------------------------------------------------------------- page
 
 
-def table(rows: list[dict]) -> str:
-    """The rows as Markdown."""
-    lines = [
-        "| scene, photographs, steps | way | voxel mm | triangles | accuracy mm | anywhere mm | completeness mm | "
-        "near, of the mesh | near, of the truth | F | s |",
-        "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
-    ]
+def in_order(rows: list[dict]) -> list[dict]:
+    """As `FITS` and `WAYS` have them."""
     order = {fit: k for k, fit in enumerate(FITS)}
     ranks = {way: k for k, way in enumerate(WAYS)}
-    key = lambda row: (order[row["scene"], row["photographs"], row["steps"]], ranks[row["way"]])  # noqa: E731
-    for row in sorted(rows, key=key):
-        cells = [f"{row['scene'].replace('_', ' ')}, {row['photographs']}, {row['steps']}", row["way"]]
-        cells += [f"{row['voxel_mm']:.1f}", f"{row['triangles']:,}"]
-        names = ("accuracy_mm", "anywhere_mm", "completeness_mm")
-        cells += [f"{row[name]:.1f}" if name in row else "" for name in names]
-        cells += [f"{100 * row[name]:.0f} %" for name in ("precision", "recall")]
-        cells += [f"{row['f']:.3f}", f"{row['seconds']:.0f}"]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+    return sorted(rows, key=lambda row: (order[row["scene"], row["photographs"], row["steps"]], ranks[row["way"]]))
+
+
+def table(rows: list[dict]) -> str:
+    """The longest fit of the still life as Markdown."""
+    steps = max(row["steps"] for row in rows if row["scene"] == "still_life")
+    lines = []
+    for row in in_order(rows):
+        if (row["scene"], row["steps"]) == ("still_life", steps):
+            cells = [row["way"], f"{row['voxel_mm']:.1f}", f"{row['triangles']:,}"]
+            cells += [f"{row[name]:.1f}" for name in ("accuracy_mm", "completeness_mm")]
+            lines.append([*cells, f"{row['f']:.3f}", f"{row['seconds']:.0f}"])
+    heads = ["way", "voxel mm", "triangles", "accuracy mm", "completeness mm", "F", "s"]
+    return markdown_table(heads, lines)
+
+
+def sheet(rows: list[dict]) -> list[list[str]]:
+    """The data file: every row."""
+    names = (
+        "voxel_mm",
+        "triangles",
+        "accuracy_mm",
+        "anywhere_mm",
+        "completeness_mm",
+        "precision",
+        "recall",
+        "f",
+        "seconds",
+    )
+    lines = [["scene", "photographs", "steps", "way", *names]]
+    for row in in_order(rows):
+        cells = [
+            "" if name not in row else f"{row[name]:.4g}" if name != "triangles" else str(row[name]) for name in names
+        ]
+        lines.append([row["scene"], str(row["photographs"]), str(row["steps"]), row["way"], *cells])
+    return lines
 
 
 def main() -> None:
@@ -297,7 +319,9 @@ def main() -> None:
         for scene, count, steps in FITS:
             if scene in args.scenes and (not args.photographs or count in args.photographs):
                 measure(scene, count, steps, args.ways, args.folder.resolve())
-    fill_between(PAGE, "rows", table(read_rows(ROWS)))
+    rows = read_rows(ROWS)
+    fill_between(PAGE, "rows", table(rows))
+    write_csv(PAGE_DATA / "mesh.csv", sheet(rows))
 
 
 if __name__ == "__main__":

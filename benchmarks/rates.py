@@ -145,11 +145,10 @@ def short_table(found: list[dict]) -> str:
         if rates != "3DGS":
             continue
         plain = by[scene, steps, rates]
-        cells = [scene, f"{steps:,}", f"{statistics.mean(plain):.2f} / {min(plain):.2f}"]
+        cells = [scene, f"{steps:,}", f"{statistics.mean(plain):.2f}"]
         for name in shown:
             views = by.get((scene, steps, name))
-            more = statistics.mean(views) - statistics.mean(plain) if views else 0.0
-            cells.append(f"{more:+.2f} / {min(views) - min(plain):+.2f}" if views else "")
+            cells.append(f"{statistics.mean(views) - statistics.mean(plain):+.2f}" if views else "")
         lines.append(cells)
     return markdown_table(["capture", "steps", "3DGS", *shown], lines)
 

@@ -79,12 +79,15 @@ def report(rows: list[dict]) -> str:
         own = [of[run, way] for run in runs if (run, way) in of]
         gains = [row["score"] / of[row["run"], str(START)]["score"] for row in own]
         seconds = np.mean([row["seconds"] for row in own])
-        told.append(f"{way}: {seconds:.1f} s, {np.mean(gains):.2f} ({min(gains):.2f} to {max(gains):.2f})")
+        gained = f", {np.mean(gains):.2f} ({min(gains):.2f} to {max(gains):.2f})" if way != str(START) else ""
+        tried = way.partition(" + ")
+        what = f"{tried[0]} candidates" + (f" and {tried[2]} views tried by moving" if tried[2] else "")
+        told.append(f"{what}: {seconds:.1f} s{gained}")
+    names = ", ".join(f"`{run}`" for run in runs)
     return paragraph(
-        f"Candidates + views tried by moving, CPU time and the pick's score over that of {START} candidates: "
-        f"{'; '.join(told)}. Averages over {', '.join(f'`{run}`' for run in runs)} (least to most), {PIXELS:,} pixels "
-        f"a view (`python benchmarks/refining.py`, {rows[-1]['machine']}, {rows[-1]['date']}, commit "
-        f"{rows[-1]['commit']})."
+        f"CPU time, and the pick's score over that of {START} candidates, on average over {names} (least to most): "
+        f"{'; '.join(told)}. {PIXELS:,} pixels a view (`python benchmarks/refining.py`, "
+        f"{rows[-1]['machine']}, {rows[-1]['date']}, commit {rows[-1]['commit']})."
     )
 
 

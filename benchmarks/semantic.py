@@ -90,29 +90,27 @@ def units_of(study: Study, seeds: int) -> list:
 
 
 def table(study: Study, rows: Sequence[Mapping[str, Any]]) -> str:
-    """Blind, PSNR and mIoU: means in which every scene counts alike, and less those of the reference; by the paper's
-    protocol, which one room has, means. All else is in the data files.
+    """Blind, PSNR and mIoU: means in which every scene counts alike, and less those of the reference. All else, the
+    paper's protocol too, is in the data files.
     """
     shown = [metric for metric in study.metrics if metric.key in ("psnr", "miou")]
-    by = {name: [row for row in rows if row["protocol"] == name] for name in ("blind", "paper")}
+    blind = [row for row in rows if row["protocol"] == "blind"]
     heads = ["policy"]
     for metric in shown:
         heads += [metric.title, f"less that of `{study.reference}`"]
-    heads += ["seconds a pick", *(f"{metric.title}, `paper`" for metric in shown)]
+    heads.append("seconds a pick")
     lines = []
     for policy in study.policies:
         cells = [f"`{policy}`"]
         for metric in shown:
-            cells.append(f"{estimate(values_of(by['blind'], metric.key, policy)).mean:.{metric.digits}f}")
+            cells.append(f"{estimate(values_of(blind, metric.key, policy)).mean:.{metric.digits}f}")
             if policy == study.reference:
                 cells.append("")
                 continue
-            one = estimate(differences(by["blind"], metric.key, policy, study.reference))
+            one = estimate(differences(blind, metric.key, policy, study.reference))
             mean, low, high = (f"{x:+.{metric.digits}f}" for x in (one.mean, one.low, one.high))
             cells.append(f"{mean if one.low <= 0 <= one.high else f'**{mean}**'} [{low}, {high}]")
-        cells.append(f"{np.median([row['pick_seconds'] for row in by['blind'] if row['policy'] == policy]):.1f}")
-        for metric in shown:
-            cells.append(f"{estimate(values_of(by['paper'], metric.key, policy)).mean:.{metric.digits}f}")
+        cells.append(f"{np.median([row['pick_seconds'] for row in blind if row['policy'] == policy]):.1f}")
         lines.append(cells)
     return markdown_table(heads, lines)
 

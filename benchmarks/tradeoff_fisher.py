@@ -3,8 +3,8 @@
     python benchmarks/tradeoff_fisher.py [--scenes office still_life cube] [--runs runs/studies]
 
 Every method computes H of the training views and of every candidate, scores the candidates by `logdet` (relative prior
-1e-3) and picks; `exact` on preset `exact` is the truth. Results go to docs/tradeoff-fisher.md (tables, one plot) and
-benchmarks/tradeoff_fisher.json.
+1e-3) and picks; `exact` on preset `exact` is the truth. Results go to benchmarks/tradeoff_fisher.json, the table and
+the picture of docs/tradeoff-fisher.md and docs/data/tradeoff-fisher.csv.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from drgs import fisher
 from drgs.cameras import Camera, look_at
 from drgs.gain import Prior, information_gain
 from drgs.lab.tradeoff import scaled_diagonal
+from drgs.studies.tables import fill_between, markdown_table, paragraph
 
 Preset = drgs.RenderSettings.preset
 PRIOR = Prior(1e-3, relative=True)
@@ -129,6 +130,23 @@ def score(parts: list, trained: int) -> list[float]:
     return [information_gain(part, H, "logdet", PRIOR).total for part in parts[trained:]]
 
 
+SHOWN = (
+    "exact",
+    "order=center",
+    "fast",
+    "fast, half resolution",
+    "fast, quarter resolution",
+    "integral",
+    "gsplat (ewa)",
+    "fisherrf",
+    "probes on exact, K = 1",
+    "probes on exact, K = 16",
+    "probes on fast, K = 1",
+    "probes on fast, K = 16",
+)
+"""Methods of the page; the others are in the data file."""
+
+
 def plot(result: dict, path: Path) -> None:
     """Error against time, a panel a scene."""
     import matplotlib
@@ -155,37 +173,26 @@ def plot(result: dict, path: Path) -> None:
     figure.savefig(path, dpi=90)
 
 
-def report(result: dict, made: str, notes: str) -> str:
-    """The markdown page."""
-    lines = [
-        "# Cheaper Fisher information: what it costs and what it gives",
-        "",
-        f"Made by {made}",
-        "",
-        "Truth: method `exact` on preset `exact`. Error: relative error of the diagonal, its median over all",
-        "parameters that a view sees, then over groups. tau: Kendall's, of the candidates ranked by `logdet` (prior",
-        "1e-3 of each group's median). Regret: by how much the true gain of the view that a method picks falls short",
-        "of the best view's. Time: of the processor, one view, everything included. FisherRF's errors are those of its",
-        "formula in its own units (activations once), without rotations.",
-    ]
+def table(result: dict) -> str:
+    """A row a method of `SHOWN`: what each scene has, in their order."""
+    lines = []
+    for method in SHOWN:
+        rows = [next(r for r in rows if r["method"] == method) for rows in result.values()]
+        whole = [next(r for r in rows if r["method"] == "exact")["seconds"] for rows in result.values()]
+        times = [f"{r['seconds'] / full:.2f}" for r, full in zip(rows, whole, strict=True)]
+        each = [times, [f"{100 * r['error']:.0f} %" for r in rows], [f"{r['tau']:.2f}" for r in rows]]
+        lines.append([f"`{method}`", *(" / ".join(x) for x in each), f"{100 * max(r['regret'] for r in rows):.1f} %"])
+    return markdown_table(["method", "time", "error of the diagonal", "tau", "most regret"], lines)
+
+
+def sheet(result: dict) -> list[list[str]]:
+    """The data file: every method on every scene."""
+    lines = [["scene", "method", "seconds", "error", "tau", "regret", "median_view_below_best"]]
     for name, rows in result.items():
-        lines += [
-            "",
-            f"## {name}",
-            "",
-            f"Median view: {100 * rows[0]['spread']:.1f} % below the best.",
-            "",
-            "| method | ms a view | speed-up | error of the diagonal | tau | regret |",
-            "|---|---|---|---|---|---|",
-            *(
-                f"| {r['method']} | {1e3 * r['seconds']:.0f} | {r['speed-up']:.1f} | {r['error']:.1e} | {r['tau']:.2f} "
-                f"| {100 * r['regret']:.2f} % |"
-                for r in rows
-            ),
-        ]
-    lines += ["", "![error against time](pictures/tradeoff-fisher.png)", ""]
-    lines += ["By `python benchmarks/tradeoff_fisher.py`, as the tables.", ""]
-    return "\n".join(lines) + (f"\n## What to use{notes}" if notes else "")
+        for r in rows:
+            numbers = (r[key] for key in ("seconds", "error", "tau", "regret", "spread"))
+            lines.append([name, r["method"], *(f"{x:.4g}" for x in numbers)])
+    return lines
 
 
 def main():
@@ -201,11 +208,11 @@ def main():
         result["scenes"][name] = measure(*scene(name, args.runs))
         result["made"] = studies.stamp("tradeoff_fisher")
         studies.write_rows(store, result)
-    page = ROOT / "docs" / "tradeoff-fisher.md"
-    notes = page.read_text().partition("\n## What to use")[2] if page.exists() else ""
     plot(result["scenes"], ROOT / "docs" / "pictures" / "tradeoff-fisher.png")
-    page.write_text(report(result["scenes"], result["made"], notes))
-    print(page.read_text())
+    text = table(result["scenes"])
+    print(text)
+    fill_between(ROOT / "docs" / "tradeoff-fisher.md", "methods", f"{text}\n\n{paragraph(result['made'])}")
+    studies.write_csv(studies.PAGE_DATA / "tradeoff-fisher.csv", sheet(result["scenes"]))
 
 
 if __name__ == "__main__":

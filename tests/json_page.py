@@ -8,7 +8,7 @@ import re
 from doc_pages import ROOT
 
 PAGE = (ROOT / "docs" / "run-files.md").read_text(encoding="utf-8")
-"""What people read: every field, with fewer words."""
+"""What people read: every file, and the fields of those that a fit leaves."""
 with (ROOT / "docs" / "data" / "run-files.csv").open(encoding="utf-8", newline="") as _file:
     ROWS = list(csv.DictReader(_file))
 OF_CAPTURE = ("exposure", "wall", "shadow", "passer_by", "pose_error")

@@ -179,7 +179,7 @@ def test_links_lead_somewhere():
 def test_tests_that_pages_name_exist():
     """`tests/test_x.py::test_y`, or `test_x.py::test_y` in a table of such, is a function of that file."""
     named = 0
-    for page in PAGES:
+    for page in (*PAGES, *sorted((ROOT / "docs" / "data").glob("*.csv"))):
         for file, function in re.findall(r"(test_\w+\.py)::(\w+)", page.read_text(encoding="utf-8")):
             path = ROOT / "tests" / file
             assert path.is_file(), f"{_name(page)}: {file}"
