@@ -46,7 +46,7 @@ cuda-check: setup
 browser:
 	command -v chromium || command -v google-chrome || { apt-get update && apt-get install -y --no-install-recommends chromium; }
 
-# The commands of the README on a scene that is made in seconds; about two minutes on two cores.
+# The commands of docs/commands.md on a scene that is made in seconds; about two minutes on two cores.
 smoke: setup
 	$(BIN)/drgs --help
 	$(BIN)/drgs info

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 from drgs import libllvm as _libllvm
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 # Public name -> module that defines it, and after a colon its name there, where that is another one.
 _NAMES = {

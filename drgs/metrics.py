@@ -67,7 +67,7 @@ RENDERERS_VIEWS = 8
 """Views, at most, that a fit is measured with in every renderer at its end: `drgs eval` takes all."""
 VIEW_PICTURES = ("png", "semantics.png")
 """Of a view: that of its colors and, of a run with features, that of its labels; what follows the view's file name."""
-_NO_LPIPS = "needs the package lpips: pip install 'drgs[lpips]', and the weights that README.md names"
+_NO_LPIPS = "needs the package lpips: pip install 'drgs[lpips]', and the weights that docs/install.md names"
 _NO_WEIGHTS = "needs the weights of a backbone: pass --lpips-weights FILE (torchvision's AlexNet or VGG16)"
 _COVERED = 0.5  # opacity from which on more of a pixel is Gaussians than background
 _LPIPS_MIN_SIDE = 64  # the AlexNet backbone pools smaller images to nothing

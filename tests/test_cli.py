@@ -161,7 +161,7 @@ def test_exit_code_of_a_command(monkeypatch):
 
 
 def test_options_of_fit(monkeypatch):
-    """Defaults and every spelling that the README uses arrive in the dataclass."""
+    """Defaults and every spelling that docs/commands.md uses arrive in the dataclass."""
     got = []
     _command(monkeypatch, "fit", got.append)
     cli.main(["fit", "DATA", "-o", "RUN"])

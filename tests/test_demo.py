@@ -27,7 +27,8 @@ def test_files(result):
     """Pictures, video, run folder and JSON are there, and nothing half-written."""
     out, report, _ = result
     names = {path.name for path in out.iterdir()}
-    assert names == {".drgs.jsonl", "still_life", "run", "comparison.png", "turntable.webm", "demo.json"}
+    pictures = {"overview.png", "comparison.png", "turntable.webm"}
+    assert names == {".drgs.jsonl", "still_life", "run", "demo.json"} | pictures
     written = json.loads((out / "demo.json").read_text())
     assert written["presets"] == report["presets"]
     check("demo.json", written, maps=("seconds",), elsewhere=("mean",), absent=("total",))

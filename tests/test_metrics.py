@@ -135,7 +135,7 @@ def test_uncovered_is_a_share_of_the_mask(rng, monkeypatch):
     ("installed", "expected"), [(True, "--lpips-weights FILE"), (False, "pip install 'drgs[lpips]'")]
 )
 def test_what_lpips_needs(rng, monkeypatch, installed, expected):
-    """Weights are asked for where the package is installed, else the package; README.md names both."""
+    """Weights are asked for where the package is installed, else the package; docs/install.md names both."""
     a, b = images(rng)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: name if installed else None)
     reason = evaluate(monkeypatch, b, [frame(a)])["reasons"]["lpips"]

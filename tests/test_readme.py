@@ -1,4 +1,4 @@
-"""The README is run: its commands on a tiny scene, its Python block by block, its links and names looked up."""
+"""The README and the page of commands are run: commands on a tiny scene, Python block by block, names looked up."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from doc_pages import ROOT, blocks, commands, elsewhere, make_folder, smaller
 from drgs import cli
 
 _PAGE = ROOT / "README.md"
+_COMMANDS = ROOT / "docs/commands.md"
 README = _PAGE.read_text(encoding="utf-8")
 
 
 def _commands() -> list[list[str]]:
-    return commands(blocks(_PAGE))
+    return commands(blocks(_COMMANDS))
 
 
 @pytest.fixture(scope="module")
@@ -27,10 +28,11 @@ def folder(tmp_path_factory):
 
 
 def test_first_lines():
-    """A stranger sees the title and a picture, reads why, and then two commands that the Makefile has."""
-    lines = README.splitlines()
-    assert lines[0] == "# drgs"
-    picture = ROOT / re.match(r"!\[[^]]+\]\((.+)\)$", lines[2])[1]
+    """A stranger reads one sentence, sees a picture, and then two commands that the Makefile has."""
+    title, sentence, figure = README.split("\n\n")[:3]
+    assert title == "# drgs"
+    assert re.fullmatch(r"[^.]+\.", sentence)
+    picture = ROOT / re.match(r"!\[[^]]+\]\((.+)\)$", figure)[1]
     assert picture.stat().st_size < 300_000
     first = re.search(r"```bash\n(.*?)```", README, flags=re.S)
     assert [line.split()[:2] for line in first[1].splitlines()] == [["make", "demo"], ["make", "test"]]
@@ -39,15 +41,20 @@ def test_first_lines():
     assert all(re.search(rf"^{name}:", makefile, flags=re.M) for name in ("demo", "test", "smoke"))
 
 
+def test_it_is_short():
+    """What a visitor reads in a few minutes; the rest is on pages."""
+    assert len(README.split()) <= 1200
+
+
 def test_every_command_is_shown():
     """The list of commands is complete."""
     assert {command[0] for command in _commands()} == set(cli._OPTIONS)
 
 
 def test_commands_run(folder, monkeypatch, capsys):
-    """The commands run in the order of the README, each on what the ones before have left."""
+    """The commands run in the order of their page, then those of the README, each on what those before have left."""
     monkeypatch.chdir(folder)
-    for command in _commands():
+    for command in [*_commands(), *commands(blocks(_PAGE))]:
         if elsewhere(command):
             cli._parse_arguments(command)
             continue
@@ -82,7 +89,7 @@ def test_python_runs(tmp_path):
         place.mkdir()
         command = [sys.executable, "-c", block]
         started.append((place, subprocess.Popen(command, cwd=place, env=environ, stderr=subprocess.PIPE, text=True)))
-    assert len(started) == 3
+    assert len(started) == 1
     for place, process in started:
         _, error = process.communicate(timeout=300)
         assert process.returncode == 0, error
@@ -91,20 +98,20 @@ def test_python_runs(tmp_path):
 
 def test_terms_are_explained():
     """Words of the field are explained where they come first."""
+    text = " ".join(_COMMANDS.read_text(encoding="utf-8").split())
     for term, explanation in {
-        "dB": "dB is PSNR, the squared error on a logarithmic scale",
-        "FLIP": "FLIP what an eye sees when it flips between two images",
+        "FLIP": "FLIP (what an eye sees when it flips between two images",
         "Fisher information": "**Fisher information** about a parameter is the sum over the pixels",
         "`logdet`": "`logdet` sums log(1 + that ratio)",
         "`eig`": "`eig`, FisherRF's criterion, sums over the parameters the candidate's information divided by that of",
-        "oracle": "the oracle: float64, brute force",
+        "teacher": "A **teacher** is a network, such as LSeg, whose feature maps describe each pixel",
     }.items():
-        assert explanation in " ".join(README.split()), term
+        assert explanation in text, term
 
 
 def test_presets_and_settings_exist():
     """The table names every preset, and nothing else."""
     from drgs.settings import PRESETS
 
-    table = README.split("## Presets")[1].split("## ")[0]
+    table = _COMMANDS.read_text(encoding="utf-8").split("## Presets")[1].split("## ")[0]
     assert re.findall(r"^\| `(\w+)`", table, flags=re.M) == list(PRESETS)

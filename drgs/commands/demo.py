@@ -27,7 +27,9 @@ from drgs.files import SCHEMA, write_json
 from drgs.fitting.frames import Frame, frames_for
 from drgs.fitting.losses import psnr_of
 from drgs.guards.outputs import Claim, claim
+from drgs.information.nuisances import Nuisances
 from drgs.integrator import render
+from drgs.report import pictures as report_pictures
 from drgs.report.write import FILE
 from drgs.settings import RenderSettings
 from drgs.sizes import cropped
@@ -48,6 +50,7 @@ _PRESETS = {
     "mitsuba": "as fast, on Mitsuba's acceleration structure, entry order",
 }
 _GAIN = 8  # factor of difference pictures
+_PANEL = 600  # pixels of width of a picture in overview.png
 _OWN = ("demo", "eval", "report")  # commands whose files in the run may be replaced
 _TARGET = (0.0, -0.02, 0.12)  # the middle of the table, in meters
 _DISTANCE = 1.1
@@ -127,7 +130,7 @@ def make_demo(out_dir: Path, plan: Plan, progress: bool = False) -> dict:
         ValueError: If something is in the way that an earlier demo did not make.
     """
     with (
-        claim(out_dir, "demo", ["comparison.png", "turntable.webm", "demo.json"]),
+        claim(out_dir, "demo", ["overview.png", "comparison.png", "turntable.webm", "demo.json"]),
         claim(Path(out_dir) / "run", "demo") as run_folder,
     ):
         return _make_demo(Path(out_dir), run_folder, plan, progress)
@@ -202,13 +205,16 @@ def _make_demo(out_dir: Path, run_folder: Claim, plan: Plan, progress: bool) -> 
     )
 
     start = time.perf_counter()
+    known = [frame.camera for frame in frames_for(dataset.split()[0], config.data)]
+    pictures.write_png(out_dir / "overview.png", _overview(g, known, frames, images["exact"]))
     pictures.write_png(out_dir / "comparison.png", _sheet(frames, images))
     _turntable(g, out_dir / "turntable.webm", plan, progress)
     page = fitted.run.path / FILE
     report_of(fitted.run, page, dataset)
     lap("pictures", start)
     seconds["total"] = time.perf_counter() - began
-    say(f"6. Pictures: {out_dir / 'comparison.png'}, {out_dir / 'turntable.webm'}; the fit's report: {page}")
+    names = ", ".join(str(out_dir / name) for name in ("overview.png", "comparison.png", "turntable.webm"))
+    say(f"6. Pictures: {names}; the fit's report: {page}")
     say(f"All of it took {seconds['total']:.0f} s; numbers: {out_dir / 'demo.json'}")
     report = {
         "schema": SCHEMA,
@@ -319,6 +325,31 @@ def _race(g: Gaussians, camera: Camera, repeats: int) -> dict:
         "psnr_between": psnr_of(mse),
         "note": "its defaults: 3 sigma, 64 hits a ray, transmittance 0.01; srgb_primitives off; 1 sample a pixel",
     }
+
+
+def _overview(g: Gaussians, known: list[Camera], frames: list[Frame], images: list[torch.Tensor]) -> np.ndarray:
+    """The held-out view that is met worst: photograph, rendering, error, and the standard deviation that is predicted."""
+    import cv2
+
+    photos = [frame.image() for frame in frames]
+    worst = min(range(len(frames)), key=lambda i: metrics.psnr(images[i].clamp(0, 1), photos[i]))
+    frame, photo, image = frames[worst], photos[worst], images[worst].clamp(0, 1)
+    settings = RenderSettings.preset("fast")  # that of the fit
+    found = report_pictures.uncertain(g, known, {frame.name: frame.camera}, settings, Nuisances())
+    error = (image - photo).abs().mean(-1).numpy()
+    panels = {
+        "photograph, held out": photo.numpy(),
+        "rendering": image.numpy(),
+        "error": pictures.inferno(error / max(np.percentile(error, 99.5), 1e-6)),
+        "predicted uncertainty": pictures.map_colors(np.sqrt(found[frame.name][0]))[0],
+    }
+    wide = (_PANEL, round(_PANEL * frame.camera.height / frame.camera.width))
+    large = {
+        text: cv2.resize(x if x.dtype == np.uint8 else pictures.to_bytes(x), wide, interpolation=cv2.INTER_CUBIC)
+        for text, x in panels.items()
+    }
+    cells = [pictures.caption(x, text, times=2) for text, x in large.items()]
+    return np.concatenate([np.concatenate(cells[:2], axis=1), np.concatenate(cells[2:], axis=1)])
 
 
 def _sheet(frames: list[Frame], images: dict[str, list[torch.Tensor]]) -> np.ndarray:

@@ -334,7 +334,7 @@ class Eval(Common, Data):
     scale: float = 1.0
     """Measure pictures this many times as wide and high as those of the fit, up to the photographs' own size."""
     lpips_weights: Path | None = None
-    """torchvision's AlexNet or VGG16 (README.md names the files), for LPIPS; needs pip install 'drgs[lpips]'."""
+    """torchvision's AlexNet or VGG16 (docs/install.md names the files), for LPIPS; needs pip install 'drgs[lpips]'."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

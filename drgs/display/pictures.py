@@ -217,15 +217,15 @@ def _with_bar(picture: np.ndarray, labels: tuple[tuple[float, float], ...], digi
     return np.concatenate([picture, bar], axis=1)
 
 
-def caption(image: np.ndarray, text: str) -> np.ndarray:
-    """The picture as uint8 with a line of text above it, shrunk to fit its width."""
+def caption(image: np.ndarray, text: str, times: int = 1) -> np.ndarray:
+    """The picture as uint8 with a line of text above it, `times` as large as usual, shrunk to fit the width."""
     import cv2
 
-    strip = np.zeros((20, image.shape[1], 3), np.uint8)
-    font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.42
-    (width, _), _ = cv2.getTextSize(text, font, scale, 1)
-    scale *= min(1.0, (image.shape[1] - 8) / max(width, 1))
-    cv2.putText(strip, text, (4, 14), font, scale, _INK, 1, cv2.LINE_AA)
+    strip = np.zeros((20 * times, image.shape[1], 3), np.uint8)
+    font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.42 * times
+    (width, _), _ = cv2.getTextSize(text, font, scale, times)
+    scale *= min(1.0, (image.shape[1] - 8 * times) / max(width, 1))
+    cv2.putText(strip, text, (4 * times, 14 * times), font, scale, _INK, times, cv2.LINE_AA)
     pixels = image if image.dtype == np.uint8 else to_bytes(image)
     return np.concatenate([strip, pixels], axis=0)
 

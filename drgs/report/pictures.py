@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from drgs.report.account import Account
     from drgs.settings import RenderSettings
 
-__all__ = ["Picture", "jpeg", "maps", "previews", "spread", "stills", "view_pictures"]
+__all__ = ["Picture", "jpeg", "maps", "previews", "spread", "stills", "uncertain", "view_pictures"]
 
 _QUALITY = 88  # of JPEG; a page of thirty pictures then has about two megabytes
 _WIDEST = 1200  # pixels; more than a page is wide
@@ -117,15 +117,33 @@ def maps(
     settings: RenderSettings,
     nuisances: Nuisances,
 ) -> dict[str, tuple[Picture, Picture]]:
-    """View -> how uncertain each pixel is by what the fitted views say, and what no Gaussian covers.
+    """View -> pictures of what `uncertain` says of it."""
+    return {
+        name: (
+            jpeg(pictures.map_picture(_enlarged(variance)), "predictive variance"),
+            jpeg(_enlarged(np.repeat(bare[..., None], 3, 2)), "not covered: 1 - alpha"),
+        )
+        for name, (variance, bare) in uncertain(scene, known, shown, settings, nuisances).items()
+    }
 
-    The first is the predictive variance by the blocks geometry and backdrop, with lambda = 1; of more than 24 known
-    views, 24 evenly chosen ones stand for all. `nuisances` are eliminated from what they say.
+
+def uncertain(
+    scene: Scene,
+    known: Sequence[Camera],
+    shown: Mapping[str, Camera],
+    settings: RenderSettings,
+    nuisances: Nuisances,
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """View -> two (H, W) maps: how uncertain each pixel is by what the fitted views say, and what no Gaussian covers.
+
+    The first is the predictive variance by the blocks geometry and backdrop, with lambda = 1, for noise of 1; of more
+    than 24 known views, 24 evenly chosen ones stand for all. The second is 1 - alpha. `nuisances` are eliminated from
+    what the views say.
     """
     if not known or not shown:
         return {}
     counted = spread(known, _KNOWN)
-    result = dict[str, tuple[Picture, Picture]]()
+    result = dict[str, tuple[np.ndarray, np.ndarray]]()
     scoring = Scoring(settings=settings, blocks=_MAPPED, nuisances=nuisances)
     blocks = SceneBlocks.of(scene, scoring, [*known, *shown.values()], "report")
     with Bar("maps of information", len(counted) + len(shown)) as bar:
@@ -140,11 +158,7 @@ def maps(
             variance = blocks.variance_map(camera, weights).numpy()
             with torch.no_grad():  # a picture
                 alpha = render(plain, camera, settings, outputs=()).alpha.cpu().numpy()
-            bare = np.repeat(1 - np.clip(alpha, 0, 1)[..., None], 3, 2)
-            result[name] = (
-                jpeg(pictures.map_picture(_enlarged(variance)), "predictive variance"),
-                jpeg(_enlarged(bare), "not covered: 1 - alpha"),
-            )
+            result[name] = variance, 1 - np.clip(alpha, 0, 1)
             bar.advance()
     return result
 
