@@ -69,7 +69,7 @@ def test_damaged_ptx_is_refused(tmp_path):
 def test_committed_table_has_no_fault():
     """The kernels of the table of docs/cuda.md."""
     told = json.loads((HERE / "kernels.json").read_text())
-    assert kernels.faults(told["cases"], told["kernels"]) == []
+    assert kernels.faults(told["cases"], [*told["kernels"], *told["old"]]) == []
     assert kernels.table(told["kernels"], told["cases"])[2] in (ROOT / "docs" / "cuda.md").read_text()
 
 
@@ -119,6 +119,29 @@ def test_answers_are_given_in_the_order_of_the_questions():
     told = r"LLVM has read numpy of Float \[2\], the card reads numpy of Float \[3\]"
     with pytest.raises(RuntimeError, match=told), answers.given():
         lib.Float([0.0, 0.0, 0.0]).numpy()
+
+
+def test_one_pixel_a_lane_tells_the_same(monkeypatch):
+    """Information and tangents as a card takes them in the order of centers, where LLVM shares a lane among four."""
+    from types import SimpleNamespace
+
+    import drgs
+    from drgs import fisher
+    from drgs.testing import random_scene
+    from drgs.tracing import composite
+
+    g, (camera,) = random_scene()
+    fast = drgs.RenderSettings.preset("fast")
+    tangents = {"means": torch.randn(5, *g.means.shape, generator=torch.Generator().manual_seed(0))}
+
+    def told() -> dict[str, torch.Tensor]:
+        pushed = drgs.render_jvp(g, camera, tangents, fast).rgb
+        return {"pushed": pushed, **fisher.diagonal(g, camera, fast), "blocks": fisher.blocks(g, camera, fast)}
+
+    four = told()
+    monkeypatch.setattr(composite, "runtime", SimpleNamespace(backend=lambda: SimpleNamespace(name="cuda")))
+    for name, one in told().items():
+        assert torch.allclose(one, four[name], rtol=1e-4, atol=1e-5 * float(four[name].abs().max())), name
 
 
 def test_slots_of_warps():

@@ -153,7 +153,7 @@ def test_both_ways_to_sort_rows(rng, monkeypatch, threads):
     flat.append(sort_keys.BEYOND)  # buffers have one tile's slots more than they need
     one, other = (torch.tensor(flat, dtype=torch.float64) for _ in range(2))
     rows._sort_by_tile(one, lengths, counts, threads)
-    rows._sort_at_once(other, lengths)
+    rows._sort_at_once(other, counts)
     assert one[:-1].tolist() == expected
     assert other[:-1].tolist() == expected
 

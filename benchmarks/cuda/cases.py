@@ -151,6 +151,13 @@ def information(settings: RenderSettings) -> None:
     fisher.variance_map(g, camera, {name: 1 / (x + 1) for name, x in found.items()}, settings)
 
 
+def columns(settings: RenderSettings) -> None:
+    """Information by columns of the Jacobian, of which one traversal carries many."""
+    g, camera = scene(grad=False)
+    fisher.diagonal(g, camera, settings, "columns", groups=("logit_opacities",))
+    fisher.pose_information(g, camera, settings)
+
+
 def nuisances() -> None:
     """Information that pose and exposure of a view are eliminated from."""
     g, camera = scene(grad=False)
@@ -316,7 +323,10 @@ CASES: dict[str, _Case] = {
     "information, sh along rays": functools.partial(information, EXACT.replace(sh_direction="ray")),
     "information, nuisances": nuisances,
     "information, features": semantics,
+    "information, 8 features": functools.partial(semantics, FAST, 8),
     "information, 40 features": functools.partial(semantics, FAST, 40),
+    "columns, order of centers": functools.partial(columns, FAST),
+    "columns, exact order": functools.partial(columns, EXACT),
     "deformation network": moving,
     "select": chosen,
 }
@@ -341,6 +351,14 @@ FRAMES: dict[str, _Case] = {
     for kind in _KINDS
     if (kind, name) != ("diagonal", "gsplat")
 }
-FRAMES["large step, fast"] = functools.partial(frame, 1_000_000, 1920, 1080, FAST, "step", 3)
-FRAMES["large step, exact"] = functools.partial(frame, 1_000_000, 1920, 1080, EXACT, "step", 3)
-"""Frames whose launches, waits and memory are counted; the size of the scene changes them little."""
+SIZES = ((100_000, 960, 540), (200_000, 960, 540))
+LARGE = ((100_000, 1920, 1080), (200_000, 1920, 1080), (1_000_000, 1920, 1080))
+"""(Gaussians, width, height) of the steps of which frames.py counts memory, the large ones of `fast` alone: LLVM takes
+minutes for their rows in exact order.
+"""
+FRAMES |= {
+    f"step, {name}, {count}, {width}x{height}": functools.partial(frame, count, width, height, Preset(name), "step", 3)
+    for name, sizes in (("fast", SIZES + LARGE), ("exact", SIZES))
+    for count, width, height in sizes
+}
+"""Frames whose launches, waits and memory are counted."""

@@ -1,6 +1,6 @@
 """How much of a warp idles: iterations of the compositing loop, counted on LLVM and laid out as a card would run them.
 
-    python benchmarks/cuda/warps.py [--print]     table of docs/cuda.md and benchmarks/cuda/warps.json; two minutes
+    python benchmarks/cuda/warps.py [--print]     benchmarks/cuda/warps.json; two minutes
 
 A warp of 32 lanes goes on until the last of its lanes has finished. A lane of the tile walk in the order of centers
 has four pixels, and finishes when its list ends or all four are opaque; in exact order it has one pixel and a row of
@@ -27,7 +27,6 @@ from exact import scene  # noqa: E402
 from where import ran  # noqa: E402
 
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
 from drgs.tracing.bridge import to_drjit  # noqa: E402
 from drgs.tracing.call import Call  # noqa: E402
 
@@ -167,18 +166,13 @@ def main() -> None:
     parser.add_argument("--print", action="store_true", help="write nothing")
     args = parser.parse_args()
     found = {f"{name}, {preset}": measured(name, preset) for name in SCENES for preset in PRESETS}
-    lines = ["| scene, preset | layout | slots | busy | iterations of warps |", "|---|---|---|---|---|"]
     for case, layouts in found.items():
         first = next(iter(layouts.values()))
         for layout, x in layouts.items():
-            if layout.startswith("16") and not layout.endswith("4 pixels a lane"):
-                continue
-            share = f"{x['slots'] / first['slots']:.2f}x"
-            lines.append(f"| {case} | {layout} | {share} | {x['busy']:.0%} | {x['turns'] / first['turns']:.2f}x |")
-    print("\n".join(lines))
+            slots, loads = (x[key] / first[key] for key in ("slots", "turns"))
+            print(f"{case}, {layout}: {slots:.2f}x slots, {x['busy']:.0%} of them busy, {loads:.2f}x loads")
     if not args.print:
         (HERE / "warps.json").write_text(json.dumps({"ran": ran(), "found": found}, indent=1) + "\n")
-        fill_between(ROOT / "docs" / "cuda.md", "warps", "\n".join(lines))
 
 
 if __name__ == "__main__":

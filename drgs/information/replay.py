@@ -108,7 +108,7 @@ class Replay:
         self.inputs = {name: to_drjit(lib, x) for name, x in call.inputs.items()}
         self.compositor, arguments = call.prepare(self.inputs)
         with dr.suspend_grad():  # nothing is recorded: what is wanted are the hits of this view
-            images = self.compositor.forward(*arguments, keep=True, joint=call.width)
+            images = self.compositor.forward(*arguments, keep=True, joint=call.width, rows=True)
         self.opacity = images["alpha"].torch().cpu().reshape(call.shape)  # (H, W)
         p = {name: x.array for name, x in self.inputs.items()}
         self.mask = None if mask is None else to_drjit(lib, mask.float().reshape(-1).to(call.home)).array

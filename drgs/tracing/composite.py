@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import drjit as dr
 import torch
 
+from drgs import runtime
 from drgs.settings import RenderSettings
 from drgs.tracing.arrays import Float, Lib, Mask, UInt32
 from drgs.tracing.derivatives import Adjoint, Tangent
@@ -27,6 +28,7 @@ from drgs.tracing.weights import MATRIX, PIXELS, Weights, in_rows, without_graph
 __all__ = ["CHUNK", "Arguments", "Composite", "Compositor", "compositor_of"]
 
 CHUNK = 32  # feature channels of one traversal
+_SHARED = 3  # tangents of four pixels that fit a card's registers
 
 
 class Arguments(NamedTuple):
@@ -142,6 +144,7 @@ class Compositor:
         keep: bool,
         columns: int = 0,
         joint: int = 0,
+        rows: bool = False,
     ) -> dict:
         """Flat images rgb, alpha, and where there are any depth and features.
 
@@ -156,6 +159,7 @@ class Compositor:
             columns: So many tangents may follow.
             joint: Feature channels that the first traversal composites with the colors, none or all, so that each of
                 its hits knows all that it composites (`information.replay`).
+            rows: The Jacobian's rows of each hit may follow.
         """
         view = self.traversal
         self.absolute: Any = absolute
@@ -175,6 +179,8 @@ class Compositor:
         self.passes += [self._channels(k, min(CHUNK, self.width - k)) for k in chunks]
         # In the order of the list four pixels can share a lane; more channels or a basis each would not fit registers.
         share = 4 if self.settings.order == "center" and self.settings.traversal == "tiles" and not self.basis else 1
+        if runtime.backend().name == "cuda" and (rows or columns > _SHARED):
+            share = 1  # LLVM is faster with four, of which ptxas would spill what a hit has
         weighed = self.width > joint
         self.parts = view.weighed(share, MATRIX // (1 + columns)) if weighed else view.parts(share)
         out = self._composited(frozenset(self.want | ({"replay"} if keep else set())), count_of(record))

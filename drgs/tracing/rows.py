@@ -195,19 +195,22 @@ def _sort(words: torch.Tensor, lengths: torch.Tensor, counts: torch.Tensor) -> N
         counts: (tiles, PIXELS) hits of each row; what is behind them is `BEYOND`.
     """
     if words.is_cuda:
-        _sort_at_once(words, lengths)
+        _sort_at_once(words, counts)
     else:
         _sort_by_tile(words, lengths, counts, runtime.backend().threads)
 
 
-def _sort_at_once(words: torch.Tensor, lengths: torch.Tensor) -> None:
-    """Sort by words, then, stably, by rows: cards sort one long array faster than many short ones."""
-    row = torch.arange(PIXELS * len(lengths), device=words.device)
-    row = row.repeat_interleave(lengths.repeat_interleave(PIXELS))
-    used = words[: len(row)]
-    # The stable second sort keeps the order of the first within each row.
-    order = torch.sort(used).indices
-    used.copy_(used[order[torch.sort(row[order], stable=True).indices]])
+def _sort_at_once(words: torch.Tensor, counts: torch.Tensor) -> None:
+    """Sort by words, then, stably, by rows: cards sort one long array faster than many short ones.
+
+    Only hits are sorted, for half of the rows or more is behind them; hits stay in the same places.
+    """
+    places = (words != BEYOND).nonzero()[:, 0]
+    row = torch.arange(counts.numel(), dtype=torch.int32, device=words.device)
+    row = row.repeat_interleave(counts.reshape(-1), output_size=len(places))
+    order = torch.sort(words[places]).indices
+    order = order[torch.sort(row[order], stable=True).indices]
+    words[places] = words[places[order]]
 
 
 def _sort_by_tile(words: torch.Tensor, lengths: torch.Tensor, counts: torch.Tensor, threads: int) -> None:
