@@ -76,7 +76,7 @@ def _run(line: str, where: str) -> None:
     words = shlex.split(line, comments=True)
     while words and re.fullmatch(r"[A-Z_]+=.*", words[0]):
         words = words[1:]
-    if words[0] != "drgs":
+    if words[0].rpartition("/")[2] != "drgs":
         _check_line(words, where)
     elif elsewhere(words[1:]):
         cli._parse_arguments(words[1:])
@@ -138,7 +138,7 @@ def test_commands_in_the_text_exist():
                 words = shlex.split(command)
             except ValueError:
                 raise AssertionError(f"{where}: {command}") from None
-            if words[0] != "drgs":
+            if words[0].rpartition("/")[2] != "drgs":
                 _check_line(words, where)
                 continue
             if words[1] in ("--help", "--version"):
