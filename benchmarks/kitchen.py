@@ -180,7 +180,6 @@ def main() -> int:
         SCALES,
         study_of,
         units_of,
-        planned=lambda seeds: min(seeds, len(UNITS)) * len(study_of("small", Path()).policies),
         report=page,
         seeds=len(UNITS),
         rows="dynamic",

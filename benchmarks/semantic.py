@@ -122,7 +122,6 @@ def main() -> int:
         SCALES,
         study_of,
         units_of,
-        planned=lambda seeds: seeds * (len(SPLITS) + 1) * len(study_of("small", Path()).policies),
         report=table,
         rows="static",
         sheets=True,

@@ -263,7 +263,6 @@ def command(
     scales: Iterable[str],
     study_of: Callable[[str, Path], Study],
     units_of: Callable[[Study, int], list],
-    planned: Callable[[int], int],
     report: Callable[[Study, list[dict]], str],
     rows: str,
     seeds: int = 3,
@@ -277,7 +276,6 @@ def command(
         scales: Values of --scale, the default first.
         study_of: Scale, folder of runs -> study.
         units_of: Study, --seeds -> units, as `Study.cells` takes them.
-        planned: --seeds -> cells of the whole study.
         report: Study, its rows -> tables.
         rows: Name of the file of rows.
         seeds: The default of --seeds.
@@ -301,9 +299,8 @@ def command(
     study = study_of(args.scale, args.runs)
     if args.page:
         found = [row for row in read_study(results) if row["study"] == study.name]
-        done = f"{len(found)} of {planned(args.seeds)} cells are finished."
-        text = f"`python benchmarks/{script}.py --scale {args.scale}`: {done}\n\n"
-        fill_between(page, script, text + report(study, found))
+        by = f"By `python benchmarks/{script}.py --scale {args.scale}`."
+        fill_between(page, script, f"{by}\n\n{report(study, found)}")
         for name, lines in study_sheets(study, found).items() if sheets else ():
             write_csv(PAGE_DATA / f"{script}-{name}.csv", lines)
         return 0

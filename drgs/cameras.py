@@ -490,7 +490,7 @@ def places_in_time(cameras: Sequence[Camera]) -> np.ndarray:
     """Where cameras stand, and when, in numbers whose distances can be compared.
 
     Args:
-        cameras: At least one. Those without a time have time 0.
+        cameras: Cameras, at least one of them; what has no time has time 0.
     Returns:
         (N, 4) center and time, each divided by its own range: the largest distance between two centers is as far as
         the first time is from the last one.
