@@ -328,7 +328,7 @@ def _race(g: Gaussians, camera: Camera, repeats: int) -> dict:
 
 
 def _overview(g: Gaussians, known: list[Camera], frames: list[Frame], images: list[torch.Tensor]) -> np.ndarray:
-    """The held-out view that is met worst: photograph, rendering, error, and the standard deviation that is predicted."""
+    """The held-out view that is met worst: photograph, rendering, error, and the predicted standard deviation."""
     import cv2
 
     photos = [frame.image() for frame in frames]
