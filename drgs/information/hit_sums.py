@@ -19,12 +19,15 @@ import torch
 from drgs.information.jacobian import GEOMETRY, Row
 from drgs.tracing.arrays import Float, Lib, Mask, UInt32
 from drgs.tracing.bridge import to_drjit
+from drgs.tracing.records import packed_size
+from drgs.tracing.sums import add_row
 
 if TYPE_CHECKING:
     from drgs.information.replay import Replay, Walk
 
 __all__ = ["HitSums"]
 
+_WIDTH = packed_size(GEOMETRY)  # floats of an image and a Gaussian
 _NOBODY = 0xFFFFFFFF  # place of a Gaussian that is not asked
 
 
@@ -55,7 +58,7 @@ class HitSums:
         """What takes the rows of one walk of a view; its `buffer` is to be evaluated afterwards."""
         lib, home = replay.lib, replay.call.home
         if self._buffer is None:
-            self._buffer = dr.zeros(lib.Float, max(1, len(self.images) * len(self.asked) * GEOMETRY))
+            self._buffer = dr.zeros(lib.Float, max(1, len(self.images) * len(self.asked) * _WIDTH))
         first = 0 if walk.first else walk.start
         channels = slice(first, first + (walk.channels.outputs if walk.first else walk.channels.channels))
         images = self.images[..., channels].to(home)
@@ -68,7 +71,8 @@ class HitSums:
         K, M = len(self.images), len(self.asked)
         if self._buffer is None:
             return torch.zeros(K, M, GEOMETRY)
-        return self._buffer.torch()[: K * M * GEOMETRY].reshape(M, K, GEOMETRY).permute(1, 0, 2)
+        rows = self._buffer.torch()[: K * M * _WIDTH].reshape(M, K, _WIDTH)
+        return rows[..., :GEOMETRY].permute(1, 0, 2)
 
 
 class _Along:
@@ -78,7 +82,7 @@ class _Along:
         walk: The walk.
         images: (K, pixels, C) of the channels that it composites and that weigh.
         places: (N,) of each Gaussian in the buffer, `_NOBODY` where it is not asked.
-        buffer: (M K 10) added to.
+        buffer: (M K _WIDTH) added to.
     """
 
     needs_color = False
@@ -116,9 +120,8 @@ class _Along:
                 totals = [dr.fma(x, z, total) for x, total in zip(slopes, totals, strict=True)]
                 for by_mean, x in zip(turned if self.walk.first else [], u, strict=False):
                     totals[:3] = [dr.fma(y, x, total) for y, total in zip(by_mean, totals, strict=False)]
-            at = (place * self.count + k) * GEOMETRY
-            for j, total in enumerate(totals):
-                dr.scatter_add(self.buffer, total, at + j, mode=self.walk.part.reduction)
+            row = place * self.count + k
+            add_row(lib, self.buffer, totals, row, _WIDTH, 0, lib.Bool(True), self.walk.part.reduction)
             return k + 1, place, own
 
         loop = (lib.UInt32(0), place, own)

@@ -24,6 +24,7 @@ from drgs.tracing.primitives import Projected, Ray
 from drgs.tracing.protocols import Sink
 from drgs.tracing.records import load_packed, pack, packed_size
 from drgs.tracing.responses import Response
+from drgs.tracing.sums import add_row
 
 __all__ = ["GEOMETRY", "Blocks", "Diagonal", "Rows", "Together", "Variance", "extras"]
 
@@ -199,7 +200,7 @@ def _entry(slopes: list[Float], g: list[Float], turned: list[list[Float]] | None
 
 
 class Diagonal:
-    """Sums of squares into a buffer of `width` floats a Gaussian: geometry, sum w^2, then by band and channel.
+    """Sums of squares into a buffer of `width` floats a Gaussian: geometry, sum w^2, by band and channel, then padding.
 
     Args:
         weights: Weights of the channels: colors first, where they are composited.
@@ -219,7 +220,7 @@ class Diagonal:
         bands: int = 0,
         summed: bool = False,
     ) -> None:
-        self.width = GEOMETRY + 1 + 3 * bands
+        self.width = packed_size(GEOMETRY + 1 + 3 * bands)
         self.buffer = dr.zeros(lib.Float, count * self.width)
         self.weights = weights
         self.entries = entries
@@ -234,6 +235,7 @@ class Diagonal:
 
     def take(self, lib: Lib, index: UInt32, hits: Mask, rows: list[Row], states: list[dict]) -> list[dict]:
         """Add a hit's rows."""
+        sums: list[Float | None] = [None] * (GEOMETRY + 1)
         for k in self.entries:
             total = lib.Float(0)
             for row in rows:
@@ -241,12 +243,12 @@ class Diagonal:
                     total = dr.fma(row.w, row.w, total)
                 else:
                     total += weighted_squares(row, k, self.weights, self.summed)
-            dr.scatter_add(self.buffer, total, index * self.width + k, hits, mode=self.mode)
+            sums[k] = total
         for k in range(self.bands):
             for c in range(3):
                 slopes = [dr.select(row.color[c] > 0, row.w * row.basis[k], 0) for row in rows]
-                at = index * self.width + (GEOMETRY + 1 + 3 * k + c)
-                dr.scatter_add(self.buffer, sum(x * x for x in slopes), at, hits, mode=self.mode)
+                sums.append(sum(x * x for x in slopes))
+        add_row(lib, self.buffer, sums, index, self.width, 0, hits, self.mode)
         return states
 
 
@@ -269,10 +271,12 @@ def _uncolored(row: Row, weights: Sequence[float]) -> Float:
 
 
 class Blocks:
-    """Sums of outer products: the lower triangles of (13, 13), row by row; base colors follow the geometry."""
+    """Sums of outer products: the lower triangles of (13, 13), row by row, then padding; base colors follow the
+    geometry.
+    """
 
     SIZE = GEOMETRY + 3
-    WIDTH = SIZE * (SIZE + 1) // 2
+    WIDTH = packed_size(SIZE * (SIZE + 1) // 2)
     needs_color = True
 
     def __init__(self, lib: Lib, count: int, weights: Sequence[float], mode: dr.ReduceMode) -> None:
@@ -295,6 +299,7 @@ class Blocks:
                 # d color / d sh_0, 0 where the color is clamped.
                 lit = dr.select(row.color[c] > 0, row.w * Y_00, 0)
                 full.append((self.weights[c], [*entries, *(lit if k == c else None for k in range(3))]))
+        sums: list[Float | None] = []
         for i in range(self.SIZE):
             for j in range(i + 1):
                 total = lib.Float(0)
@@ -303,8 +308,8 @@ class Blocks:
                         total = dr.fma(weight * entries[i], entries[j], total)
                 for slopes, squares in others if i < GEOMETRY else ():
                     total = dr.fma(slopes[i] * slopes[j], squares, total)
-                at = index * self.WIDTH + (i * (i + 1) // 2 + j)
-                dr.scatter_add(self.buffer, total, at, hits, mode=self.mode)
+                sums.append(total)
+        add_row(lib, self.buffer, sums, index, self.WIDTH, 0, hits, self.mode)
         return states
 
 

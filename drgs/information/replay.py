@@ -244,7 +244,7 @@ class Replay:
             others = [sums.sink(self, walk) for sums in beside]
             # A buffer is float32, which one traversal fills; what several add up to is float64.
             dr.eval(self.run(walk, Together([sink, *others])), sink.buffer, [other.buffer for other in others])
-            found = _torch(sink.buffer).reshape(self.count, -1)
+            found = _torch(sink.buffer).reshape(self.count, -1)[:, :width]
             total[:, : found.shape[1]] += found
         return total
 
@@ -280,8 +280,8 @@ class Replay:
         """`fisher.blocks` of one view."""
         lib, size = self.lib, Blocks.SIZE
         made = lambda walk, mode: Blocks(lib, self.count, walk.weights, mode)  # noqa: E731
-        total = self._summed(made, Blocks.WIDTH, weights)
         row, column = torch.tril_indices(size, size)
+        total = self._summed(made, len(row), weights)
         full = torch.zeros(self.count, size, size, dtype=torch.float64)
         full[:, row, column] = total
         full[:, column, row] = total

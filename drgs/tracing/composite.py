@@ -22,6 +22,7 @@ from drgs.tracing.harmonics import sh_basis
 from drgs.tracing.hit_table import Table, along_lists
 from drgs.tracing.kernels import Channels, Emit, HitModel, Primal
 from drgs.tracing.records import RECORD, count_of, pack, pack_records
+from drgs.tracing.sums import add_row
 from drgs.tracing.walk import Part, Traversal
 from drgs.tracing.weights import MATRIX, PIXELS, Weights, in_rows, without_graph
 
@@ -399,9 +400,8 @@ class Compositor:
         """Add w times the cotangents of a feature pass to the gradient of its features: dL/df_i = sum w_i dL/dF."""
 
         def emit(index: UInt32, k: int, place: list, w: Float, ok: Mask) -> None:
-            base = index * self.width + channels.first
-            for c, cotangent in enumerate(cotangents[k]["sum"]):
-                dr.scatter_add(grad, w * cotangent, base + c, ok, mode=part.reduction)
+            slopes = [w * cotangent for cotangent in cotangents[k]["sum"]]
+            add_row(self.lib, grad, slopes, index, self.width, channels.first, ok, part.reduction)
 
         dr.eval(part.run(Primal(self.model, self._channels(), frozenset(), emit)), grad)
 

@@ -30,6 +30,7 @@ from drgs.tracing.hit_table import Table, replayed_hit
 from drgs.tracing.kernels import Channels, Emit, HitModel, Primal
 from drgs.tracing.primitives import Ray
 from drgs.tracing.records import load_packed, packed_size
+from drgs.tracing.sums import add_row
 
 __all__ = ["Adjoint", "Tangent", "if_any_hit"]
 
@@ -186,13 +187,10 @@ class Adjoint:
             for new, own in zip(out, carried, strict=True):
                 new["carried"] = [x + dr.grad(y) for x, y in zip(new["carried"], own, strict=True)]
         if self.absolute is not None:
-            for k, x in enumerate(moved):
-                dr.scatter_add(self.absolute, x, 2 * index + k, hits, mode=self.mode)
-        for name, (stride, offset, count) in self.channels.layout(rays[0]).items():
-            for k in range(count):
-                if name != "record" or k in self.slots:
-                    at = index * stride + offset + k
-                    dr.scatter_add(self.grads[name], grads[name][k], at, hits, mode=self.mode)
+            add_row(lib, self.absolute, moved, index, 2, 0, hits, self.mode)
+        for name, (stride, offset, _) in self.channels.layout(rays[0]).items():
+            own = [x if name != "record" or k in self.slots else None for k, x in enumerate(grads[name])]
+            add_row(lib, self.grads[name], own, index, stride, offset, hits, self.mode)
         return out
 
     def _moves(self, slope: Float, fixed: dict, ray: Ray) -> list[Float]:
