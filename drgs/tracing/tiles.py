@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import drjit as dr
@@ -42,7 +42,9 @@ TABLES = 128 << 20
 _NOWHERE = 2**64 - 1
 _HELD = 128 << 20  # bytes of the orders of all pixels, which derivatives need again
 _TAILS = 5e-6  # what the tails left out of a pixel may add up to
-_LARGE = 8  # tiles of a box, on average
+_LARGE = 8  # tiles of a box, on average, from which on each is looked at
+_HUGE = 16  # likewise, from which on blocks of them are, first
+_BLOCK = 8  # tiles along the edge of a block
 
 
 class TileTraversal:
@@ -314,34 +316,29 @@ def build(
         # Emitting in depth order leaves 32 bits for the rank, so ties fall by index and nothing is quantized.
         order = depth_order(lib, projected.key, gaussian)
         amount = dr.gather(lib.UInt32, amount, order)
-    total64 = dr.sum(lib.UInt64(amount))[0]
-    if total64 >= 2**32:
-        raise ValueError(
-            f"render: the tile lists must have fewer than 2^32 entries, got {total64}; lower extent or image size"
-        )
-    pairs = int(total64)
-    what = f"{pairs} entries of tile lists ({count} Gaussians, {width}x{height} pixels)"
-    memory.require("render", memory.PAIR * pairs, what, "lower extent or image size", runtime.backend().name == "cuda")
     start = dr.zeros(lib.UInt32, columns * rows)
     end = dr.zeros(lib.UInt32, columns * rows)
     nothing = Lists(dr.zeros(lib.UInt32, 1), start, end, columns, rows, 0)
-    if pairs == 0:
-        return nothing
-    offset = dr.cumsum(amount) - amount
-    keys = dr.full(lib.UInt64, _NOWHERE, pairs)
+    x, y = ([dr.gather(lib.Int32, b, order) for b in along] for along in ((tx0, tx1), (ty0, ty1)))
+    boxes = _Boxes(lib, gaussian, x, y, amount)
+    boxes_seen = int(dr.sum(dr.select(seen, lib.UInt32(1), 0))[0])
+    what = f"({count} Gaussians, {width}x{height} pixels)"
     # A box holds many tiles that its ellipse misses, most of all where a Gaussian reaches behind the camera. Small
     # boxes hold few, and looking for them costs more than they do.
-    large = pairs > _LARGE * int(dr.sum(dr.select(seen, lib.UInt32(1), 0))[0])
-    box = [dr.gather(lib.Int32, b, order) for b in (tx0, tx1, ty0, ty1)]
+    tested = boxes.pairs > _LARGE * boxes_seen
     loaded = [dr.gather(lib.Float, record, order * layout.RECORD + k) for k in range(layout.RECORD)]
-    tiles = _Tiles(lib, settings, loaded, lens=lens)
-    _emit(lib, keys, gaussian, amount, offset, box, columns, tiles, large)
-    if large:
-        kept = dr.compress(keys != _NOWHERE)
-        pairs = dr.width(kept)
-        if pairs == 0:
+    if boxes.pairs > _HUGE * boxes_seen and lens is None:
+        across = -(-columns // _BLOCK)
+        found = boxes.of_blocks().keys(across, _Tiles(lib, settings, loaded, size=_BLOCK * TILE), what)
+        if not dr.width(found):
             return nothing
-        keys = dr.gather(lib.UInt64, keys, kept)
+        boxes = boxes.within(found, across)
+        at = dr.gather(lib.UInt32, order, boxes.gaussian) * layout.RECORD
+        loaded = [dr.gather(lib.Float, record, at + k) for k in range(layout.RECORD)]
+    keys = boxes.keys(columns, _Tiles(lib, settings, loaded, lens=lens) if tested else None, what)
+    pairs = dr.width(keys)
+    if pairs == 0:
+        return nothing
     keys = ascending(lib, keys)
     tile = lib.UInt32(keys >> 32)
     index = dr.gather(lib.UInt32, order, lib.UInt32(keys & 0xFFFFFFFF))
@@ -418,6 +415,7 @@ class _Tiles:
         loaded: The first entries of each lane's record.
         cut: What is taken off squared extents.
         lens: The camera's, if it is no pinhole.
+        size: Pixels along the edge of a tile, or of a block of tiles.
     """
 
     def __init__(
@@ -427,8 +425,10 @@ class _Tiles:
         loaded: list[Float],
         cut: Float | int = 0,
         lens: LensRays | None = None,
+        size: int = TILE,
     ) -> None:
         self.lib = lib
+        self.size = size
         self.lens = lens
         self.r = loaded
         self.response = response_of(settings)
@@ -445,8 +445,8 @@ class _Tiles:
         if self.lens is not None:
             return self.lens.patch(self.r, x, y)
         at = (self.lib.Float(v) + 0.5 for v in (x, y))
-        dx, dy = (v * TILE - self.r[k] for v, k in zip(at, (layout.AX, layout.AY), strict=True))
-        half = 0.5 * (TILE - 1)
+        dx, dy = (v * self.size - self.r[k] for v, k in zip(at, (layout.AX, layout.AY), strict=True))
+        half = 0.5 * (self.size - 1)
         return Patch(dx, dy, 1, (half, half))
 
     def may_hit(self, x: Int32, y: Int32) -> Mask:
@@ -456,30 +456,81 @@ class _Tiles:
         return self.response.may_hit(self.r, self.patch(x, y), self.limit)
 
 
-def _emit(
-    lib: Lib,
-    keys: UInt64,
-    gaussian: UInt32,
-    amount: UInt32,
-    offset: UInt32,
-    box: list[Int32],
-    columns: int,
-    tiles: _Tiles,
-    large: bool,
-) -> None:
-    """Write the sort key of every (tile, Gaussian) pair; of those that may have a hit, if boxes are `large`."""
-    x0, x1, y0, _ = box
+class _Boxes:
+    """Boxes of tiles, or of blocks of tiles, each of one Gaussian.
 
-    def body(k: UInt32, x: Int32, y: Int32) -> tuple[UInt32, Int32, Int32]:
-        """Write one pair, and step to the next tile of the box, row by row."""
-        tile = lib.UInt32(y * columns + x)
-        key = (lib.UInt64(tile) << 32) | lib.UInt64(gaussian)
-        dr.scatter(keys, key, offset + k, tiles.may_hit(x, y) if large else True)
-        wrap = x >= x1
-        return k + 1, dr.select(wrap, x0, x + 1), dr.select(wrap, y + 1, y)
+    Args:
+        gaussian: (boxes,) place of the Gaussian in the order of the lists.
+        x, y: First and last column, first and last row, (boxes,) each.
+        amount: (boxes,) how many tiles a box holds; 0: it is none.
+    Attributes:
+        pairs: Number of tiles that all boxes hold.
+    """
 
-    with dr.suspend_grad():  # lists have no derivative
-        dr.while_loop(
-            (dr.zeros(lib.UInt32, dr.width(gaussian)), lib.Int32(x0), lib.Int32(y0)), lambda k, x, y: k < amount, body
-        )
-    dr.eval(keys)
+    def __init__(
+        self, lib: Lib, gaussian: UInt32, x: Sequence[Int32], y: Sequence[Int32], amount: UInt32 | None = None
+    ) -> None:
+        self.lib = lib
+        self.gaussian = gaussian
+        self.x, self.y = tuple(x), tuple(y)
+        self.amount = _area(lib, x, y) if amount is None else amount
+        dr.eval(self.gaussian, self.x, self.y, self.amount)
+        self.pairs = int(dr.sum(lib.UInt64(self.amount))[0])
+
+    def of_blocks(self) -> _Boxes:
+        """The boxes of blocks that hold these."""
+        x, y = ([v // _BLOCK for v in along] for along in (self.x, self.y))
+        return _Boxes(self.lib, self.gaussian, x, y, dr.select(self.amount > 0, _area(self.lib, x, y), 0))
+
+    def within(self, keys: UInt64, across: int) -> _Boxes:
+        """What lies of these boxes in each of some blocks, of which `across` are side by side."""
+        lib = self.lib
+        gaussian = lib.UInt32(keys & 0xFFFFFFFF)
+        block = lib.Int32(keys >> 32)
+        parts = []
+        for (low, high), first in zip((self.x, self.y), (block % across, block // across), strict=True):
+            low, high = (dr.gather(lib.Int32, v, gaussian) for v in (low, high))
+            first = first * _BLOCK
+            parts.append((dr.maximum(low, first), dr.minimum(high, first + _BLOCK - 1)))
+        return _Boxes(lib, gaussian, *parts)
+
+    def keys(self, columns: int, tiles: _Tiles | None, what: str) -> UInt64:
+        """The sort key of every pair of a tile and a Gaussian, the tile first; of those that may have a hit.
+
+        Args:
+            columns: Tiles in x.
+            tiles: Says which may have one; None: all.
+            what: Of which scene and image they are, for messages.
+        """
+        lib = self.lib
+        advice = "lower extent or image size"
+        if self.pairs >= 2**32:
+            raise ValueError(
+                f"render: the tile lists must have fewer than 2^32 entries, got {self.pairs} {what}; {advice}"
+            )
+        what = f"{self.pairs} entries of tile lists {what}"
+        memory.require("render", memory.PAIR * self.pairs, what, advice, runtime.backend().name == "cuda")
+        if self.pairs == 0:
+            return dr.zeros(lib.UInt64, 0)
+        offset = dr.cumsum(self.amount) - self.amount
+        keys = dr.full(lib.UInt64, _NOWHERE, self.pairs)
+        x0, x1 = self.x
+
+        def body(k: UInt32, x: Int32, y: Int32) -> tuple[UInt32, Int32, Int32]:
+            """Write one pair, and step to the next tile of the box, row by row."""
+            tile = lib.UInt32(y * columns + x)
+            key = (lib.UInt64(tile) << 32) | lib.UInt64(self.gaussian)
+            dr.scatter(keys, key, offset + k, True if tiles is None else tiles.may_hit(x, y))
+            wrap = x >= x1
+            return k + 1, dr.select(wrap, x0, x + 1), dr.select(wrap, y + 1, y)
+
+        start = dr.zeros(lib.UInt32, dr.width(self.gaussian)), lib.Int32(x0), lib.Int32(self.y[0])
+        with dr.suspend_grad():  # lists have no derivative
+            dr.while_loop(start, lambda k, x, y: k < self.amount, body)
+        dr.eval(keys)
+        return keys if tiles is None else dr.gather(lib.UInt64, keys, dr.compress(keys != _NOWHERE))
+
+
+def _area(lib: Lib, x: Sequence[Int32], y: Sequence[Int32]) -> UInt32:
+    """Number of tiles between the first and the last column and row."""
+    return lib.UInt32((x[1] - x[0] + 1) * (y[1] - y[0] + 1))
