@@ -221,7 +221,7 @@ def blocks(
     total = torch.zeros(count, BLOCK, BLOCK, dtype=torch.float64)
     for camera, mask in zip(cameras, mask_list("fisher.blocks", masks, cameras), strict=True):
         seen = gaussians_at("fisher.blocks", gaussians, camera)
-        check_same_parameters("fisher.blocks", "blocks", total, (len(seen), BLOCK, BLOCK))
+        check_same_parameters("fisher.blocks", "blocks", tuple(total.shape), (len(seen), BLOCK, BLOCK))
         if semantics is not None:
             semantics.check("fisher.blocks", seen)
         if len(seen):
@@ -249,7 +249,7 @@ def coverage(
     total = torch.zeros(len(gaussians_at("fisher.coverage", gaussians, cameras[0])), dtype=torch.float64)
     for camera, mask in zip(cameras, mask_list("fisher.coverage", masks, cameras), strict=True):
         seen = gaussians_at("fisher.coverage", gaussians, camera)
-        check_same_parameters("fisher.coverage", "coverage", total, (len(seen),))
+        check_same_parameters("fisher.coverage", "coverage", tuple(total.shape), (len(seen),))
         if len(seen):
             total += Replay(seen, camera, settings, geometry=False, mask=mask).sums((GEOMETRY,), [1.0] * 3)[:, GEOMETRY]
     return total

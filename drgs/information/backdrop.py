@@ -46,6 +46,7 @@ BACKDROP = "backdrop"  # the group of its information
 _SIDE = 16  # cells along an edge of the cube
 CELLS = 6 * _SIDE**2
 _PIXELS = 1200  # of a view as its depth is looked at
+_VIEWS = 16  # whose depth is looked at, at most
 _FAST = RenderSettings.preset("fast")  # measures depth along the ray, as `ewa` does not
 _SOLID = 0.5  # opacity from which on that is the depth of a surface
 _FARTHEST = 0.95  # of all depths
@@ -71,7 +72,8 @@ def backdrop_sphere(
     answers: Callable[[Callable, Sequence[Camera]], Iterable[Mapping[str, torch.Tensor]]] | None = None,
 ) -> Sphere | None:
     """Around all cameras, as far away as nearly all surfaces that they show, each at its time; None: infinitely far
-    away, where they show none.
+    away, where they show none. Of more than 16 cameras, 16 are asked: sorted by x, y and z of their centers, every so
+    many.
 
     It depends on the scene and on all of these cameras, in whatever order. So it moves as candidates come and go, with
     the bits that a single call would find; `drgs.select.Cache` keeps what views tell apart from it.
@@ -88,6 +90,9 @@ def backdrop_sphere(
     centers = np.stack([camera.center for camera in cameras])
     # Of the cameras, not of their order, which the last bits of a running sum depend on.
     center = np.array([math.fsum(along) / len(cameras) for along in centers.T.tolist()])
+    if len(cameras) > _VIEWS:
+        in_order = sorted(cameras, key=lambda camera: (camera.center.tolist(), camera.w2c.tolist(), camera.time))
+        cameras = [in_order[i * len(cameras) // _VIEWS] for i in range(_VIEWS)]
     found = answers(_surfaces, cameras) if answers else (_surfaces(scene, camera) for camera in cameras)
     solid = np.concatenate([one["depths"].numpy() for one in found])
     if not len(solid):
@@ -111,20 +116,22 @@ def _surfaces(scene: Scene, camera: Camera, mask: torch.Tensor | None = None) ->
 
 def backdrop_cells(camera: Camera, sphere: Sphere | None = None) -> torch.Tensor:
     """(H, W) int64: the cell that each pixel's ray leaves the sphere through; of None, that of its direction."""
-    rays = camera.pixel_directions().reshape(-1, 3)
+    rays = np.ascontiguousarray(camera.pixel_directions().reshape(-1, 3).T)  # x, y and z each in one piece
     if sphere:
         start = (camera.center - np.array(sphere.center)) / sphere.radius
-        along = np.einsum("pk,k->p", rays, start)  # no `@`, as in `Camera.pixel_directions`
+        along = start[0] * rays[0] + start[1] * rays[1] + start[2] * rays[2]
         # Not below 0: a ray of a camera outside that misses has no crossing, and takes the place where it is nearest.
-        rays = start + rays * (np.sqrt(np.maximum(along**2 + 1 - start @ start, 0.0)) - along)[:, None]
-    axis = np.abs(rays).argmax(1)
-    rows = np.arange(len(rays))
-    along = rays[rows, axis]
-    across = np.stack([rays[rows, (axis + k) % 3] for k in (1, 2)], axis=-1) / np.abs(along)[:, None]
-    even = np.arctan(across) * 4 / np.pi  # in [-1, 1]
-    places = ((even + 1) / 2 * _SIDE).astype(int).clip(0, _SIDE - 1)  # the edge of a face, 1, would be cell 16
-    face = 2 * axis + (along < 0)
-    found = (face * _SIDE + places[:, 0]) * _SIDE + places[:, 1]
+        rays *= np.sqrt(np.maximum(along**2 + 1 - start @ start, 0.0)) - along
+        rays += start[:, None]
+    axis = np.abs(rays).argmax(0)
+    found = np.empty(len(axis), np.int64)
+    for k in range(3):  # the faces across each axis
+        (seen,) = (axis == k).nonzero()
+        along, *others = (rays[(k + step) % 3][seen] for step in range(3))
+        # Evenly in angle, in [0, 2]; the edge of a face, 2, would be cell 16.
+        even = (np.arctan(x / np.abs(along)) * 4 / np.pi + 1 for x in others)
+        first, second = ((x / 2 * _SIDE).astype(np.int64).clip(0, _SIDE - 1) for x in even)
+        found[seen] = ((2 * k + (along < 0)) * _SIDE + first) * _SIDE + second
     return torch.from_numpy(found.reshape(camera.height, camera.width))
 
 

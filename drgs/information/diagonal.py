@@ -69,12 +69,13 @@ def diagonal_and_opacity(
     if semantics is not None:
         semantics.check("fisher.diagonal", seen)
     opacities: list[torch.Tensor] = []
-    total = {name: torch.zeros(group.shape(seen), dtype=torch.float64) for name, group in wanted.items()}
+    shapes = {name: group.shape(seen) for name, group in wanted.items()}
+    total: dict[str, torch.Tensor] = {}
     shown = mask_list("fisher.diagonal", masks, cameras)
     for number, camera in enumerate(cameras):
         seen = gaussians_at("fisher.diagonal", gaussians, camera)
         for name, group in wanted.items():
-            check_same_parameters("fisher.diagonal", name, total[name], group.shape(seen))
+            check_same_parameters("fisher.diagonal", name, shapes[name], group.shape(seen))
         if not len(seen):
             continue
         if backgrounds:  # every view has its own
@@ -101,7 +102,10 @@ def diagonal_and_opacity(
             if rows is not None:
                 part |= {name: left(part[name], lost) for name, lost in rows.lost(wanted).items()}
         for name in wanted:
-            total[name] += part[name]
+            found = part[name].to(torch.float64)
+            total[name] = total[name].add_(found) if name in total else found
+    if not total:  # no view has Gaussians
+        total = {name: torch.zeros(shape, dtype=torch.float64) for name, shape in shapes.items()}
     return total, opacities
 
 
@@ -127,10 +131,10 @@ def _checked_groups(wanted: dict[str, Group], method: str, semantics: SemanticMe
     return known
 
 
-def check_same_parameters(where: str, name: str, total: torch.Tensor, shape: tuple[int, ...]) -> None:
+def check_same_parameters(where: str, name: str, first: tuple[int, ...], shape: tuple[int, ...]) -> None:
     """Refuse to add up what views say about Gaussians that are not as many in each."""
-    if tuple(total.shape) != shape:
+    if first != shape:
         raise ValueError(
             f"{where}: a scene must have as many Gaussians and coefficients in all views, got {name} of shape "
-            f"{tuple(total.shape)} in the first and {shape} in another; take views of one time"
+            f"{first} in the first and {shape} in another; take views of one time"
         )

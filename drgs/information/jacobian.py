@@ -148,14 +148,23 @@ class Rows:
             return self.table.if_any_hit(index, rays, states, places, active, self._take)
         return if_any_hit(self.m, self.channels, index, rays, states, places, active, self._take)
 
-    def _take(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
+    def _take(
+        self,
+        index: UInt32,
+        rays: list[Ray],
+        states: list[dict],
+        places: list[list],
+        active: Mask,
+        record: list[Float] | None = None,
+    ) -> list[dict]:
         """Replay a hit that some ray of the packet has: B_c as in derivatives.py, exact as the sums are float64."""
         m = self.m
         lib = self.m.lib
         rows = []
         out = []
         going = active & (sum((s["alive"] for s in states), lib.UInt32(0)) != 0)
-        loaded = self.channels.load(lib, index, rays[0], going, only=None if self.colors else "record")
+        only = None if self.colors else "record"
+        loaded = self.channels.load(lib, index, rays[0], going, only=only, record=record)
         record = loaded["record"]
         hits = lib.Bool(False)
         extra = None if self.buffer is None else load_packed(lib, self.buffer, self.size, index, going)

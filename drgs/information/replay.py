@@ -324,8 +324,7 @@ class Replay:
         seen = squares[:, 0].nonzero()[:, 0]  # a view sees few of all Gaussians
         basis, lit = self._squared_basis(seen)
         result = torch.zeros(self.count, basis.shape[1], 3, dtype=torch.float64)
-        result[seen] = basis[:, :, None] * (squares[seen] * lit * weights)[:, None, :]
-        return result
+        return result.index_copy_(0, seen, basis[:, :, None] * (squares[seen] * lit * weights)[:, None, :])
 
     @property
     def feature_scale(self) -> float:

@@ -47,7 +47,8 @@ def if_any_hit(
     active: Mask,
     take: Callable,
 ) -> list[dict]:
-    """`take(index, rays, states, places, active)` where a ray of the packet meets the Gaussian, else the same states.
+    """`take(index, rays, states, places, active, record)` where a ray of the packet meets the Gaussian, else the same
+    states.
 
     Most Gaussians of a tile's list miss most packets of its rays, and the branch is cheaper than what it skips.
     """
@@ -60,7 +61,7 @@ def if_any_hit(
     return dr.if_stmt(
         (states, index, rays, places, active),
         hits,
-        lambda states, index, rays, places, active: take(index, rays, states, places, active),
+        lambda states, index, rays, places, active: take(index, rays, states, places, active, record),
         lambda states, *_: states,
     )
 
@@ -140,7 +141,15 @@ class Adjoint:
             return self.table.if_any_hit(index, rays, states, places, active, self._take)
         return if_any_hit(self.m, self.channels, index, rays, states, places, active, self._take)
 
-    def _take(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
+    def _take(
+        self,
+        index: UInt32,
+        rays: list[Ray],
+        states: list[dict],
+        places: list[list],
+        active: Mask,
+        record: list[Float] | None = None,
+    ) -> list[dict]:
         """One hit of each ray: its local derivative by AD, weighted with dL/da and with w times the cotangents."""
         m = self.m
         lib = self.m.lib
@@ -148,9 +157,8 @@ class Adjoint:
         going = active & (sum((s["alive"] for s in states), lib.UInt32(0)) != 0)
         with dr.resume_grad():
             # A graph of this hit only, from leaves of its own: the walk has suspended AD.
-            fixed = {
-                name: [dr.detach(x) for x in xs] for name, xs in self.channels.load(lib, index, rays[0], going).items()
-            }
+            loaded = self.channels.load(lib, index, rays[0], going, record=record)
+            fixed = {name: [dr.detach(x) for x in xs] for name, xs in loaded.items()}
             dr.enable_grad(fixed)
             total = lib.Float(0)
             hits = lib.Bool(False)

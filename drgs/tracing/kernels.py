@@ -107,16 +107,27 @@ class Channels:
         return table
 
     def load(
-        self, lib: Lib, index: UInt32, ray: Ray, active: Mask, buffers: dict | None = None, only: str | None = None
+        self,
+        lib: Lib,
+        index: UInt32,
+        ray: Ray,
+        active: Mask,
+        buffers: dict | None = None,
+        only: str | None = None,
+        record: list[Float] | None = None,
     ) -> dict:
-        """What a hit of Gaussian `index` reads, name -> list of floats; from other buffers, or `only` of one name."""
+        """What a hit of Gaussian `index` reads, name -> list of floats; from other buffers, or `only` of one name.
+
+        Args:
+            record: The Gaussian's record, where it has been read already.
+        """
         buffers = buffers or self.buffers
         loaded = {}
         for name, (stride, offset, count) in self.layout(ray).items():
             if name not in buffers or (only and name != only):
                 continue
             if name == "record":
-                loaded[name] = load_record(lib, buffers[name], index, active)
+                loaded[name] = record or load_record(lib, buffers[name], index, active)
             else:
                 base = index * stride + offset
                 loaded[name] = [dr.gather(lib.Float, buffers[name], base + k, active) for k in range(count)]
