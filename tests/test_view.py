@@ -260,6 +260,38 @@ def test_uncertainty_is_that_of_fisher():
     np.testing.assert_allclose(made.map(cameras[3]), wanted, rtol=1e-3, atol=1e-6 * wanted.max())
 
 
+def test_uncertainty_is_sketched_first():
+    """Few pixels of few photographs, each for all that it stands for: soon there is about the map of all of them."""
+    torch.manual_seed(0)
+    g = blobs(torch.randn(40, 3) * 0.4)
+    cameras = orbit((0, 0, 0), 3.0, 30, width=96, height=80)
+    asked = []
+
+    def said(camera):
+        asked.append(camera.width * camera.height)
+        return fisher.diagonal(g, camera, FAST)
+
+    def mapped(camera, weights):
+        return fisher.variance_map(g, camera, weights, FAST).numpy()
+
+    made = Uncertainty(cameras, said, mapped, gain.Prior(1.0))
+    steps = made.learn(lambda: None)
+    while not made.is_sketched:
+        next(steps)
+    assert len(asked) == 24
+    assert max(asked) <= 2400
+    assert not made.is_known
+    sketch = made.map(cameras[3])
+    for _ in steps:
+        pass
+    assert made.is_known
+    assert asked[24:] == [96 * 80] * 30
+    whole = made.map(cameras[3])
+    seen = whole > 1e-3 * whole.max()
+    assert np.median(np.abs(np.log(sketch[seen] / whole[seen]))) < 0.1
+    assert len(list(Uncertainty(cameras, said, mapped, gain.Prior(1.0)).learn(lambda: None, sketch=False))) == 30
+
+
 # ------------------------------------------------------------------------------------------------- worker
 
 

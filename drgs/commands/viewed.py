@@ -63,7 +63,8 @@ def subject_of(args: View, given: SceneInput, before: Subject | None = None) -> 
     uncertainty = _uncertainty(args, given, known)
     origin = np.array(given.gaussians.origin, np.float64)
     first = before.first if before else _first(args, given.gaussians, known.cameras if known else [])
-    pixels = known.pixels if known else args.max_pixels
+    # What a network leaves uncertain takes tangents of all pixels; the rest of a map costs no more than a picture.
+    pixels = known.pixels if known and given.moving is not None else None
     if before is not None and _same(before.placed_views, placed_views) and before.ranking == ranking:
         placed_views = before.placed_views
     return Subject(

@@ -92,7 +92,10 @@ class _Along:
         self.places = places
         self.buffer = buffer
         count, pixels, self.width = images.shape
-        self.images = to_drjit(lib, images.reshape(-1)).array
+        # Four channels are read at once.
+        self.fours = -(-self.width // 4)
+        padded = torch.nn.functional.pad(images, (0, 4 * self.fours - self.width))
+        self.images = to_drjit(lib, padded.reshape(-1)).array
         # Opaque: another number of either is no other kernel.
         self.count, self.pixels = (dr.opaque(lib.UInt32, x) for x in (count, pixels))
 
@@ -114,8 +117,11 @@ class _Along:
         def body(k: UInt32, place: UInt32, own: list[list]) -> tuple[UInt32, UInt32, list[list]]:
             totals = [lib.Float(0)] * GEOMETRY
             for (slopes, g, turned), pixel, inside in zip(own, self.walk.part.flat, self.walk.part.inside, strict=True):
-                at = (k * self.pixels + pixel) * self.width
-                u = [dr.gather(lib.Float, self.images, at + c, inside) for c in range(self.width)]
+                at = (k * self.pixels + pixel) * self.fours
+                u: list[Float] = []
+                for four in range(self.fours):
+                    u += list(dr.gather(lib.ArrayXf, self.images, at + four, inside, shape=(4, dr.width(pixel))))
+                u = u[: self.width]
                 z = sum((x * y for x, y in zip(g, u, strict=True)), lib.Float(0))
                 totals = [dr.fma(x, z, total) for x, total in zip(slopes, totals, strict=True)]
                 for by_mean, x in zip(turned if self.walk.first else [], u, strict=False):

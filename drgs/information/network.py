@@ -214,7 +214,7 @@ class NetworkProbes:
         rows = None if view is None else view.network_rows(groups)
         if view is None or rows is None or probes > view.most_images:
             return None
-        images = _signs(torch.Generator().manual_seed(0), probes, view.pixels, view.rows, dtype=torch.float32)
+        images = _first_signs(probes, view.pixels, view.rows)
         return cls(rows, rows.along(view.cotangents(images)), groups, semantics)
 
     @alone
@@ -428,6 +428,12 @@ _ESTIMATORS = {
 def _signs(generator: torch.Generator, *shape: int, dtype: torch.dtype = torch.float64) -> torch.Tensor:
     """-1 or 1; the same of each type."""
     return torch.randint(0, 2, shape, generator=generator, dtype=dtype).mul_(2).sub_(1)
+
+
+@functools.lru_cache(maxsize=1)
+def _first_signs(*shape: int) -> torch.Tensor:
+    """Random images as of seed 0, the same for each view of a size: not to be changed."""
+    return _signs(torch.Generator().manual_seed(0), *shape, dtype=torch.float32)
 
 
 def _by_group(groups: Groups, found: Mapping[str, torch.Tensor]) -> Information:

@@ -321,10 +321,14 @@ class Replay:
         """(N, K, 3) squares of the derivatives by SH, from (N, 1) sum w^2, times (3,) weights; call after `sums`."""
         if self.along_ray:
             return self.light * weights
-        seen = squares[:, 0].nonzero()[:, 0]  # a view sees few of all Gaussians
+        seen = squares[:, 0].nonzero()[:, 0]
+        if 2 * len(seen) > self.count:  # to copy them to where they belong takes longer than zeros of the others
+            seen = torch.arange(self.count)
         basis, lit = self._squared_basis(seen)
-        result = torch.zeros(self.count, basis.shape[1], 3, dtype=torch.float64)
-        return result.index_copy_(0, seen, basis[:, :, None] * (squares[seen] * lit * weights)[:, None, :])
+        found = basis[:, :, None] * (squares[seen] * lit * weights)[:, None, :]
+        if len(seen) == self.count:
+            return found
+        return torch.zeros(self.count, *found.shape[1:], dtype=torch.float64).index_copy_(0, seen, found)
 
     @property
     def feature_scale(self) -> float:

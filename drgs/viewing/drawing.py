@@ -7,7 +7,7 @@ the picture that is no longer wanted, not for all of it.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -22,10 +22,23 @@ if TYPE_CHECKING:
     from drgs.integrator import Output
     from drgs.settings import RenderSettings
 
-__all__ = ["Steps", "bands", "drawn", "stages"]
+__all__ = ["Progress", "Steps", "bands", "drawn", "over", "stages"]
 
-Steps = Generator[float, None, np.ndarray]
-"""Yields the share that is done between its steps, and returns what it has made."""
+
+class Progress(NamedTuple):
+    """How far a picture is.
+
+    Attributes:
+        share: Share that is done.
+        rows: (h, W, 3) uint8 rows from the top that are done; None where colors are not known before the end.
+    """
+
+    share: float
+    rows: np.ndarray | None = None
+
+
+Steps = Generator[Progress, None, np.ndarray]
+"""Yields its progress between its steps, and returns what it has made."""
 
 _FIRST = 16_000  # pixels of the first picture
 _BAND = 48_000  # pixels that are drawn in one step
@@ -58,6 +71,7 @@ def drawn(
     settings: RenderSettings,
     read: Callable[[Output], np.ndarray],
     features: bool = False,
+    colors: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> Steps:
     """What `read` takes of the rendering of a view, (H, W, ...).
 
@@ -67,8 +81,10 @@ def drawn(
         settings: Render settings.
         read: Function that takes a band's rendering, with its depth, and returns rows of the picture.
         features: Whether it reads the features, which else cost nothing.
+        colors: What makes rows of the picture of that, where a row does not depend on others.
     """
     parts = []
+    shown: list[np.ndarray] = []
     with torch.no_grad():  # a picture is looked at only; a graph would keep every band's intermediates
         seen = scene.at(camera.time) if features else colors_only(scene.at(camera.time), None)
     below = 0
@@ -76,5 +92,22 @@ def drawn(
         with torch.no_grad():  # entered for each band: between two of them the thread does other work
             parts.append(read(render(seen, part, settings, ("depth",))))
         below += part.height
-        yield below / camera.height
+        if colors is not None:
+            shown.append(colors(parts[-1]))
+        yield Progress(below / camera.height, np.concatenate(shown) if shown else None)
     return np.concatenate(parts)
+
+
+def over(before: np.ndarray, rows: np.ndarray, height: int) -> np.ndarray:
+    """(height, W, 3) uint8 picture whose first rows are done, over a smaller one of the same view.
+
+    Args:
+        before: (h, w, 3) uint8 smaller picture.
+        rows: (r, W, 3) uint8 rows that are done.
+        height: H.
+    """
+    import cv2
+
+    picture = cv2.resize(before, (rows.shape[1], height), interpolation=cv2.INTER_LINEAR)
+    picture[: len(rows)] = rows
+    return picture

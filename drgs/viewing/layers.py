@@ -10,7 +10,7 @@ import numpy as np
 
 from drgs.display import pictures
 from drgs.integrator import Output
-from drgs.viewing.drawing import drawn
+from drgs.viewing.drawing import Progress, drawn
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -49,8 +49,8 @@ class Drawing:
     scale: ColorScale | None = None
 
 
-Drawings = Generator[float, None, Drawing]
-"""Yields the share that is done between its steps, and returns the picture."""
+Drawings = Generator[Progress, None, Drawing]
+"""Yields its progress between its steps, and returns the picture."""
 
 Draw = Callable[["Scene", "Camera", "RenderSettings"], Drawings]
 
@@ -75,14 +75,14 @@ class Layer:
 
 
 def layers_of(
-    paint: Mapping[str, Callable[[Output], np.ndarray]], uncertainty: Uncertainty | None, pixels: int
+    paint: Mapping[str, Callable[[Output], np.ndarray]], uncertainty: Uncertainty | None, pixels: int | None
 ) -> tuple[Layer, ...]:
     """Layers that a scene has.
 
     Args:
         paint: Kind -> function that draws it of a rendering with features.
         uncertainty: What the photographs leave uncertain, where there are any.
-        pixels: Largest number of pixels of its map.
+        pixels: Largest number of pixels of its map; None: as many as of other pictures.
     """
     made = [
         Layer("rgb", "colors", _rgb),
@@ -109,7 +109,8 @@ def tinted(layer: Layer, gaussians: Gaussians) -> np.ndarray | None:
 
 
 def _rgb(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
-    return Drawing((yield from drawn(scene, camera, settings, lambda out: pictures.to_bytes(out.rgb.cpu().numpy()))))
+    read = lambda out: pictures.to_bytes(out.rgb.cpu().numpy())  # noqa: E731
+    return Drawing((yield from drawn(scene, camera, settings, read, colors=lambda rows: rows)))
 
 
 def _depth(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
@@ -123,13 +124,14 @@ def _depth(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
 
 
 def _missing(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
-    found = yield from drawn(scene, camera, settings, lambda out: 1 - out.alpha.cpu().numpy())
+    read = lambda out: 1 - out.alpha.cpu().numpy()  # noqa: E731
+    found = yield from drawn(scene, camera, settings, read, colors=pictures.inferno)
     return Drawing(pictures.inferno(found), ColorScale(0.0, 1.0, "share of the light, none to all"))
 
 
 def _painted(painter: Callable[[Output], np.ndarray]) -> Draw:
     def draw(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
-        return Drawing((yield from drawn(scene, camera, settings, painter, features=True)))
+        return Drawing((yield from drawn(scene, camera, settings, painter, True, lambda rows: rows)))
 
     return draw
 
@@ -137,7 +139,7 @@ def _painted(painter: Callable[[Output], np.ndarray]) -> Draw:
 def _mapped(uncertainty: Uncertainty) -> Draw:
     def draw(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
         found = uncertainty.map(camera)
-        yield 1.0
+        yield Progress(1.0)
         picture, (low, high) = pictures.map_colors(found)
         return Drawing(picture, ColorScale(low, high, _VARIANCE))
 

@@ -151,15 +151,26 @@ class Viewer:
             told = functools.partial(self._tell, subject, uncertainty)
             told()
             yield
-            yield from uncertainty.learn(told)
+            shown = uncertainty.is_sketched
+            for _ in uncertainty.learn(told, sketch=self._learnt is None):
+                if uncertainty.is_sketched and not uncertainty.is_known and not shown:
+                    shown = True
+                    self._redraw()
+                yield
             self._learnt = subject
-            self._each(lambda session: session.redraw() if session.layer.name == UNCERTAINTY else None)
+            self._redraw()
             if not self._waiting():
                 return
+
+    def _redraw(self) -> None:
+        """Draw the map once more in each browser that shows it."""
+        self._each(lambda session: session.redraw() if session.layer.name == UNCERTAINTY else None)
 
     def _tell(self, subject: Subject, uncertainty: Uncertainty) -> None:
         """Tell those who wait for it how many photographs have been added."""
         of = f" of {subject.state}" if subject.state else ""
+        if uncertainty.is_sketched and not uncertainty.is_known:
+            of += ", a sketch of few pixels"
         for session in self._waiting():
             session.say(
                 f"uncertainty{of}: {uncertainty.done} of {len(uncertainty.cameras)} photographs added", session.scale

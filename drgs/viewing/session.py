@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
+import functools
 import math
 import threading
 import time
@@ -21,7 +22,7 @@ import numpy as np
 from drgs.data.flight import Keyframe
 from drgs.display.pictures import to_bytes
 from drgs.viewing import panel
-from drgs.viewing.drawing import stages
+from drgs.viewing.drawing import over, stages
 from drgs.viewing.keyframes import KeyframeFolder
 from drgs.viewing.layers import UNCERTAINTY, Layer, tinted
 from drgs.viewing.placed_views import PlacedView, score_colors
@@ -42,6 +43,7 @@ REST = 0.3
 """Seconds that a camera rests before our picture is drawn."""
 
 _PRESETS = ("exact", "fast", "gsplat", "3dgut")
+_ROWS_EVERY = 1.0  # seconds between two pictures of rows that are done
 _PHOTOGRAPH = 360  # pixels of its width in the panel
 _WAY_COLOR = (240, 60, 60)
 _FRUSTUM = 0.05  # size of a camera's frustum, of its distance to what is looked at
@@ -477,9 +479,11 @@ class Session:
         subject = self.subject
         if self._lacks_uncertainty():
             self._wants()
-            if (earlier := self._learnt()) is None or earlier.layer(UNCERTAINTY).name != UNCERTAINTY:
+            earlier = self._learnt()
+            if earlier is not None and earlier.layer(UNCERTAINTY).name == UNCERTAINTY:
+                subject = earlier
+            elif subject.uncertainty is None or not subject.uncertainty.is_sketched:
                 return
-            subject = earlier
         with self._lock:
             self._wanted += 1
             wanted = self._wanted
@@ -494,6 +498,7 @@ class Session:
         began = time.perf_counter()
         settings = subject.settings(preset)
         rate = 0.0
+        before: np.ndarray | None = None
         of = f" of {subject.state}" if subject is not self.subject and subject.state else ""
         for camera in stages(whole, min(self._pixels, layer.pixels or self._pixels)):
             text = f"{layer.name}{of}, {preset}: "
@@ -503,38 +508,58 @@ class Session:
                 layer.draw(subject.scene, camera, settings),
                 f"{text}drawing {camera.width}x{camera.height}",
                 rate * pixels,
+                functools.partial(self._show_rows, wanted, before, camera.height),
             )
             rate = (time.perf_counter() - since) / pixels
-            with self._lock:
-                if wanted != self._wanted:
-                    return
-                self._is_over = True
-                self.scale = drawing.scale
-                with self.client.atomic():
-                    self.client.scene.set_background_image(drawing.picture, format="png")
-                    if self._gaussians is not None:
-                        self._gaussians.visible = False
+            if not self._show(wanted, drawing.picture, drawing.scale):
+                return
+            before = drawing.picture
             took = time.perf_counter() - began
             self.say(f"{text}{camera.width}x{camera.height} in {took:.1f} s", drawing.scale)
             yield
         self.drawn += 1
 
-    def _told(self, steps: Drawings, text: str, expected: float) -> Generator[None, None, Drawing]:
+    def _show(self, wanted: int, picture: np.ndarray, scale: ColorScale | None) -> bool:
+        """Lay a picture behind everything, in place of the Gaussians, unless another one is wanted; whether it is."""
+        with self._lock:
+            if wanted != self._wanted:
+                return False
+            self._is_over = True
+            self.scale = scale
+            with self.client.atomic():
+                self.client.scene.set_background_image(picture, format="png")
+                if self._gaussians is not None:
+                    self._gaussians.visible = False
+        return True
+
+    def _show_rows(self, wanted: int, before: np.ndarray | None, height: int, rows: np.ndarray) -> None:
+        """Lay the rows that are done over the smaller picture that lies there, if one does."""
+        if before is not None:
+            self._show(wanted, over(before, rows, height), self.scale)
+
+    def _told(
+        self, steps: Drawings, text: str, expected: float, show: Callable[[np.ndarray], None]
+    ) -> Generator[None, None, Drawing]:
         """Steps of a drawing, saying how much of it is done, and how long the rest will take.
 
         Args:
             text: Name of what is drawn.
             expected: Seconds that it takes by the pixels of a picture before it; 0 where there was none.
+            show: Shows the rows that are done, now and then.
         """
         self.say(f"{text}, about {_seconds(expected)} ..." if expected else f"{text} ...")
-        began = time.perf_counter()
+        began = shown = time.perf_counter()
         while True:
             try:
-                share = next(steps)
+                share, rows = next(steps)
             except StopIteration as end:
                 return end.value
-            left = (time.perf_counter() - began) * (1 - share) / share
+            now = time.perf_counter()
+            left = (now - began) * (1 - share) / share
             if share < 1:
+                if rows is not None and now - shown >= _ROWS_EVERY:
+                    show(rows)
+                    shown = now
                 self.say(f"{text}: {share:.0%}, about {_seconds(left)} left ...")
             yield
 
