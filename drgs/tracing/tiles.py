@@ -500,7 +500,7 @@ class _Boxes:
         Args:
             columns: Tiles in x.
             tiles: Says which may have one; None: all.
-            what: Of which scene and image they are, for messages.
+            what: The scene and the image, as messages name them.
         """
         lib = self.lib
         advice = "lower extent or image size"

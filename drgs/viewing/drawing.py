@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from drgs.integrator import Output
     from drgs.settings import RenderSettings
 
-__all__ = ["Progress", "Steps", "bands", "drawn", "over", "stages"]
+__all__ = ["Done", "Steps", "bands", "drawn", "over", "stages"]
 
 
-class Progress(NamedTuple):
+class Done(NamedTuple):
     """How far a picture is.
 
     Attributes:
@@ -37,7 +37,7 @@ class Progress(NamedTuple):
     rows: np.ndarray | None = None
 
 
-Steps = Generator[Progress, None, np.ndarray]
+Steps = Generator[Done, None, np.ndarray]
 """Yields its progress between its steps, and returns what it has made."""
 
 _FIRST = 16_000  # pixels of the first picture
@@ -94,7 +94,7 @@ def drawn(
         below += part.height
         if colors is not None:
             shown.append(colors(parts[-1]))
-        yield Progress(below / camera.height, np.concatenate(shown) if shown else None)
+        yield Done(below / camera.height, np.concatenate(shown) if shown else None)
     return np.concatenate(parts)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from drgs.display import pictures
 from drgs.integrator import Output
-from drgs.viewing.drawing import Progress, drawn
+from drgs.viewing.drawing import Done, drawn
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -49,7 +49,7 @@ class Drawing:
     scale: ColorScale | None = None
 
 
-Drawings = Generator[Progress, None, Drawing]
+Drawings = Generator[Done, None, Drawing]
 """Yields its progress between its steps, and returns the picture."""
 
 Draw = Callable[["Scene", "Camera", "RenderSettings"], Drawings]
@@ -139,7 +139,7 @@ def _painted(painter: Callable[[Output], np.ndarray]) -> Draw:
 def _mapped(uncertainty: Uncertainty) -> Draw:
     def draw(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
         found = uncertainty.map(camera)
-        yield Progress(1.0)
+        yield Done(1.0)
         picture, (low, high) = pictures.map_colors(found)
         return Drawing(picture, ColorScale(low, high, _VARIANCE))
 
