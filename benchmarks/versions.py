@@ -1,0 +1,192 @@
+"""What a commit gained or lost in speed: the same frames by two checkouts of drgs, in turns.
+
+    git worktree add ../before COMMIT
+    python benchmarks/versions.py ../before [RUN ...] [--turns 9]   rows: benchmarks/versions.jsonl
+    python benchmarks/versions.py --page                            the table of docs/benchmarks-versions.md
+
+One process a checkout, one thread each, taking turns; what counts is the median of the ratios of processor time of two
+neighboring turns, which other work on the machine changes little. Scenes are the cube of `render.py` and, of each RUN
+(a fit, at 320x240), its fifth camera. With a RUN that has 47 cameras or more a pick among 80 candidates is timed, too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+os.environ.setdefault("DRGS_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+ROOT = Path(__file__).resolve().parent.parent
+CODE = Path(os.environ.get("DRGS_CHECKOUT", ROOT))
+sys.path[:0] = [str(CODE), str(ROOT / "benchmarks")]
+
+ROWS = ROOT / "benchmarks" / "versions.jsonl"
+PAGE = ROOT / "docs" / "benchmarks-versions.md"
+CUBE = "cube"
+POSES = 80  # candidates of a pick
+
+
+def frames(scene: str) -> dict[str, Callable[[], object]]:
+    """What is timed of a scene, by name: imports drgs from the checkout of this process."""
+    import cubes
+    import numpy as np
+    import torch
+
+    import drgs
+    from drgs.data import load
+    from drgs.fitting.records import load_run
+    from drgs.select import select
+
+    if scene == CUBE:
+        g, camera, cameras = cubes.cube(), cubes.camera(), []
+    else:
+        run = load_run(scene)
+        views = load(run.record.data).views
+        cameras = [view.camera.undistorted().resized(320, 240) for view in views]
+        g, camera = drgs.load_ply(Path(scene) / "point_cloud.ply"), cameras[5 % len(cameras)]
+    timed: dict[str, Callable[[], object]] = {}
+    for preset in ("fast", "exact"):
+        settings = drgs.RenderSettings.preset(preset)
+
+        def forward(settings: drgs.RenderSettings = settings) -> None:
+            with torch.no_grad():
+                drgs.render(g, camera, settings, outputs=())
+
+        def backward(settings: drgs.RenderSettings = settings) -> None:
+            leaves = {name: x.detach().clone().requires_grad_() for name, x in g.parameters().items()}
+            drgs.render(g.replace(**leaves), camera, settings, outputs=()).rgb.square().sum().backward()
+
+        timed |= {f"{preset}, forward": forward, f"{preset}, forward + backward": backward}
+        timed[f"{preset}, Fisher diagonal"] = lambda settings=settings: drgs.fisher.diagonal(g, camera, settings)
+    timed["fast, Fisher blocks"] = lambda: drgs.fisher.blocks(g, camera, drgs.RenderSettings.preset("fast"))
+    if len(cameras) >= 47:
+        rng = np.random.default_rng(0)
+        poses = []
+        for k in range(POSES):
+            moved = cameras[k % len(cameras)]
+            shift = 0.05 * rng.normal(size=3) * (k >= len(cameras))
+            w2c = moved.w2c.copy()
+            w2c[:3, 3] -= w2c[:3, :3] @ shift
+            poses.append(dataclasses.replace(moved, w2c=w2c, name=f"pose {k}"))
+        fast = drgs.RenderSettings.preset("fast")
+        timed["a pick of 80"] = lambda: select(g, poses, cameras[:12], 1, settings=fast)
+    return timed
+
+
+def work(scene: str) -> None:
+    """Time everything once for each line that comes in."""
+    timed = frames(scene)
+    for run in timed.values():
+        run()
+    print("ready", flush=True)
+    for _ in sys.stdin:
+        seconds = {}
+        for name, run in timed.items():
+            began = time.process_time()
+            run()
+            seconds[name] = time.process_time() - began
+        print(json.dumps(seconds), flush=True)
+
+
+def compared(before: Path, scene: str, turns: int) -> dict[str, list[tuple[float, float]]]:
+    """Name -> seconds before and now, turn by turn."""
+    processes = []
+    for checkout in (before, ROOT):
+        environment = {**os.environ, "DRGS_CHECKOUT": str(checkout.resolve())}
+        command = [sys.executable, __file__, "--work", scene]
+        processes.append(
+            subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
+        )
+    found: dict[str, list[tuple[float, float]]] = {}
+    answers = []
+    for process in processes:
+        assert process.stdout is not None
+        assert process.stdout.readline().strip() == "ready", f"{scene}: a process has failed"
+    for _ in range(turns):
+        answers = []
+        for process in processes:
+            assert process.stdin is not None
+            assert process.stdout is not None
+            process.stdin.write("go\n")
+            process.stdin.flush()
+            answers.append(json.loads(process.stdout.readline()))
+        for name in answers[0]:
+            found.setdefault(name, []).append((answers[0][name], answers[1][name]))
+    for process in processes:
+        assert process.stdin is not None
+        process.stdin.close()
+        process.wait()
+    return found
+
+
+def page() -> None:
+    """Write the table."""
+    from where import read_rows
+
+    from drgs.studies.tables import fill_between, markdown_table, paragraph
+
+    rows = read_rows(ROWS)
+    last = rows[-1]
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    timed = list(dict.fromkeys(row["timed"] for row in rows))
+    cells = {(row["scene"], row["timed"]): row for row in rows}
+    lines = []
+    for name in timed:
+        line = [name]
+        for scene in scenes:
+            row = cells.get((scene, name))
+            line.append(f"{row['ratio']:.2f} ({1e3 * row['before']:.0f} to {1e3 * row['now']:.0f})" if row else "")
+        lines.append(line)
+    text = paragraph(
+        f"Commit {last['commit']} in multiples of the time of {last['before_commit']}, in brackets milliseconds of "
+        f"processor time: `python benchmarks/versions.py`, {last['machine']}, {last['date']}, other work running."
+    )
+    fill_between(PAGE, "versions", text + "\n\n" + markdown_table(["", *scenes], lines))
+
+
+def main() -> None:
+    """The program."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("before", nargs="?", type=Path, help="checkout that is compared with this one")
+    parser.add_argument("runs", nargs="*", help="fits")
+    parser.add_argument("--turns", type=int, default=9)
+    parser.add_argument("--page", action="store_true", help="write the table of what is there")
+    parser.add_argument("--work", metavar="SCENE", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.work:
+        work(args.work)
+        return
+    if args.page:
+        page()
+        return
+    if args.before is None:
+        parser.error("name a checkout to compare with")
+    from where import add_row, ran
+
+    described = ["git", "-C", str(args.before), "rev-parse", "--short", "HEAD"]
+    commit = subprocess.run(described, capture_output=True, text=True, check=True).stdout.strip()
+    for scene in (CUBE, *args.runs):
+        for name, pairs in compared(args.before, scene, args.turns).items():
+            row = {
+                "scene": Path(scene).name,
+                "timed": name,
+                "ratio": statistics.median(now / before for before, now in pairs),
+                "before": statistics.median(before for before, _ in pairs),
+                "now": statistics.median(now for _, now in pairs),
+                "before_commit": commit,
+            }
+            add_row(ROWS, row | ran())
+            print(row, flush=True)
+
+
+if __name__ == "__main__":
+    main()
