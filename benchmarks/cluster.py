@@ -148,7 +148,7 @@ def report(r: dict) -> str:
     where = r["ran"]
     lines = [
         f"`python benchmarks/cluster.py`, {where['machine']}, {where['date']}, commit {where['commit']}: "
-        f"{r['candidates']} candidates, {r['known']} known views, {r['size'][0]}x{r['size'][1]}, {r['gaussians']} "
+        f"{r['candidates']} candidates, {r['known']} training views, {r['size'][0]}x{r['size'][1]}, {r['gaussians']} "
         f"Gaussians, criterion v_opt with a backdrop. The scene is {r['scene_bytes'] / 1e6:.2f} MB for each worker.",
         "",
         "| workers | load before | start, s | pick, s | a view on its worker, s | of these CPU "
