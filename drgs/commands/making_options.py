@@ -40,7 +40,7 @@ class Sfm(Common):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Capture(Common):
-    """Make a scene of photographs or videos in one command: frames, poses, fit, report; can be resumed."""
+    """Make a scene from photographs or videos in one command: frames, poses, fit, report; can be resumed."""
 
     paths: Annotated[Positional[tuple[Path, ...]], arg(metavar="PATH")] = ()
     """Photographs, videos, folders of both, or one data set that has poses; none with --more."""
@@ -68,7 +68,7 @@ class Capture(Common):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Teach(Common, Timed):
-    """Add feature maps of its photographs by a local CLIP model (the teacher), and text embeddings, to a data set."""
+    """Add a teacher's feature maps, by a local CLIP model, and text embeddings to a data set."""
 
     data: Positional[Path]
     """Data set; files are written into its folder, where drgs fit finds them, and none is replaced."""

@@ -114,7 +114,7 @@ class Fit(_Fitted, _Selecting, Choosing, Clustered, Data):
     """Fit Gaussians to photographs with known cameras."""
 
     data: Positional[Path]
-    """COLMAP, transforms.json (D-NeRF too), LLFF, Replica, Neu3D (cam*.mp4), train_meta.json, or folders cam00, ..."""
+    """Data set: COLMAP, transforms.json, LLFF, Replica, Neu3D (cam*.mp4), train_meta.json, folders cam00, ..."""
     output: OutputPath
     """The run folder."""
     preset: Preset | None = None
@@ -200,7 +200,7 @@ class Fisher(Comparing):
     pose: bool = False
     """Also report the information of each of these views about its own pose, a 6x6 matrix."""
     maps: bool = False
-    """Also write one image for each view next to its maps of moments, of fisherrf and of every block."""
+    """Also write an image of each view side by side with its maps of moments, of fisherrf and of every block."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
