@@ -15,6 +15,7 @@ import dataclasses
 import json
 import os
 import sys
+import textwrap
 import time
 from pathlib import Path
 
@@ -146,10 +147,13 @@ def measured(arguments: argparse.Namespace) -> dict:
 def report(r: dict) -> str:
     """The table, and a line above it."""
     where = r["ran"]
-    lines = [
+    about = (
         f"`python benchmarks/cluster.py`, {where['machine']}, {where['date']}, commit {where['commit']}: "
-        f"{r['candidates']} candidates, {r['known']} known views, {r['size'][0]}x{r['size'][1]}, {r['gaussians']} "
-        f"Gaussians, criterion v_opt with a backdrop. The scene is {r['scene_bytes'] / 1e6:.2f} MB for each worker.",
+        f"{r['candidates']} candidates, {r['known']} training views, {r['size'][0]}x{r['size'][1]}, {r['gaussians']} "
+        f"Gaussians, criterion v_opt with a backdrop. The scene is {r['scene_bytes'] / 1e6:.2f} MB for each worker."
+    )
+    lines = [
+        *textwrap.wrap(about, 120),
         "",
         "| workers | load before | start, s | pick, s | a view on its worker, s | of these CPU "
         "| this process, CPU a view, s | back, KB a view | same bits |",

@@ -54,7 +54,7 @@ class Common:
     threads: int | None = None
     """Threads of Dr.Jit and torch; default DRGS_THREADS, else every usable core."""
     quiet: bool = False
-    """Print neither progress nor results, which are in the files; only warnings and errors."""
+    """Print only warnings and errors; results are in the files."""
     debug: bool = False
     """Show the traceback of an error."""
 
@@ -64,7 +64,7 @@ class Settings(Common):
     """Options of commands that render."""
 
     preset: Preset = "exact"
-    """Render settings of a named system."""
+    """Preset of render settings."""
     overrides: Annotated[
         tuple[str, ...],
         arg(name="set", metavar="KEY=VALUE", help="Replace one render setting, e.g. order=ray."),
@@ -93,7 +93,7 @@ class Data:
     """Options of commands that load data sets."""
 
     strict: bool = False
-    """Refuse a data set that lists images which are not there; else at least 3 must be, and the others are left out."""
+    """Refuse a data set with missing images; by default they are left out, and at least 3 must remain."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -101,7 +101,7 @@ class Timed(Data):
     """Options of commands that load data sets of one time or of several."""
 
     times: int | None = None
-    """How many frames of each synchronous camera are used, evenly over its video; default as the run, else 40."""
+    """Number of frames of each synchronous camera, evenly spaced in its video; default that of the run, else 40."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -109,7 +109,7 @@ class Views(Timed):
     """Options of commands that take some of the views of a data set."""
 
     test_cameras: Annotated[tuple[str, ...] | None, CAMERAS_TEXT] = None
-    """Synchronous cameras that are held out at all times (cam00,cam05), or none; default as the run, else the first."""
+    """Synchronous cameras to hold out at all times (cam00,cam05), or none; default those of the run, else the first."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -117,7 +117,7 @@ class Lenses:
     """Options of commands that can look through lenses."""
 
     undistort: UndistortUse = "auto"
-    """Take lenses out of cameras (on), look through them, with presets along rays (off), or as the run did (auto)."""
+    """Undistort cameras (on), render through their lenses, by presets along rays (off), or do as the run did (auto)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -125,7 +125,7 @@ class Around:
     """Options of commands that can make cameras around a scene."""
 
     orbit: Annotated[tuple[str, ...], arg(metavar="KEY=VALUE"), UseAppendAction] = ()
-    """What is fixed of an orbit or a dome, e.g. elevation=30,span=180; else it is as the photographs or known views."""
+    """Shape of an orbit or a dome, e.g. elevation=30,span=180; by default chosen from the photographs' cameras."""
     orbit_keys: ClassVar[tuple[str, ...]] = tuple(ORBIT_KEYS)
 
 
@@ -135,15 +135,15 @@ class Seen(Settings, Around, Views):
 
     scene: SceneFile
     cameras: str | None = None
-    """A data set, a run, a cameras.json or selection.json, or orbit; default a run's own, else orbit."""
+    """Views: a data set, a run, a cameras.json or selection.json, or orbit; default those of the run, else orbit."""
     split: Split = "all"
-    """Which views of a data set."""
+    """Which views of a data set to take."""
     limit: int = 2
     """At most this many views, evenly spaced."""
     max_pixels: int = 20_000
     """Views are reduced to at most this many pixels."""
     seed: int = 0
-    """Seed of everything random."""
+    """Random seed."""
 
 
 _UNKNOWN = ("eliminate", "exposure_std", "pose_std")
@@ -185,13 +185,13 @@ class Comparing(Informed, Around, Views, Lenses):
 
     scene: SceneFile
     train: str | None = None
-    """Views that are known: a data set, a run, a cameras.json or a selection.json; default the run's."""
+    """Training views: a data set, a run, a cameras.json or a selection.json; default those of the run."""
     split: Split = "all"
-    """Which of the other views, where they are a data set's."""
+    """Which views of the data set of --candidates or --cameras to take."""
     count: int = 40
-    """Cameras of an orbit or a dome."""
+    """Number of cameras of an orbit or a dome."""
     time: float | None = None
-    """Of cameras that state none, in a run that moves: e.g. those of an orbit."""
+    """Dynamic scenes: the time of cameras that have none, such as those of an orbit."""
     orbit_keys: ClassVar[tuple[str, ...]] = tuple(key for key in ORBIT_KEYS if key != "fov")  # known views have a lens
 
 
@@ -203,9 +203,9 @@ class Choosing(Informed, _Choice):
     """Options of commands that choose views."""
 
     seed: int = 0
-    """Seed of everything random."""
+    """Random seed."""
     config: Path | None = None
-    """A TOML or JSON file of the configuration, or a run; what the command line says wins (docs/configuration.md)."""
+    """Configuration: a TOML or JSON file, or a run; options of the command line override it (docs/configuration.md)."""
 
     def scoring(self) -> Scoring:
         """What these options say of scores.
@@ -223,9 +223,9 @@ class Clustered:
     """Options of commands that can let other processes compute."""
 
     scheduler: str | None = None
-    """HOST:PORT of a Dask cluster that computes: information of views, or whole fits (docs/many-machines.md)."""
+    """HOST:PORT of a Dask cluster that computes information of views, or whole fits (docs/many-machines.md)."""
     workers: int | None = None
-    """The same on this machine: so many processes of one thread each."""
+    """Number of worker processes, of one thread each, on this machine; the same as --scheduler without a cluster."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -233,8 +233,8 @@ class Moments:
     """Options of commands that draw a scene that moves."""
 
     time: str | None = None
-    """Of a scene that moves: one time, or a range (0..1) over all views; default the views' own, else all times."""
+    """Dynamic scenes: one time, or a range (0..1) over all views; default that of each view, else all times."""
     view: str | None = None
-    """Only the view, or the camera, of this name; with a range of --time, --frames pictures of it."""
+    """Only the view, or the camera, of this name; with a range of --time, --frames images of it."""
     moving: bool = False
-    """Into ply files only what moves."""
+    """Write only moving Gaussians to ply files."""

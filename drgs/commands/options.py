@@ -71,35 +71,35 @@ class Render(Settings, Around, Views, Moments, Lenses):
 
     scene: SceneFile
     cameras: str | None = None
-    """A data set, a run, a cameras.json or selection.json, or orbit; default orbit, or with --view the run."""
+    """Views: a data set, a run, a cameras.json or selection.json, or orbit; default orbit, or with --view the run."""
     output: OutputPath = Path("out/render")
-    """Folder for the pictures; or a file: NAME.mp4 or .webm for the film alone, NAME.png, .jpg or .exr for one view."""
+    """Folder for the images, or one file: a video NAME.mp4 or .webm, or one view NAME.png, .jpg or .exr."""
     width: int | None = None
-    """Image width in pixels; default the camera's, of an orbit or a flight 640, of a panorama 2048."""
+    """Image width in pixels; default that of the camera; 640 for an orbit or a flight, 2048 for a panorama."""
     height: int | None = None
-    """Image height in pixels; default the camera's."""
+    """Image height in pixels; default that of the camera."""
     path: Path | None = None
-    """A flight through keyframes, as drgs view saves it, or a camera path of Nerfstudio's viewer (docs/view.md)."""
+    """Camera path: a flight.json saved by drgs view, or a camera_path.json of Nerfstudio's viewer (docs/view.md)."""
     panorama: bool = False
-    """All-round pictures (360 by 180 degrees, upright) from where the cameras are; default the middle photograph's."""
+    """Panoramas (360 by 180 degrees, upright) at the places of the cameras; default that of the middle photograph."""
     frames: int | None = None
-    """Views of an orbit, a flight, or one camera over a range of --time; default 60, of a flight as it lasts."""
+    """Number of images of an orbit, a flight or a range of --time; default 60, for a flight by its seconds."""
     duration: float | None = None
-    """Seconds that the film of an orbit, a flight or a range of --time lasts, instead of --frames."""
+    """Seconds of the video of an orbit, a flight or a range of --time, instead of --frames."""
     format: str | None = None
-    """List of png, jpg, exr, webm, mp4 and ply (all Gaussians at each time), by commas; default png, or as -o ends."""
+    """List of png, jpg, exr, webm, mp4 and ply (all Gaussians at each time), by commas; default png, or by -o."""
     fps: float | None = None
-    """Frames a second of the video; default 24, of a flight what its file says."""
+    """Frames a second of the video; default 24, for a flight the rate in its file."""
     depth: bool = False
     """Write color-mapped depth too; exr files hold it anyway."""
     features: bool = False
-    """Write pictures of the semantic features too, three principal components as colors."""
+    """Write images of the semantic features too, three principal components as colors."""
     labels: bool = False
-    """Write pictures of the classes too, of a run that has been fitted with some."""
+    """Write images of the classes too, for a run that was fitted with classes."""
     overlay: bool = False
-    """Write pictures of the classes over the colors too."""
+    """Write images of the classes over the colors too."""
     split: Split = "all"
-    """Which views of a data set."""
+    """Which views of a data set to take."""
     limit: int | None = None
     """At most this many views."""
 
@@ -114,19 +114,19 @@ class Fit(_Fitted, _Selecting, Choosing, Clustered, Data):
     """Fit Gaussians to photographs with known cameras."""
 
     data: Positional[Path]
-    """COLMAP, transforms.json (D-NeRF too), LLFF, Replica, Neu3D (cam*.mp4), train_meta.json, or folders cam00, ..."""
+    """Data set: COLMAP, transforms.json, LLFF, Replica, Neu3D (cam*.mp4), train_meta.json, folders cam00, ..."""
     output: OutputPath
     """The run folder."""
     preset: Preset | None = None
-    """Render settings of a named system: fit for it alone, or with --for of several draw previews and views by it."""
+    """Fit for the renderer of this name alone; with several renderers in --for, render previews and views by it."""
     resume: bool = False
     """Continue from the last checkpoint in the run folder."""
     background: tuple[float, float, float] = RenderSettings.background
-    """RGB in [0, 1] behind everything."""
+    """Background color: RGB in [0, 1]."""
     views: Literal["all", "active"] = "all"
-    """Fit to all training views, or start with a few and choose more on the way (active; the options below)."""
+    """Fit to all training views, or start with a few and choose more during the fit (active; options below)."""
     report: bool = True
-    """Write report.html into the run folder at the end, unless --no-report is given, which saves its seconds."""
+    """Write report.html into the run folder at the end, unless --no-report is given."""
 
     def settings(self) -> RenderSettings:
         """As for every command, with the background that the photographs are composited on; without --preset those of
@@ -174,122 +174,122 @@ class Select(Choosing, Clustered, Comparing):
     """Rank cameras by what their views would add to a run, or to a file of Gaussians."""
 
     candidates: str
-    """A data set or a run (those of its views that are not known), a cameras.json or selection.json, orbit, or dome."""
+    """A data set or a run (its views without the training views), a cameras.json or selection.json, orbit, or dome."""
     k: Annotated[int, arg(aliases=["-k"])] = 1
-    """Views to pick, each given the ones before."""
+    """Number of views to pick, one after the other."""
     refine: int = 0
-    """Move each pick to where its view tells more, by scoring so many further cameras at most; 0: it stays."""
+    """Move each pick to a better pose near it, by scoring at most this many further cameras; 0: keep it."""
     refine_box: str | None = None
-    """X0,Y0,Z0,X1,Y1,Z1: where cameras may be moved to, world units; default the box around candidates and known."""
+    """X0,Y0,Z0,X1,Y1,Z1: box for --refine, world units; default the box around candidates and training views."""
     output: OutputPath = Path("out/select.json")
     """The JSON file."""
     preset: Preset = "fast"
-    """Render settings of a named system; fast ranks as exact does, in a fraction of the time (docs)."""
+    """Preset of render settings; fast ranks like exact in a fraction of the time (docs/tradeoff-fisher.md)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Fisher(Comparing):
-    """Write the information that known views have about every Gaussian, and maps of what they leave uncertain."""
+    """Write the Fisher information of training views about every Gaussian, and maps of the remaining uncertainty."""
 
     cameras: str | None = None
-    """Views to draw maps for: a data set, a run, a cameras.json or selection.json, orbit or dome; default the known."""
+    """Views for maps: a data set, a run, a cameras.json or selection.json, orbit or dome; default training views."""
     output: OutputPath = Path("out/fisher")
     """Folder for information.safetensors, fisher.json and the maps."""
     limit: int = 4
-    """Maps of at most this many views, evenly spaced."""
+    """At most this many views for maps, evenly spaced."""
     pose: bool = False
-    """Also report what each of these views says about its own pose, a 6x6 matrix."""
+    """Also report the information of each of these views about its own pose, a 6x6 matrix."""
     maps: bool = False
-    """Also write each view beside its maps of moments, of fisherrf and of every block, as one picture."""
+    """Also write an image of each view side by side with its maps of moments, of fisherrf and of every block."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class View(Informed, Around, Views):
-    """Look at a run or a Gaussian PLY in the browser, while it is fitted, too."""
+    """Look at a run or a file of Gaussians in the browser, also during a fit."""
 
     scene: Positional[Path]
     """A run folder, a 3DGS point_cloud.ply, or Gaussians in another format (docs/files.md)."""
     train: str | None = None
-    """Known views, whose cameras are shown: a data set, a run, a cameras.json or selection.json; default the run's."""
+    """Training views to display: a data set, a run, a cameras.json or selection.json; default those of the run."""
     selection: Path | None = None
-    """Scores of cameras, as drgs select writes them; default those of the run, if it chose its views."""
+    """Scores of cameras, a file that drgs select wrote; default those of the run, if it chose its views."""
     blocks: Annotated[tuple[Block, ...] | None, BLOCKS_TEXT] = ("geometry", "backdrop")
-    """What of an image tells, for the map of information: geometry, semantic, deformation, backdrop."""
+    """Outputs that count in the map of uncertainty: geometry, semantic, deformation, backdrop."""
     max_pixels: int = 500_000
-    """Our pictures have at most this many pixels, whatever the window."""
+    """Images rendered by drgs have at most this many pixels, also in a larger window."""
     host: str = "127.0.0.1"
-    """Address to listen at; 0.0.0.0: all of this machine's, for browsers of others, which then need a token."""
+    """Address to listen at; 0.0.0.0: all addresses of this machine, for other machines, which then need a token."""
     port: int = 8080
-    """Port to listen at; 0: any that is free."""
+    """Port to listen at; 0: any free port."""
     token: str | None = None
-    """What a browser must know; default nothing on this machine, else one that is made up and printed."""
+    """Token that browsers must send; default none on this machine, else a random one, which is printed."""
     open: bool = False
-    """Open the page in a browser, too."""
+    """Open the page in a browser."""
     orbit_keys: ClassVar[tuple[str, ...]] = tuple(key for key in ORBIT_KEYS if key != "fov")  # the browser has its own
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Crossval(Seen):
-    """Compare a rasterizer's image and gradients with ours and name what differs, group by group."""
+    """Compare a rasterizer's image and gradients with a reference and name differences, by parameter group."""
 
     rasterizer: str = "drgs:ewa"
     """drgs:ewa or drgs:PRESET, gsplat, package.module:function, or a dump (.npz, .safetensors)."""
     preset: Literal["auto", Preset] = "auto"
-    """The model that it claims to compute; auto: the one whose image is nearest."""
+    """Model that the rasterizer implements; auto: the preset with the nearest image."""
     ladder: bool = True
-    """Say which approximations make that model differ from the exact one, unless --no-ladder, which saves the time."""
+    """Measure which approximations of that model cause its difference from exact, unless --no-ladder is given."""
     strict: bool = False
-    """Conventions that differ and known deviations fail, too, and so does a data set with images that are missing."""
+    """Fail also for other conventions, known deviations and missing images of a data set."""
     export: Path | None = None
-    """Only write the scene, the cameras and cotangents to this .npz, for a rasterizer on another machine."""
+    """Only write scene, cameras and cotangents to this .npz, for a rasterizer on another machine."""
     output: OutputPath = Path("out/crossval")
     """Folder for report.html and crossval.json."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Tradeoff(Seen):
-    """Time every accuracy/speed setting on a scene, with its image, gradient and information error."""
+    """Measure time and errors (image, gradient, information) of every accuracy setting on a scene."""
 
     max_error: tuple[float, ...] = (1e-4, 1e-3, 1e-2)
-    """Budgets: one setting is recommended for each, the fastest whose errors are all below it."""
+    """Error budgets: for each, the fastest setting whose errors are all below it is recommended."""
     repeats: int = 5
-    """Interleaved rounds of timing."""
+    """Rounds of timing, in each of which all settings are timed in turn."""
     seconds: float = 300.0
-    """For timing the leading settings on views as large as they are drawn; less time, smaller views."""
+    """Seconds for timing the best settings on views of full size; with less time the views are smaller."""
     output: OutputPath = Path("out/tradeoff")
     """Folder for tradeoff.json, tradeoff.md and the plot."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Query(Settings, Around, Views, Lenses):
-    """Find what a text means: masks of views, and a PLY of the Gaussians that are it, or of all others."""
+    """Find objects by text: write masks of views, and a PLY of the Gaussians of the objects, or of all others."""
 
     scene: Positional[Path]
     """A run that was fitted with semantics, or a 3DGS PLY with features."""
     classes: Annotated[tuple[str, ...], arg(name="class", metavar="NAME"), UseAppendAction] = ()
-    """A class of the run; may be repeated."""
+    """Name of a class of the run; may be repeated."""
     text_embedding: Path | None = None
     """Embeddings of texts by the teacher's text encoder: .npy or .pt, of shape (C,) or (K, C)."""
     threshold: float | None = None
-    """What the score must reach: of classes their probability, of embeddings the cosine; default the largest wins."""
+    """Least score: probability of a class, or cosine of an embedding; default the largest wins."""
     temperature: float | None = None
-    """Cosines are divided by it before the softmax that makes probabilities of them; default 0.01, CLIP's."""
+    """Temperature of the softmax over cosines; default 0.01, that of CLIP."""
     decoder: Path | None = None
-    """Decoder of a PLY, as Feature 3DGS writes it (decoder_chkpnt*.pth); a run has its own."""
+    """Decoder for a PLY, a decoder_chkpnt*.pth of Feature 3DGS; a run has its own."""
     remove: bool = False
-    """Write all Gaussians but the selected ones."""
+    """Write all Gaussians except the selected ones."""
     preset: Preset = "fast"
-    """Render settings of a named system."""
+    """Preset of render settings."""
     cameras: str | None = None
-    """A data set, a run, a cameras.json or selection.json, or orbit; default a run's own, else orbit."""
+    """Views: a data set, a run, a cameras.json or selection.json, or orbit; default those of the run, else orbit."""
     split: Split = "all"
-    """Which views of a data set."""
+    """Which views of a data set to take."""
     limit: int = 4
-    """Masks of at most this many views, evenly spaced."""
+    """At most this many views for masks, evenly spaced."""
     max_pixels: int | None = None
-    """Views are reduced to at most this many pixels; default as in the fit."""
+    """Views are reduced to at most this many pixels; default that of the fit."""
     output: OutputPath = Path("out/query")
-    """Folder for the masks, pictures, query.json, and selected.ply or (--remove) rest.ply."""
+    """Folder for masks, images, query.json, and selected.ply or (--remove) rest.ply."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -298,53 +298,53 @@ class Convert(Common):
 
     scene: SceneFile
     out: Positional[Path]
-    """The file; its suffix says the format."""
+    """Output file; its suffix is the format."""
     as_stored: bool = False
-    """Of an .spz, keep its axes: some programs write those of PLY files and not those that the format states."""
+    """Do not turn the axes of an .spz: some programs write the axes of PLY files instead of the format's."""
     time: float | None = None
-    """Of a run that moves: the Gaussians as they are then."""
+    """Dynamic scenes: the time at which Gaussians are written."""
     uncertainty: Path | None = None
-    """information.safetensors of drgs fisher: what it leaves uncertain goes into the PLY, a column a group."""
+    """information.safetensors of drgs fisher: adds a column of standard deviations for each group to the PLY."""
     prior: float = 1.0
-    """For --uncertainty: how firmly every number counts as known beforehand (lambda), as in the maps of drgs fisher."""
+    """For --uncertainty: prior information about every parameter (lambda), as in the maps of drgs fisher."""
     labels: bool = False
-    """Of a run that was fitted with classes: a column with the class of each Gaussian is added to the PLY."""
+    """Add a column with the class of each Gaussian to the PLY, for a run that was fitted with classes."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Stress(Common):
-    """Run the extremes of the renderer on this machine against the float64 oracle and print their errors."""
+    """Test the renderer on extreme scenes on this machine and print its errors, compared with a float64 oracle."""
 
     match: str = ""
-    """Only the cases with this text in their name."""
+    """Run only the cases with this text in their name."""
     output: Annotated[Path | None, arg(aliases=["-o"])] = None
-    """Folder for stress.json and stress.md; default none is written."""
+    """Folder for stress.json and stress.md; by default none is written."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Eval(Common, Data):
-    """Measure a run on held-out views: PSNR, SSIM, FLIP, and LPIPS when weights are given."""
+    """Measure a run on held-out views: PSNR, SSIM, FLIP, and LPIPS if weights are given."""
 
     run: Positional[Path]
     """A run folder."""
     split: Split = "test"
-    """Which views."""
+    """Which views to measure."""
     preset: Literal["all", Preset] | None = None
-    """Renderers to measure with, beside the run's own settings; default those that it was fitted for, and gsplat."""
+    """Further renderers to measure with; default those that the run was fitted for, and gsplat."""
     scale: float = 1.0
-    """Measure pictures this many times as wide and high as those of the fit, up to the photographs' own size."""
+    """Factor of width and height of the images over those of the fit, up to the size of the photographs."""
     lpips_weights: Path | None = None
     """torchvision's AlexNet or VGG16 (docs/install.md names the files), for LPIPS; needs pip install 'drgs[lpips]'."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Report(Common):
-    """Write what a fit looked like as one HTML file: curves, views, picks, maps, timings, and how to repeat it."""
+    """Write a report of a fit as one HTML file: curves, views, picks, maps, timings, and the command."""
 
     run: Positional[Path]
-    """A run folder; the fit may still be going on, or have been stopped."""
+    """A run folder; the fit may still run, or have been stopped."""
     output: Annotated[Path | None, arg(aliases=["-o"])] = None
-    """The HTML file; default report.html in the run folder. While a fit writes there, name another place."""
+    """Output HTML file; default report.html in the run folder. While a fit writes there, name another place."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -353,18 +353,18 @@ class Share(Common):
 
     scene: SceneFile
     output: Annotated[Path | None, arg(aliases=["-o"])] = None
-    """The HTML file; default scene.html in the run folder, of a file the same name with .html."""
+    """Output HTML file; default scene.html in the run folder, for a file its name with .html."""
     selection: Path | None = None
-    """Photographs to take next, as drgs select writes them; default those of the run, if it chose its views."""
+    """Photographs to take next, a file that drgs select wrote; default those of the run, if it chose its views."""
     uncertainty: bool = True
-    """With a layer of what the photographs leave uncertain, unless --no-uncertainty, which saves the time."""
+    """Add a layer of the uncertainty that the photographs leave, unless --no-uncertainty is given."""
     moments: int = 12
-    """Of a scene that moves: at so many times it is written, the page draws those between on straight lines."""
+    """Dynamic scenes: number of times to store; the page interpolates linearly between them."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Cite(Common):
-    """Print BibTeX of what a run used, by its config.json; without a run, of what every use rests on."""
+    """Print BibTeX of what a run used, by its config.json; without a run, of what drgs always uses."""
 
     run: Positional[Path | None] = None
-    """A run folder; the fit may still be going on."""
+    """A run folder; the fit may still run."""

@@ -19,11 +19,11 @@ UP = {
 """World directions by their names on the command line."""
 
 ORBIT_KEYS = {
-    "up": "world direction that is up: x, y, z, minus-x, minus-y, minus-z; auto: as the photographs, else minus-y",
-    "center": "world point X,Y,Z that is looked at; default as the photographs, else the middle of the Gaussians",
-    "distance": "from that point, in scene units; default the photographs' median, else so that all is in the frame",
+    "up": "up direction of the world: x, y, z, minus-x, minus-y, minus-z; auto: that of the photographs, else minus-y",
+    "center": "world point X,Y,Z to look at; default that of the photographs, else the middle of the Gaussians",
+    "distance": "distance from that point, in scene units; default the photographs' median, else all is in the frame",
     "elevation": "degrees above the center; default the photographs' median, else 20",
-    "span": "degrees that are covered; default as the photographs, else 360 (select and fisher: 360 if they meet)",
+    "span": "degrees of the orbit; default that of the photographs, else 360 (select and fisher: 360 if closed)",
     "fov": "horizontal field of view in degrees; default the photographs', else 45",
 }
 """Key -> what it says, as help shows it."""

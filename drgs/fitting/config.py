@@ -86,30 +86,27 @@ class DataConfig(Record):
 
     Attributes:
         max_pixels: Images are reduced to at most this many pixels.
-        num_downscales: How many times their width and height are halved at the start; they double again in the first
-            half of the steps, but none is made smaller than 11 pixels.
+        num_downscales: Start with images of half the width and height, this many times halved; full size is reached in
+            the first half of the steps, and no side is below 11 pixels.
         init_points: Initial points: of the training views (views) or of the data set (all); auto: all, or views if
             --views active.
-        test_every: Every n-th view, by name, is held out; 0 holds out none.
-        test_offset: Index of the first of them, below --test-every; a split that the data set itself states wins over
+        test_every: Hold out every n-th view, by name; 0 holds out none.
+        test_offset: Index of the first held-out view, below --test-every; a split in the data set's files overrides
             both.
-        test_cameras: Synchronous cameras that are held out at all times, e.g. cam00,cam07; none leaves it to
-            --test-every.
-        times: How many frames of each synchronous camera are used, evenly over its video, the first and the last
-            included.
-        mask: Outside of masks is nothing (object), or something unknown (valid); auto: object if there are mask files,
-            valid where undistorted photographs have empty corners; ignore reads none. With object and auto nothing is
-            where a photograph's own alpha channel is transparent, either.
-        undistort: Take lenses out of photographs (on), or fit them as they were taken (off), with renderers that follow
-            rays through the lens (--for drgs, exact, fast or 3dgut); auto: off where these are asked for and more than
-            a fifth of what photographs show would be lost.
-        exposure: Multiply what is rendered for a photograph by its own gain of R, G and B: none (off), those that
-            initial points tell (points), the same fitted on (learned); auto: points, where they differ clearly.
-        poses: Cameras of training photographs stay where the data set says (fixed) or are fitted, too (refined); auto:
-            fitted, where observations of a COLMAP model are clearly off.
-        skybox: A tenth of the Gaussians begins far away around the scene, for the sky and what is behind everything,
-            where photographs clearly agree on what is far away (auto, not in active fits nor where things move), always
-            (on), or never (off).
+        test_cameras: Synchronous cameras to hold out at all times, e.g. cam00,cam07; none: hold out by --test-every.
+        times: Number of frames of each synchronous camera, evenly spaced in its video, the first and the last included.
+        mask: Outside of masks the scene is empty (object), or unknown (valid); auto: object for views with a mask file,
+            valid for empty corners of undistorted photographs; ignore: no masks. With object and auto, transparent
+            pixels of an alpha channel are empty, too.
+        undistort: Undistort photographs (on), or fit them as they were taken (off), with renderers along rays (--for
+            drgs, exact, fast or 3dgut); auto: off for these renderers if undistorting would crop more than a fifth of
+            the picture.
+        exposure: Multiply the rendering of each photograph by gains of R, G and B: none (off), estimated from the
+            initial points (points), then optimized (learned); auto: points, if gains clearly differ.
+        poses: Keep the cameras of training photographs (fixed), or optimize them (refined); auto: refined if
+            reprojection errors of a COLMAP model are large.
+        skybox: Place a tenth of the Gaussians far around the scene, for the sky and the far background: if photographs
+            clearly agree on it (auto; not in active fits and dynamic scenes), always (on), or never (off).
     """
 
     max_pixels: int = 130_000
@@ -148,17 +145,17 @@ class DensityConfig(Record):
     28.4); MCMC has 5e5, for 30,000 steps.
 
     Attributes:
-        max_gaussians: How many Gaussians there may be, at the start as later.
+        max_gaussians: Largest number of Gaussians, at the start and later.
         initial_opacity: Opacity of every Gaussian at the start.
-        dense_opacity: The same, where the initial points are of depth maps.
+        dense_opacity: Opacity at the start of Gaussians at points of depth maps.
         dense_scale: Factor of the scales of Gaussians at points of depth maps.
-        refine_start: Fraction of the steps from which on density is controlled.
-        refine_stop: Fraction of the steps up to which density is controlled.
-        refine_every: Fraction of the steps between two times that density is controlled.
+        refine_start: Fraction of the steps at which density control begins.
+        refine_stop: Fraction of the steps at which density control ends.
+        refine_every: Fraction of the steps between two steps of density control.
         min_opacity: A Gaussian below this opacity is moved elsewhere.
-        grow_until: Fraction of the steps at which the budget of Gaussians is reached, growing at a constant rate.
-        noise: Strength of the noise by which Gaussians explore; 0 is none, 5e5 is that of MCMC.
-        jitter: Displacement of copies, in their own standard deviations.
+        grow_until: Fraction of the steps at which --max-gaussians is reached, at a constant rate of growth.
+        noise: Strength of the exploration noise of MCMC; 0 is none, 5e5 is that of the paper.
+        jitter: Displacement of copied Gaussians, in their own standard deviations.
     Reference:
         [1] Kheradmand et al., "3D Gaussian Splatting as Markov Chain Monte Carlo", NeurIPS 2024.
     """
@@ -229,13 +226,13 @@ class LossConfig(Record):
     """Weights of the terms of the loss that every fit has; the photographs' L1 distance has what SSIM leaves of 1.
 
     Attributes:
-        ssim_weight: Weight of 1 - SSIM against the L1 distance, in [0, 1].
-        outside_weight: Weight of the opacity outside of a mask of kind object, and where a photograph's own alpha
-            channel says that nothing is.
-        opacity_weight: Weight of the mean opacity, which lets Gaussians that nobody needs fade (MCMC).
+        ssim_weight: Weight of 1 - SSIM in the loss, in [0, 1]; the rest is that of the L1 distance.
+        outside_weight: Weight of the opacity outside of object masks, and where the alpha channel of a photograph is
+            transparent.
+        opacity_weight: Weight of the mean opacity, which lets Gaussians of no use fade (MCMC).
         scale_weight: Weight of the mean scale, which keeps Gaussians small (MCMC).
-        transients: What is in one photograph only, a shadow or a passer-by, is left out of the loss never (keep), if
-            residuals show clearly that there is such a thing (auto), or wherever they may show it (mask).
+        transients: Leave shadows and passers-by, which single photographs have, out of the loss: never (keep), if
+            residuals clearly reveal some (auto), or at all suspicious pixels (mask).
     """
 
     ssim_weight: float = 0.2
@@ -257,16 +254,16 @@ class FeatureConfig(Record):
     In [1] features are rendered at the size of the image, and the feature image reaches the features alone.
 
     Attributes:
-        semantics: Fit features and a decoder, too, where the data set has maps of a teacher (auto), or never (ignore).
-        feature_width: Feature channels of a Gaussian; a linear decoder makes the teacher's of them.
-        feature_weight: Weight of the features' distance to the teacher's maps in the loss; that of the photographs'
-            is 1.
+        semantics: Fit semantic features and a decoder if the data set has a teacher's feature maps (auto), or never
+            (ignore).
+        feature_width: Feature channels of a Gaussian; a linear decoder maps them to those of the teacher.
+        feature_weight: Weight of the distance to the teacher's feature maps in the loss; that of the photographs is 1.
         feature_rate: Learning rate of the features; five times as much for fits of about 1,000 steps
             (docs/semantic.md).
-        decoder_rate: Learning rate of the decoder, a tenth of the features' as a rule.
-        couple_features: Let features move the geometry, too; else only colors do.
-        feature_resolution: Features are rendered at the size of the image and then reduced, or at that of the teacher's
-            map: faster.
+        decoder_rate: Learning rate of the decoder, usually a tenth of that of the features.
+        couple_features: Let gradients of the features change the geometry, too, not only those of colors.
+        feature_resolution: Render features at the size of the image and reduce them, or, faster, at the size of the
+            teacher's map.
     Reference:
         [1] Zhou et al., "Feature 3DGS", CVPR 2024, and its code.
     """
@@ -291,7 +288,7 @@ class SavingConfig(Record):
 
     Attributes:
         save_every: Steps between checkpoints.
-        save_minutes: Minutes after which one is written all the same, however few steps these were.
+        save_minutes: Minutes between checkpoints, if --save-every takes longer.
     """
 
     save_every: int = 1000
@@ -322,21 +319,23 @@ class SelectionConfig(Record):
     to none can be triangulated.
 
     Attributes:
-        policy: What chooses: a name, or package.module:function of one's own (docs/extending.md).
+        policy: How views are picked: a policy's name, or package.module:function of your own (docs/extending.md).
         scoring: What counts, and how; its settings and the metric of its features are the fit's.
-        schedule: Pick view by view (views), one camera at each later time (times), or any camera at any (pairs); auto:
-            times where a deformation is fitted.
-        initial: Views at the start: that of --start, then those farthest away; default 2, or all cameras at the first
-            time.
-        start: The first of the initial views: the first training view by name, or one that the seed draws.
-        add: Views to be chosen on the way, others are not read; default 10, or one for every time after the first.
+        schedule: Pick view by view (views), one camera at each later time (times), or any camera at any time (pairs);
+            auto: times for dynamic scenes, else views.
+        initial: Number of initial views: the one of --start, then those farthest away; default 2, or all cameras at the
+            first time.
+        start: First of the initial views: the first training view by name, or a random one by the seed.
+        add: Number of views to pick during the fit; the others are not read; default 10, or one for every time after
+            the first.
         every: Steps before the first pick, and between picks; default 200, with --schedule times or pairs 200 of
             17,000.
-        info_pixels: Information is computed on views of at most this many pixels; default as in the fit.
-        pick_points: Points that a picked view adds: triangulated, and where nothing is yet; auto: none with
-            --init-points all.
-        restart: Begin again after a pick at points of all views so far: until these are 1,000 (auto), always, never.
-        measure: Numbers of training views at which the held-out views are measured, too, just before the next pick.
+        info_pixels: Compute information on views of at most this many pixels; default that of the fit.
+        pick_points: Points that a picked view adds: triangulated, and where no Gaussian is yet (uncovered), or none;
+            auto: none with --init-points all.
+        restart: Restart the Gaussians after a pick, at points of all views so far: until these are 1,000 (auto),
+            always, or never.
+        measure: Numbers of training views at which held-out views are measured, too, just before the next pick.
     """
 
     policy: str = "fisher"
@@ -420,15 +419,15 @@ class FitConfig(Record):
 
     Attributes:
         settings: What `drgs.render` computes.
-        renderers: Renderers that the fit must look right in, taken in turn: any (exact, fast, inria, gsplat, 3dgut),
-            drgs (exact, fast), viewers (gsplat, inria), or presets; auto: any, or --preset alone where it is given.
-        filter_3d: Render, and save, no Gaussian narrower than the photographs sample it (on), for pictures larger than
-            those of the fit; the 3D smoothing filter of Mip-Splatting.
+        renderers: Renderers that the result must look right in, used in turn: any (exact, fast, inria, gsplat, 3dgut),
+            drgs (exact, fast), viewers (gsplat, inria), or presets; auto: any, or --preset alone if it is given.
+        filter_3d: Limit Gaussians to the sampling rate of the photographs (on), for renderings larger than those of the
+            fit: the 3D smoothing filter of Mip-Splatting.
         max_steps: Optimizer steps.
-        seed: Seed of everything random.
+        seed: Random seed.
         sh_degree: Highest degree of the view-dependent color.
-        deterministic: One Dr.Jit thread: same seed, same bits; slower. (Images drawn again without gradients differ by
-            1e-7: docs/numerics.md.)
+        deterministic: Use one Dr.Jit thread, which is slower: the same seed gives the same bits. (Images rendered again
+            without gradients differ by 1e-7: docs/numerics.md.)
         data: Photographs, split and initial points.
         density: Numbers of Gaussians, and density control.
         rates: Learning rates.

@@ -35,24 +35,24 @@ class MotionConfig(Record):
     another time fades them (`drgs.fitting.lives`).
 
     Attributes:
-        dynamics: Fit a deformation field where the views have several times (auto), or static Gaussians to all times
+        dynamics: Fit a deformation field if the views have several times (auto), or static Gaussians to all times
             (ignore).
         static_share: Fraction of the steps that fit static Gaussians to the first time, before the deformation field is
-            added; 0 leaves them out.
+            added; 0: none.
         field_preset: Size of the deformation field: for videos of several cameras (neu3d), or one camera around an
             object (dnerf).
         grid_rate: First and last learning rate of the field's planes.
         field_rate: First and last learning rate of the field's MLP.
-        motion_rate: Learning rate of the gates (a logit each Gaussian: does it move?), times the steps of the dynamic
-            stage.
-        motion_weight: Weight in the loss of the mean of all gates: the larger, the fewer Gaussians move.
-        smooth_weight: Weight of the field's smoothness along time.
-        plane_weight: Weight of the smoothness of the field's planes of space (x and y, x and z, y and z).
-        l1_time_weight: Weight of the L1 distance of the field's planes of time from 1, at which they change nothing.
-        lives: Gaussians that are there for a time, born where photographs of one time show what those of the static
-            stage do not (auto), or none (off).
-        life_weight: Weight of the mean, over Gaussians, of the time between photographs over the width of a life, where
-            that is below 1: the larger, the longer they live.
+        motion_rate: Learning rate of the gates (for each Gaussian a logit of whether it moves), times the steps of the
+            dynamic stage.
+        motion_weight: Weight of the mean gate in the loss: the larger, the fewer Gaussians move.
+        smooth_weight: Weight of the smoothness of the field along time.
+        plane_weight: Weight of the smoothness of the field's spatial planes (xy, xz, yz).
+        l1_time_weight: Weight of the L1 distance of the field's temporal planes from 1, where they have no effect.
+        lives: Add Gaussians with a limited lifetime where photographs of one time differ from the static Gaussians
+            (auto), or none (off).
+        life_weight: Weight of the mean ratio of the time between photographs to a Gaussian's lifetime, where it is
+            below 1: the larger, the longer they live.
     Reference:
         [1] Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", CVPR 2024, and its code.
     """

@@ -28,11 +28,11 @@ class Nuisances(Record):
     equations.
 
     Attributes:
-        eliminate: Unknowns of every view that its information is freed of: exposure (three log gains), pose; none;
-            default those that the fit has estimated.
-        exposure_std: Standard deviation of a log gain that is known before a view is seen; default nothing is known.
-        pose_std: Standard deviations of the camera's rotation about its center (radians) and of its place (world
-            units) that are known before; default nothing is known.
+        eliminate: Unknowns of each view to marginalize in its information: exposure (three log gains), pose; none;
+            default those that the fit estimated.
+        exposure_std: Prior standard deviation of a log gain of a view; default unknown.
+        pose_std: Prior standard deviations of a camera's rotation about its center (radians) and of its center (world
+            units); default unknown.
     Raises:
         ValueError: If a name is unknown, or a standard deviation is out of range.
     """

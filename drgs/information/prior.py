@@ -23,7 +23,7 @@ class Prior:
 
     Attributes:
         value: lambda of every group, >= 0. With 0, parameters that no training view sees are left out of every score.
-        relative: lambda is its value (--prior) times the median information of a parameter's group, where it is not 0.
+        relative: lambda is its value (--prior) times the median of the nonzero information of a parameter's group.
         groups: Group -> lambda in place of `value`.
     Raises:
         ValueError: If a lambda is negative, infinite or NaN.

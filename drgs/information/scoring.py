@@ -62,22 +62,22 @@ class Scoring(Record):
     `fisher` and `fisherrf`. Groups of a scene's network need method `columns` or `probes`.
 
     Attributes:
-        criterion: Score of policy fisher, or package.module:function of one's own; v_opt chose the best views from six
-            on, level below (docs/active-static.md).
+        criterion: Score of policy fisher, or package.module:function of your own; v_opt chooses best from six views on
+            (docs/active-static.md).
         settings: What `drgs.render` computes of a view.
-        method: How information is computed: exactly (columns: slowly), by random probes, or as FisherRF's code does.
-        prior: How firmly every parameter counts as known beforehand (lambda): 1e-2 with v_opt, 1 in drgs fisher, else
-            1e-6.
+        method: How information is computed: exactly (columns: slower), by random probes, or as FisherRF's code does.
+        prior: Prior information about every parameter (lambda): 1e-2 with v_opt, 1 in drgs fisher, else 1e-6.
         weights: Group -> factor of its part of the score; 1 where none is given.
         groups: Groups of the parameters that count, as `drgs.fisher.diagonal` takes them; None: all that there are.
-        blocks: What of an image tells: geometry (colors), semantic (features), deformation (what moves), backdrop
-            (gaps).
+        blocks: Outputs of a view that count: geometry (colors), semantic (features), deformation (motion), backdrop
+            (where no Gaussian is).
         semantics: Metric of the block semantic; None: that of features as they are stored, all channels alike.
-        network: How the block deformation scores: against what known views say of the field (ratio), or alone (trace,
-            paper).
-        combine: Scores of several blocks are added up, or as z-scores over the candidates; default zscore with a trace.
-        probes: Random probes of each view, for what it tells about a deformation field, and for --method probes.
-        nuisances: Unknowns of each view that are eliminated from what it tells; of policy fisher.
+        network: Score of block deformation: relative to the information of the training views (ratio), or without it
+            (trace, paper).
+        combine: Add the scores of several blocks (sum), or their z-scores over the candidates (zscore); default sum,
+            with --network trace or paper zscore.
+        probes: Number of random probes of each view, for block deformation and for --method probes.
+        nuisances: Unknowns of each view that are eliminated from its information; of policy fisher.
     Raises:
         ValueError: If a criterion, method or block is unknown, blocks cannot be combined so, or something else is of
             the wrong kind.

@@ -22,13 +22,14 @@ class MeshOptions(Record):
     """How a surface is made of depth images.
 
     Attributes:
-        depth: A ray meets the surface where transmittance falls to one half (median), or at the mean (expected).
-        voxel: Distance of neighboring points of the lattice in scene units; default two pixels wide on the surface.
-        trunc: How far from the surface a view still says something about it, in voxels.
-        max_voxels: Points of the lattice that are computed at most; the default voxel grows until they suffice.
-        min_views: Cut away what fewer views than this see.
-        crop: Cut away what known views leave more uncertain than this many voxels, by their information; 0 keeps it.
-        min_piece: Remove loose pieces with less than this share of the largest one's area.
+        depth: Depth of a ray: where transmittance falls to one half (median), or the mean (expected).
+        voxel: Size of a voxel in scene units; default two pixels wide on the surface.
+        trunc: Truncation distance of the signed distance field, in voxels.
+        max_voxels: Largest number of voxels to compute; the default --voxel grows until they suffice.
+        min_views: Remove parts of the surface that fewer views than this see.
+        crop: Remove parts of the surface whose position the views leave more uncertain than this many voxels; 0 keeps
+            all.
+        min_piece: Remove loose pieces with less than this fraction of the largest one's area.
     """
 
     where: ClassVar[str] = "mesh"
