@@ -123,7 +123,7 @@ def _tell_next(args: Capture) -> None:
     if args.quiet:
         return
     if args.length is None:
-        print("lengths are told in shares of the way from a photograph to what it shows; --length tells them in meters")
+        print("lengths are shares of the way from a photograph to what it shows; with --length they are in meters")
     for pick in picks:
         worth = "" if pick["gain"] is None else f" (tells as much as {_counted(pick['gain'])})"
         print(f"{pick['rank']}. {pick['text']}{worth}")

@@ -49,7 +49,10 @@ def imported_function(option: str, text: str, or_else: str = "") -> Callable[...
     try:
         found = getattr(importlib.import_module(module), attribute, None)
     except Exception as error:
-        raise ValueError(f"{option} {text}: must be importable, got {type(error).__name__}: {error}") from error
+        raise ValueError(
+            f"{option} {text}: must be importable, got {type(error).__name__}: {error}; correct it, or run drgs in the "
+            "folder that holds the module"
+        ) from error
     if not callable(found):
         raise ValueError(f"{option} {text}: {module} must have a function {attribute}, has none")
     return found
