@@ -5,6 +5,7 @@ import importlib
 import inspect
 import subprocess
 import sys
+import textwrap
 import typing
 
 import pytest
@@ -13,7 +14,7 @@ from drgs import cli, fisher, gain, runtime, select
 from drgs.commands import making_options, options
 from drgs.commands.option_help import options_in
 from drgs.data import sfm
-from drgs.fitting.config import FitConfig, SelectionConfig
+from drgs.fitting.config import DataConfig, FitConfig, SelectionConfig
 from drgs.fitting.renderers import own_preset
 from drgs.guards.records import hints_of, part_of, texts_of, ways_of
 from drgs.information.choices import CRITERION_NAMES, POLICY_NAMES, Criterion, Policy
@@ -32,6 +33,21 @@ def _of_records(kind: type) -> dict[str, typing.Any]:
         value = getattr(kind(), name)
         found |= _of_records(part) if (part := part_of(hint)) and value is not None else {name: value}
     return found
+
+
+def test_texts_of_any_python():
+    """Python 3.13 takes the indentation of the code off docstrings; what they say of fields is read all the same."""
+    texts = dict(texts_of(DataConfig))
+    as_is = DataConfig.__doc__
+    for doc in (inspect.cleandoc(as_is), textwrap.indent(inspect.cleandoc(as_is), "    ").lstrip()):
+        texts_of.cache_clear()
+        DataConfig.__doc__ = doc
+        try:
+            assert dict(texts_of(DataConfig)) == texts
+        finally:
+            DataConfig.__doc__ = as_is
+            texts_of.cache_clear()
+    assert set(texts) >= {"max_pixels", "exposure", "poses"}
 
 
 def test_fit_options_are_the_fields_of_its_records():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import functools
+import inspect
 import re
 import sys
 import types
@@ -141,8 +142,9 @@ def part_of(hint: Any) -> Any:
 def texts_of(kind: type) -> Mapping[str, str]:
     """Field, of the record and of its parts -> what its docstring's `Attributes` say of it, as one line."""
     found: dict[str, str] = {}
-    told = (kind.__doc__ or "").partition("Attributes:\n")[2]
-    for block in re.split(r"\n(?= {8}\w)", "\n" + told.partition("\n    Raises:")[0].partition("\n    Reference:")[0]):
+    # Python 3.13 takes the indentation of the code off docstrings, those before do not.
+    told = inspect.cleandoc(kind.__doc__ or "").partition("Attributes:\n")[2]
+    for block in re.split(r"\n(?= {4}\w)", "\n" + told.partition("\nRaises:")[0].partition("\nReference:")[0]):
         names, colon, text = block.strip().partition(": ")
         if colon:
             found |= {name: " ".join(text.split()) for name in names.split(", ") if name in hints_of(kind)}
