@@ -242,8 +242,8 @@ def test_variance_map(direction):
 
 @pytest.mark.parametrize("direction", ["gaussian", "ray"])
 def test_variance_without_lambda(direction):
-    """Of what is all but transparent H is 1e-38 and 1 / H near the end of float32: the map is finite all the same, its sum at
-    most the number of parameters seen, and infinite weights are refused, those of SH along rays, too.
+    """Of what is all but transparent H is 1e-38 and 1 / H near the end of float32: the map is finite all the same, its
+    sum at most the number of parameters seen, and infinite weights are refused, those of SH along rays, too.
     """
     g, cam, settings, _, _ = _one(direction=direction)
     settings = Preset("fast", sh_direction=direction, alpha_min=0.0)
