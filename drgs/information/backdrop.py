@@ -91,7 +91,7 @@ def backdrop_sphere(
     # Of the cameras, not of their order, which the last bits of a running sum depend on.
     center = np.array([math.fsum(along) / len(cameras) for along in centers.T.tolist()])
     if len(cameras) > _VIEWS:
-        in_order = sorted(cameras, key=lambda camera: (camera.center.tolist(), camera.w2c.tolist(), camera.time))
+        in_order = sorted(cameras, key=_place)
         cameras = [in_order[i * len(cameras) // _VIEWS] for i in range(_VIEWS)]
     found = answers(_surfaces, cameras) if answers else (_surfaces(scene, camera) for camera in cameras)
     solid = np.concatenate([one["depths"].numpy() for one in found])
@@ -100,6 +100,11 @@ def backdrop_sphere(
     outermost = float(np.linalg.norm(centers - center, axis=1).max())
     radius = max(float(np.quantile(solid, _FARTHEST)), _AROUND * outermost)
     return Sphere((float(center[0]), float(center[1]), float(center[2])), radius)
+
+
+def _place(camera: Camera) -> tuple[list, list, float]:
+    """Where a camera is, which way it looks, and its time: no two orders of the same cameras are sorted differently."""
+    return camera.center.tolist(), camera.w2c.tolist(), -math.inf if camera.time is None else camera.time
 
 
 def _surfaces(scene: Scene, camera: Camera, mask: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
