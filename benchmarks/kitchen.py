@@ -128,13 +128,11 @@ def told(rows: Rows) -> str:
         for label in SHOWN
         if (values := differences(rows, "psnr", DEFAULT, label)) and (one := estimate(values)).detectable is not None
     ]
-    verdict = (
-        "Bold: the interval excludes 0. " if len(found) >= FEWEST_UNITS else "So few give no verdict. "
-    )
+    verdict = "Bold: the interval excludes 0. " if len(found) >= FEWEST_UNITS else "So few give no verdict. "
     least = f"A t test would find a difference of {np.median(seen):.2f} dB in 80 % of such studies." if seen else ""
     return (
-        f"{size}Differences are paired, with 95 % intervals of a bootstrap over kitchens; {held} of such intervals hold "
-        f"the true mean. {verdict}{least}"
+        f"{size}Differences are paired, with 95 % intervals of a bootstrap over kitchens; {held} of such intervals "
+        f"hold the true mean. {verdict}{least}"
     )
 
 
