@@ -33,6 +33,7 @@ import drgs  # noqa: E402
 from drgs import data, fisher  # noqa: E402
 from drgs.machine import peak_memory  # noqa: E402
 from drgs.sizes import at_most, cropped  # noqa: E402
+from drgs.studies.tables import markdown_table, paragraph  # noqa: E402
 from drgs.train import FitConfig, fit  # noqa: E402
 
 PIXELS = 76_800  # of a view: 320x240
@@ -43,6 +44,7 @@ KINDS = ("forward", "forward + backward", "Fisher diagonal")
 CROP = (48, 36)  # pixels that the oracle looks at
 MESH = {"type": "ellipsoidsmesh", "extent_adaptive_clamping": True}
 TORCH = 10_000, 128  # Gaussians, and pixels along a side: what torch code can do
+TORCH_ROWS = ("gsplat's torch code", "preset gsplat")
 LIMITS = (8, 10, 5)  # targets for `exact`, in multiples of `fast`
 
 
@@ -211,80 +213,98 @@ def child(task: str, name: str, threads: int, args: argparse.Namespace) -> dict 
     return result
 
 
-def scene_rows(rows: dict) -> list[str]:
-    """The table of scenes for each number of threads."""
+def ratios(found: dict, kind: str) -> list[float]:
+    """Times of `exact` over those of `fast`, by scene."""
+    every = [row["seconds"] for row in found.values() if row]
+    return [t[f"exact, {kind}"] / t[f"fast, {kind if kind in KINDS else KINDS[0]}"] for t in every]
+
+
+def between(values: list[float]) -> str:
+    """The least and the largest."""
+    return f"{min(values):.1f} to {max(values):.1f}"
+
+
+def scene_rows(found: dict) -> str:
+    """The table of the scenes, with one thread."""
     lines = []
-    for threads, found in rows.items():
-        lines += [
-            f"{threads} thread{'s' if int(threads) > 1 else ''}:",
-            "",
-            "| scene | Gaussians | view | hits a pixel | " + " | ".join(KINDS) + " | forward with depth | peak GB |",
-            "|---|---|---|---|---|---|---|---|---|",
-        ]
-        for name, row in found.items():
-            if row is None:
-                lines.append(f"| {name} | not there | | | | | | | |")
-                continue
-            t = row["seconds"]
-            cells = []
-            for kind in (*KINDS, "with depth"):
-                fast = t[f"fast, {kind if kind in KINDS else KINDS[0]}"]
-                exact = t[f"exact, {kind}"]
-                cells.append(f"{exact / fast:.1f}x ({1e3 * fast:.0f} to {1e3 * exact:.0f} ms)")
-            size = "x".join(map(str, row["size"]))
-            lines.append(
-                f"| {name} | {row['gaussians']:,} | {size} | {row['hits']:.0f} | {' | '.join(cells)} "
-                f"| {row['peak GB']:.2f} |"
-            )
-        lines.append("")
-    return lines
+    for name, row in found.items():
+        if row is None:
+            lines.append([name, "not there", *[""] * 7])
+            continue
+        t = row["seconds"]
+        cells = []
+        for kind in (*KINDS, "with depth"):
+            fast = t[f"fast, {kind if kind in KINDS else KINDS[0]}"]
+            exact = t[f"exact, {kind}"]
+            cells.append(f"{exact / fast:.1f}x ({1e3 * fast:.0f} to {1e3 * exact:.0f} ms)")
+        size = "x".join(map(str, row["size"]))
+        lines.append([name, f"{row['gaussians']:,}", size, f"{row['hits']:.0f}", *cells, f"{row['peak GB']:.2f}"])
+    heads = ["scene", "Gaussians", "view", "hits a pixel", *KINDS, "forward with depth", "peak GB"]
+    return markdown_table(heads, lines)
 
 
 def missed(rows: dict) -> str:
     """Which of the targets are missed."""
     over = []
-    for threads, found in rows.items():
-        for name, row in found.items():
-            for kind, limit in zip(KINDS, LIMITS, strict=True):
-                if row and (ratio := row["seconds"][f"exact, {kind}"] / row["seconds"][f"fast, {kind}"]) > limit:
-                    over.append(f"{name}, {kind}, {threads} thread{'s' if int(threads) > 1 else ''}: {ratio:.1f}x")
+    for kind, limit in zip(KINDS, LIMITS, strict=True):
+        for threads, found in rows.items():
+            scenes = [f"{name} {x:.1f}x" for name, x in zip(found, ratios(found, kind), strict=True) if x > limit]
+            if scenes:
+                over.append(f"{kind}, {threads} thread{'s' if int(threads) > 1 else ''} ({', '.join(scenes)})")
     return f"Missed: {'; '.join(over)}." if over else "All are met."
 
 
 def report(result: dict) -> str:
     """The page."""
-    memory, peers = result["memory"], result["peers"]
+    memory, peers, oracle = result["memory"], result["peers"], [x for x in result["oracle"].values() if x]
+    one, two = result["scenes"]["1"], result["scenes"]["2"]
+    cost = [between(ratios(one, kind)) for kind in KINDS]
+    rest = {name: peers["rest"]["volprim, ellipsoids"] / t for name, t in peers["rest"].items()}
+    again = f" ({result['again']})" if "again" in result else ""
+    errors, ties = [x["error"] for x in oracle], [x["near a tie"] for x in oracle]
+    slow = result["torch"]["seconds"]
     lines = [
         "# What exact order costs",
         "",
-        f"Made by `python benchmarks/exact.py` on {result['machine']}, {result['date']}, commit {result['commit']}"
-        + (f" ({result['again']})." if "again" in result else "."),
-        "`exact` in multiples of `fast` on the same view; presets take turns in one process, medians. The fits have",
-        "1,000 steps at 10,800 pixels. `forward` is without depth: with a depth, the tails of Gaussians that a tile",
-        "could do without are not left out ([numerics.md](numerics.md)).",
-        "",
-        *scene_rows(result["scenes"]),
-        f"Targets for `exact` against `fast`: {', '.join(f'{k} {x}x' for k, x in zip(KINDS, LIMITS, strict=True))}. "
-        f"{missed(result['scenes'])}",
-        "",
-        f"The {CROP[0]}x{CROP[1]} pixels in the middle of these views against the float64 oracle, by brute force; near",
-        "a tie or a cut-off float32 may decide otherwise: such pixels are counted and left out.",
-        "",
-        "| scene | largest error of a color | pixels near a tie |",
-        "|---|---|---|",
-        *(
-            f"| {name} | {x['error']:.1e} | {x['near a tie']} of {x['pixels']} |" if x else f"| {name} | not there | |"
-            for name, x in result["oracle"].items()
+        paragraph(
+            f"Preset `exact` sorts Gaussians along each ray. On one thread it takes {cost[0]} times as long as `fast` "
+            f"for an image, {cost[1]} times with gradients and {cost[2]} times for a Fisher diagonal; it is "
+            f"{rest['exact']:.1f} times as fast as Mitsuba's `volprim_rf_basic`."
         ),
         "",
-        f"1,000,000 Gaussians at 1024x1024: {memory['frame']:.2f} GB peak of the whole process forward + backward, "
-        f"{memory['with the diagonal']:.2f} GB",
-        "with a Fisher diagonal after it.",
+        paragraph(
+            f"Made by `python benchmarks/exact.py` on {result['machine']}, {result['date']}, commit {result['commit']}"
+            f"{again}. `exact` in multiples of `fast` on the same view, one thread; presets take turns in one process, "
+            "medians. The fits have 1,000 steps at 10,800 pixels. `forward` is without depth: with a depth, the tails "
+            "of Gaussians that a tile could do without are not left out ([numerics.md](numerics.md))."
+        ),
         "",
-        "## Against Mitsuba, at rest and on a busy machine",
+        scene_rows(one),
         "",
-        "The cube (100,000 Gaussians, 512^2), forward, ms; two threads. Busy: beside two processes that never rest.",
-        "`volprim_rf_basic` on `ellipsoidsmesh` has `extent_adaptive_clamping`.",
+        paragraph(
+            f"With two threads: {', '.join(f'{kind} {between(ratios(two, kind))}x' for kind in KINDS)}, with depth "
+            f"{between(ratios(two, 'with depth'))}x ([all times](../benchmarks/exact.json)). Targets: "
+            f"{', '.join(f'{k} {x}x' for k, x in zip(KINDS, LIMITS, strict=True))}. {missed(result['scenes'])}"
+        ),
+        "",
+        paragraph(
+            f"The {CROP[0]}x{CROP[1]} pixels in the middle of views of {len(oracle)} scenes are compared with the "
+            f"float64 oracle, by brute force: colors are off by {min(errors):.1e} to {max(errors):.1e} at most. "
+            "Pixels near a tie or a cut-off, where float32 may decide otherwise, are left out: "
+            f"{min(ties)} to {max(ties)} of {oracle[0]['pixels']}."
+        ),
+        "",
+        paragraph(
+            f"1,000,000 Gaussians at 1024x1024: {memory['frame']:.2f} GB peak of the whole process forward + backward, "
+            f"{memory['with the diagonal']:.2f} GB with a Fisher diagonal after it."
+        ),
+        "",
+        "## Compared with Mitsuba, at rest and on a busy machine",
+        "",
+        paragraph(
+            "The cube (100,000 Gaussians, 512^2), forward, ms; two threads. Busy: with two processes running that "
+            "never rest. `volprim_rf_basic` on `ellipsoidsmesh` has `extent_adaptive_clamping`."
+        ),
         "",
         "| | at rest | faster than volprim | busy | faster than volprim |",
         "|---|---|---|---|---|",
@@ -295,22 +315,19 @@ def report(result: dict) -> str:
             t = peers[state]
             cells.append(f"{1e3 * t[name]:.0f} | {t['volprim, ellipsoids'] / t[name]:.1f}x")
         lines.append(f"| {name} | {' | '.join(cells)} |")
-    slow = result["torch"]["seconds"]
+    theirs, ours = ([slow[f"{name}, {kind}"] for kind in ("forward", "both")] for name in TORCH_ROWS)
     lines += [
         "",
-        "## Against gsplat's torch code",
+        "## Compared with gsplat's torch code",
         "",
-        f"{TORCH[0]:,} Gaussians, {TORCH[1]}x{TORCH[1]}, ms, two threads: gsplat 1.5.3's own torch functions on the",
-        "CPU (examples/gsplat_torch.py says which), and our preset of its model; 99.9 % of the values differ by less",
-        f"than {result['torch']['difference']:.0e}.",
-        "",
-        "| | forward | forward + backward |",
-        "|---|---|---|",
+        paragraph(
+            f"{TORCH[0]:,} Gaussians, {TORCH[1]}x{TORCH[1]}, two threads: gsplat 1.5.3's own torch functions on the "
+            f"CPU (examples/gsplat_torch.py says which) take {1e3 * theirs[0]:.0f} ms forward and "
+            f"{1e3 * theirs[1]:.0f} ms forward + backward, our preset `gsplat` {1e3 * ours[0]:.0f} and {1e3 * ours[1]:.0f} ms, "
+            f"{theirs[0] / ours[0]:.0f} and {theirs[1] / ours[1]:.0f} times less; 99.9 % of the values differ by less "
+            f"than {result['torch']['difference']:.0e}."
+        ),
     ]
-    for name in ("gsplat's torch code", "preset gsplat"):
-        lines.append(f"| {name} | {1e3 * slow[f'{name}, forward']:.0f} | {1e3 * slow[f'{name}, both']:.0f} |")
-    ratios = [slow[f"gsplat's torch code, {kind}"] / slow[f"preset gsplat, {kind}"] for kind in ("forward", "both")]
-    lines.append(f"| ratio | {ratios[0]:.0f}x | {ratios[1]:.0f}x |")
     return "\n".join([*lines, ""])
 
 

@@ -32,6 +32,7 @@ from drgs import fisher  # noqa: E402
 from drgs.gain import information_gain  # noqa: E402
 from drgs.machine import peak_memory  # noqa: E402
 from drgs.select import select  # noqa: E402
+from drgs.studies.tables import paragraph  # noqa: E402
 
 Preset = drgs.RenderSettings.preset
 GEOMETRY = ("means", "rotations", "log_scales", "logit_opacities")
@@ -175,14 +176,23 @@ def growth(turns: int, quick: bool) -> list[dict]:
 
 def report(r: dict) -> str:
     """The markdown page."""
+    fast = r["headline"][0]
     lines = [
         "# What Fisher information costs",
         "",
-        f"Made by `python benchmarks/fisher.py` on {r['machine']}, {r['date']}, commit {r['commit']}. Milliseconds,",
-        "one view of 100,000 Gaussians in a cube, 512x512, everything included (projection, lists, sorting, torch),",
-        "median, peers taking turns; in brackets the ratio to forward + backward.",
-        *([f"Made again since: {r['again']}."] if "again" in r else []),
-        *(["", *r["note"]] if "note" in r else []),
+        paragraph(
+            f"The exact diagonal of a view takes {fast['exact diagonal'] / fast['forward+backward']:.2f} times as long "
+            f"as an image with gradients, {1e3 * fast['exact diagonal']:.0f} ms for 100,000 Gaussians at 512x512 with "
+            "preset `fast`."
+        ),
+        "",
+        paragraph(
+            f"Made by `python benchmarks/fisher.py` on {r['machine']}, {r['date']}, commit {r['commit']}"
+            + (f" ({r['again']})" if "again" in r else "")
+            + ". Milliseconds, one view of 100,000 Gaussians in a cube, 512x512, everything included (projection, "
+            "lists, sorting, torch), median, peers taking turns; in brackets the ratio to forward + backward. "
+            + " ".join(r.get("note", []))
+        ),
         "",
         "| | " + " | ".join(f"`{row['preset']}`, SH {row['sh']}" for row in r["headline"]) + " |",
         "|---|" + "---|" * len(r["headline"]),
@@ -197,9 +207,11 @@ def report(r: dict) -> str:
         "",
         "## Tangents",
         "",
-        f"Forward mode, `fast`: one tangent {1e3 * t['1']:.0f} ms, 4 in one traversal {1e3 * t['4']:.0f} ms, 16",
-        f"{1e3 * t['16']:.0f} ms: {t['16'] / 16 / t['1']:.2f} of 16 single ones. The 6 of the pose:"
-        f" {1e3 * t['pose']:.0f} ms.",
+        paragraph(
+            f"Forward mode, `fast`: one tangent {1e3 * t['1']:.0f} ms, 4 in one traversal {1e3 * t['4']:.0f} ms, 16 "
+            f"{1e3 * t['16']:.0f} ms: {t['16'] / 16 / t['1']:.2f} of 16 single ones. The 6 of the pose: "
+            f"{1e3 * t['pose']:.0f} ms."
+        ),
     ]
     if "picks" in r:
         lines += picks_lines(r["picks"])
@@ -223,12 +235,13 @@ def picks_lines(c: dict) -> list[str]:
         "",
         "## One pick",
         "",
-        f"{c['poses']} candidate poses at 320x240 and {c['train']} training views, {c['gaussians']:,} Gaussians",
-        f"with SH {c['sh']} ({c['run']}), nothing cached. The paper states about 7 s on an L40 GPU, for its own",
-        "formula: `fisherrf` by `eig`; what compares with it of our diagonal is `fisher` by `eig`, geometry alone.",
-        "The default of `drgs select` is `v_opt` of geometry and backdrop: it also looks at every view once",
-        "more, small, for how far away things are, sorts its pixels into cells of what is behind, and scores",
-        "in the end.",
+        paragraph(
+            f"{c['poses']} candidate poses at 320x240 and {c['train']} training views, {c['gaussians']:,} Gaussians "
+            f"with SH {c['sh']} ({c['run']}), nothing cached. The paper states about 7 s on an L40 GPU, for its own "
+            "formula, `fisherrf` by `eig`; ours that compares with it is `fisher` by `eig`, geometry alone. The "
+            "default of `drgs select`, `v_opt` of geometry and backdrop, also renders every view once more, small, "
+            "for distances, and sorts its pixels into cells of the backdrop."
+        ),
         "",
         "| policy | criterion | blocks | preset | seconds a pick | ms a view |",
         "|---|---|---|---|---|---|",
@@ -241,10 +254,11 @@ def picks_lines(c: dict) -> list[str]:
             cells[4:] = f"{rows[pick]:.2f}", f"{1e3 * rows[pick] / (c['poses'] + c['train']):.0f}"
         lines.append(f"| {' | '.join(cells)} |")
     gains = ", ".join(f"{1e3 * t:.0f} ms by `{name}`" for name, t in c["gain of one"].items())
-    lines += ["", f"The gain of one candidate, once its information is there: {gains}."]
+    told = f"The gain of one candidate, once its information is there: {gains}."
     if "memory" in c:
-        peaks = ", ".join(f"{row['candidates']} candidates: {row['GB']:.2f} GB" for row in c["memory"])
-        lines += ["", "Peak memory of the process, one pick of the default on `fast` among", f"{peaks}."]
+        peaks = ", ".join(f"{row['candidates']} candidates {row['GB']:.2f} GB" for row in c["memory"])
+        told += f" Peak memory of the process, one pick of the default on `fast`: {peaks}."
+    lines += ["", paragraph(told)]
     return lines
 
 

@@ -30,6 +30,7 @@ import drgs  # noqa: E402
 from drgs import runtime  # noqa: E402
 from drgs.ellipsoids import semi_axes  # noqa: E402
 from drgs.machine import peak_memory  # noqa: E402
+from drgs.studies.tables import paragraph  # noqa: E402
 
 Preset = drgs.RenderSettings.preset
 
@@ -281,34 +282,44 @@ def report(result: dict) -> str:
     for name, seconds in h.items():
         kind = "forward+backward" if name.endswith("forward+backward") else "forward"
         rows.append(f"| {name} | {1e3 * seconds:.0f} | {base[kind] / seconds:.1f}x |")
+    times = {kind: base[kind] / h[f"fast {kind}"] for kind in base}
     lines = [
         "# How fast the renderer is",
         "",
-        f"Made by `python benchmarks/render.py` on {result['machine']}, {result['date']}, commit {result['commit']}.",
-        "Medians of interleaved turns in one process; everything of a frame is inside the clock. The ratios carry over",
-        "to other machines, the milliseconds do not.",
+        paragraph(
+            f"Preset `fast` is {times['forward']:.0f} times as fast as Mitsuba's `volprim_rf_basic`, `exact` "
+            f"{base['forward'] / h['exact forward']:.1f} times. `exact` costs "
+            f"{h['exact forward'] / h['fast forward']:.1f}x `fast` forward and "
+            f"{h['exact forward+backward'] / h['fast forward+backward']:.1f}x forward + backward."
+        ),
         "",
-        "## Against Mitsuba's `volprim_rf_basic`",
+        paragraph(
+            f"Made by `python benchmarks/render.py` on {result['machine']}, {result['date']}, commit "
+            f"{result['commit']}. Medians of interleaved turns in one process, everything of an image included. The "
+            "ratios carry over to other machines, the milliseconds do not."
+        ),
         "",
-        "100,000 Gaussians in [-1, 1]^3, median standard deviation 0.01, seen from distance 4 at 45 degrees, 512^2,",
-        "one ray a pixel. `fast` has the cut-offs of `volprim_rf_basic` (3 sigma, T = 0.01, alpha 0.9999).",
+        "## Compared with Mitsuba's `volprim_rf_basic`",
+        "",
+        paragraph(
+            "100,000 Gaussians in [-1, 1]^3, median standard deviation 0.01, seen from distance 4 at 45 degrees, "
+            "512^2, one ray a pixel. `fast` has the cut-offs of `volprim_rf_basic` (3 sigma, T = 0.01, alpha 0.9999)."
+        ),
         "",
         "| | ms | times faster than volprim |",
         "|---|---|---|",
         *rows,
         "",
-        f"`exact` costs {h['exact forward'] / h['fast forward']:.1f}x `fast` forward and "
-        f"{h['exact forward+backward'] / h['fast forward+backward']:.1f}x forward + backward.",
-        "",
     ]
     if "rates" in result:
         r = result["rates"]
         lines += [
-            f"`fast` forward composites {r['hits per second'] / 1e6:.0f} million hits a second, out of at most "
-            f"{r['tests per second at most'] / 1e6:.0f} million tests of a Gaussian on a",
-            f"pixel; that is at most {100 * r['share of peak at most']:.0f} % of the {r['peak Gflop/s']:.0f} Gflop/s "
-            "that fused multiply-adds reach in a Dr.Jit kernel here,",
-            "everything of a frame in the clock.",
+            paragraph(
+                f"`fast` forward composites {r['hits per second'] / 1e6:.0f} million hits a second, out of at most "
+                f"{r['tests per second at most'] / 1e6:.0f} million tests of a Gaussian on a pixel; that is at most "
+                f"{100 * r['share of peak at most']:.0f} % of the {r['peak Gflop/s']:.0f} Gflop/s of fused "
+                "multiply-adds in a Dr.Jit kernel here."
+            ),
             "",
         ]
     if "hits" in result:
@@ -316,22 +327,20 @@ def report(result: dict) -> str:
         lines += [
             "## Hits that the acceleration structure finds",
             "",
-            f"256 x 256 rays, {x['true hits']:,} true hits (within 3 sigma, counted by `tiles`), no early stop.",
-            "",
-            "| | share of the true hits found | ns per true hit found |",
-            "|---|---|---|",
-            f"| `bvh` | {100 * x['bvh finds']:.2f} % | {x['bvh ns per true hit']:.0f} |",
-            f"| `volprim_rf_basic` | {100 * x['volprim finds']:.2f} % | {x['volprim ns per true hit']:.0f} |",
-            "",
-            f"{100 * x['rays equal on both traversals']:.2f} % of the rays get the same color (1e-4) from both `bvh`",
-            "and `tiles`. A lone Gaussian of this size is missed by `volprim_rf_basic` on 40 % of its rays; in this",
-            "crowd each hit restarts the ray nearby, and few are.",
+            paragraph(
+                f"Of {x['true hits']:,} true hits of 256 x 256 rays (within 3 sigma, counted by `tiles`, no early "
+                f"stop) `bvh` finds {100 * x['bvh finds']:.2f} %, in {x['bvh ns per true hit']:.0f} ns each, and "
+                f"`volprim_rf_basic` {100 * x['volprim finds']:.2f} %, in {x['volprim ns per true hit']:.0f} ns. "
+                f"{100 * x['rays equal on both traversals']:.2f} % of the rays get the same color (1e-4) from `bvh` "
+                "and `tiles`. `volprim_rf_basic` misses a lone Gaussian of this size on 40 % of its rays; in this "
+                "crowd each hit restarts the ray nearby, and few are missed."
+            ),
             "",
         ]
     lines += [
         "## Growth",
         "",
-        "`fast`; standard deviations shrink with the square root of the number, so that the picture stays as covered.",
+        "`fast`; standard deviations shrink with the square root of the number, so that the image stays as covered.",
         "",
         "| Gaussians | image | tile entries | forward ms | forward + backward ms |",
         "|---|---|---|---|---|",
@@ -343,11 +352,12 @@ def report(result: dict) -> str:
         "",
         "## Memory and compilation",
         "",
-        f"1,000,000 Gaussians at 1024 x 1024, forward + backward: {result['memory']['peak GB']:.2f} GB peak of the",
-        "whole process, torch included.",
-        "",
-        f"First frame forward + backward, nothing cached: {result['first']['first']:.2f} s; first frame of a second",
-        f"process: {result['second']['first']:.2f} s; warm: {result['second']['warm']:.3f} s.",
+        paragraph(
+            f"1,000,000 Gaussians at 1024 x 1024, forward + backward: {result['memory']['peak GB']:.2f} GB peak of the "
+            "whole process, torch included. First image forward + backward, nothing cached: "
+            f"{result['first']['first']:.2f} s; first image of a second process: {result['second']['first']:.2f} s; "
+            f"warm: {result['second']['warm']:.3f} s."
+        ),
         "",
     ]
     return "\n".join(lines)
