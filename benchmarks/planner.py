@@ -179,7 +179,7 @@ def tables(rows: list[dict]) -> str:
         parts.append(
             paragraph(
                 f"`{name}`: {len(frames)} photographs, {last['machine']}, {last['date']}, commit {last['commit'][:7]}. "
-                "Seconds are medians, in brackets the largest; memory is the largest that the process had by then."
+                "Seconds are medians, in brackets the largest; memory is the peak of the process so far."
             )
         )
         lines = []
@@ -200,7 +200,7 @@ def tables(rows: list[dict]) -> str:
                     f"{quality[-1]:.1f} dB" if quality else "",
                 ]
             )
-        heads = ["photographs", "Gaussians", "kept", "observe", "scores", "next, 3 picks", "views asked", "changed",
+        heads = ["photographs", "Gaussians", "kept", "observe", "scores", "next, 3 picks", "views computed", "changed",
                  "memory", "held out"]  # fmt: skip
         parts.append(markdown_table(heads, lines))
         compared = [row for row in mine if row["what"] == "bound"]
@@ -219,9 +219,10 @@ def tables(rows: list[dict]) -> str:
             count = len({row["number"] for row in compared})
             parts.append(paragraph(f"Bounds, {count} models, ten photographs apart; in brackets the worst:"))
             parts.append(
-                markdown_table(["bound", "views asked", "seconds", "Kendall's tau", "what the best lacks"], lines)
+                markdown_table(
+                    ["bound", "views computed", "seconds", "Kendall's tau", "best view falls short by"], lines
+                )
             )
-        parts += memory_table([row for row in mine if row["what"] == "memory"])
     return "\n\n".join(parts)
 
 
@@ -253,8 +254,9 @@ def main() -> None:
     args = parser.parse_args()
     if args.data is not None:
         measure(args.data, args.frames, args.bounds, args.memory)
-    text = tables(read_rows(ROWS))
-    print(text)
+    rows = read_rows(ROWS)
+    text = tables(rows)
+    print("\n\n".join([text, *memory_table([row for row in rows if row["what"] == "memory"])]))
     if args.page:
         fill_between(PAGE, "planner", text)
 
