@@ -3,9 +3,9 @@
     python benchmarks/kitchen.py [--scale small] [--seeds 6] [--shard K/N]     fits, rows as they come
     python benchmarks/kitchen.py --page [--merge ROWS.jsonl ...]               the page
 
-The page is two tables of docs/dynamic.md, docs/data/moving-units.csv (every fit of the first) and
-moving-differences.csv. The rows of the second, benchmarks/kitchens.jsonl, are of six kitchens by color alone, with
-1,500 steps (max_steps = 1500 and semantics = "ignore" in fit.toml):
+The page is docs/data/moving-units.csv (every fit) and moving-differences.csv, with a paragraph of docs/dynamic.md, and
+a table there. The rows of the table, benchmarks/kitchens.jsonl, are of six kitchens by color alone, with 1,500 steps
+(max_steps = 1500 and semantics = "ignore" in fit.toml):
 
     drgs reproduce dynamic --protocol blind --seeds 6 --config fit.toml --policy uniform --policy farthest \
         --policy "joint+backdrop, v_opt" -o OUT --no-figures
@@ -53,9 +53,9 @@ COLOR = ROOT / "benchmarks" / "kitchens.jsonl"
 BASELINES = ("random", "uniform", "farthest", "moments", "fisherrf")
 DEFAULT = "joint+backdrop, v_opt"  # the program's own choice where something moves
 SHOWN = (*BASELINES, "geometry", "joint", "all views")
-"""What the table of the page compares the default with."""
+"""What the table compares the default with."""
 BLOCKS = ("geometry", "geometry+semantic", "geometry+deformation")
-LEADS = {"psnr": "PSNR", "psnr_moving": "moving pixels", "miou": "mIoU"}
+LEADS = {"psnr": "PSNR", "psnr_moving": "moving pixels"}
 """Metrics of the table."""
 UNITS = tuple((f"kitchen-{seed}", camera) for camera in ("cam00", "cam03") for seed in (1, 2, 3))
 """In the order in which --seeds takes them: cam00 is in the middle of the arc, cam01, ... go from left to right."""
@@ -118,7 +118,8 @@ def told(rows: Rows) -> str:
     scenes = {unit[0] for unit in units}
     commits = dict.fromkeys((row.get("commit") or "unknown")[:7] for row in rows)
     found = next((x for label in SHOWN if (x := differences(rows, "psnr", DEFAULT, label))), {})
-    size = f"{len(rows)} fits, on commits {', '.join(commits)}; {len(scenes)} kitchens, {len(units)} units. "
+    starts = "" if len(units) == len(scenes) else f", {len(units)} choices of a kitchen and its held-out camera"
+    size = f"{len(rows)} fits, on commits {', '.join(commits)}; {len(scenes)} kitchens{starts}. "
     if len(found) < 2:
         return size
     held = f"{100 * coverage(len({unit[0] for unit in found}), len(found)):.0f} %"
@@ -127,13 +128,11 @@ def told(rows: Rows) -> str:
         for label in SHOWN
         if (values := differences(rows, "psnr", DEFAULT, label)) and (one := estimate(values)).detectable is not None
     ]
-    verdict = (
-        "Bold: the interval excludes 0. " if len(found) >= FEWEST_UNITS else f"{len(found)} units bear no verdict. "
-    )
+    verdict = "Bold: the interval excludes 0. " if len(found) >= FEWEST_UNITS else "So few give no verdict. "
     least = f"A t test would find a difference of {np.median(seen):.2f} dB in 80 % of such studies." if seen else ""
     return (
-        f"{size}Means over units; behind them differences within units, 95 % intervals from a bootstrap over kitchens "
-        f"first and the units of each then, {held} of which hold the true mean with so few kitchens. {verdict}{least}"
+        f"{size}Differences are paired, with 95 % intervals of a bootstrap over kitchens; {held} of such intervals "
+        f"hold the true mean. {verdict}{least}"
     )
 
 
@@ -164,13 +163,13 @@ def difference_lines(study: Study, rows: Rows) -> Iterator[list[str]]:
 
 
 def page(study: Study, rows: Rows) -> str:
-    """Writes the data files and the table of fits by color alone; returns that of the others."""
+    """Writes the data files and the table of fits by color alone; returns what the data files are of."""
     color = read_study(COLOR)
     if color:
         fill_between(PAGE, "kitchens", report(study, color))
     studies.write_csv(DATA / "moving-units.csv", unit_lines(study, rows))
     studies.write_csv(DATA / "moving-differences.csv", difference_lines(study, rows))
-    return report(study, rows)
+    return paragraph(told(rows))
 
 
 def main() -> int:

@@ -80,8 +80,8 @@ class Robot:
 def report(r: dict) -> str:
     """What docs/information.md says."""
     told = [
-        f"{PICKS} picks on `wolf` ({r['gaussians']:,} Gaussians) at {r['size']}, {KNOWN} known views and {CANDIDATES} "
-        f"candidates at first, {NEW} more with each pick, CPU time without and with a cache:"
+        f"{PICKS} picks on `wolf` ({r['gaussians']:,} Gaussians) at {r['size']}, {KNOWN} training views and "
+        f"{CANDIDATES} candidates at first, {NEW} more with each pick, CPU time without and with a cache:"
     ]
     for preset, row in r["rows"].items():
         (all_a, all_b), (one_a, one_b) = row["all"], row["later"]
