@@ -126,7 +126,7 @@ def report(r: dict) -> str:
             f"`python benchmarks/coupled.py RUN`, {r['machine']}, {r['date']}, commit {r['commit']}; RUN is "
             f"`{r['run']}`, {r['gaussians']:,} Gaussians with {r['width']} channels, a decoder of rank {r['rank']}; "
             f"times are of `fast` at {r['size']['fast']} and `exact` at {r['size']['exact']}, errors against `exact` "
-            f"are of `fast` at 80x60 and the scores of {e['views']} views where two are known."
+            f"are of `fast` at 80x60 and the scores of {e['views']} views, with two training views."
         ),
         "",
         "| estimate | time, `fast` | time, `exact` | median error of an entry | `eig`: error, tau, regret |",
