@@ -23,6 +23,7 @@ from drgs.dynamics.hexplane import HexPlane, corners_of, features, product
 from drgs.dynamics.lives import LIVES, Lives, drift, living, logit_at
 from drgs.ellipsoids import Gaussians
 from drgs.guards.arguments import ArgumentError, must_be
+from drgs.guards.derivatives import ends_of
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -392,7 +393,7 @@ class DynamicGaussians:
 
 def is_finite(x: torch.Tensor) -> bool:
     """Whether all entries are: NaN passes through the reduction."""
-    return x.numel() == 0 or all(math.isfinite(float(end)) for end in torch.aminmax(x))
+    return x.numel() == 0 or all(map(math.isfinite, ends_of(x)))
 
 
 def _check_lives(lives: Lives, count: int) -> None:

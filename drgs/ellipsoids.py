@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from drgs.guards.arguments import ArgumentError, kind_of, must_be
-from drgs.guards.derivatives import check_has_numbers
+from drgs.guards.derivatives import check_has_numbers, ends_of
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -253,7 +253,7 @@ class Gaussians:
             for name, x in self.parameters().items():
                 check_has_numbers(where, name, x)
                 # One reduction decides, NaN passes through it; the index is looked for only if there is one to report.
-                if x.numel() and not all(math.isfinite(float(end)) for end in torch.aminmax(x)):
+                if x.numel() and not all(map(math.isfinite, ends_of(x))):
                     bad = ~torch.isfinite(x).reshape(len(x), -1).all(1)
                     if bool(bad.any()):
                         i = int(bad.nonzero()[0, 0])

@@ -22,6 +22,7 @@ from typing import Any
 import torch
 
 from drgs.guards.arguments import must_be
+from drgs.guards.derivatives import ends_of
 from drgs.information.chain import Chain, dense
 from drgs.information.choices import METHODS
 from drgs.information.criteria import CRITERIA, ViewCriterion, criterion_named
@@ -175,7 +176,7 @@ def check(where: str, information: Information, signed: bool = False) -> None:
     for name, x in information.items():
         if not x.numel():
             continue
-        low, high = (float(v) for v in torch.aminmax(x))  # NaN comes through
+        low, high = ends_of(x)
         if lowest <= low and -math.inf < low and high < math.inf:
             continue
         bad = ~torch.isfinite(x) | (x < lowest)

@@ -103,6 +103,7 @@ _active: Backend | None = None
 _computing = threading.RLock()
 _abandoned: list[Any] = []  # graphs that nobody wants any more, and that were left while another thread computed
 _owner: int | None = None  # the process that has computed: its worker threads exist nowhere else
+_thread: int | None = None  # the thread that has computed last
 
 
 def uncompiled(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
@@ -144,9 +145,24 @@ def alone(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Resu
         _owner = os.getpid()
         with _computing, _no_garbage():
             _abandoned.clear()
+            _take_over()
             return function(*args, **kwargs)
 
     return uncompiled(one_at_a_time)
+
+
+def _take_over() -> None:
+    """Lets this thread go on with variables of another one.
+
+    Dr.Jit orders a kernel by scopes, which each thread counts up from where it was: one that comes back is behind the
+    thread whose variables it meets. Torch differentiates what is on a card in a thread of its own.
+    """
+    global _thread
+    before, _thread = _thread, threading.get_ident()
+    if _active is not None and before != _thread:
+        import drjit as dr
+
+        dr.detail.new_scope(dr.JitBackend.CUDA if _active.name == "cuda" else dr.JitBackend.LLVM)
 
 
 # Dr.Jit frees a variable of a graph under its lock on graphs. If its numbers are those of a torch tensor, torch lets go
@@ -230,8 +246,9 @@ class Graph:
 def _refuse_fork() -> None:
     if _owner not in (None, os.getpid()):
         raise NotImplementedError(
-            f"drgs: a process must not render when it was forked from one that has rendered, got process {os.getpid()} "
-            f"forked from {_owner}; use multiprocessing.get_context('spawn'), or fork before the first render"
+            "drgs: a process must not render when it was forked from one that has rendered, or has a CUDA backend, got "
+            f"process {os.getpid()} forked from {_owner}; use multiprocessing.get_context('spawn'), or fork before the "
+            "first render"
         )
 
 
@@ -267,7 +284,7 @@ def setup(variant: str | None = None, threads: int | None = None) -> Backend:
         ValueError: If an argument or environment variable is bad, or a loaded libLLVM would abort.
         FileNotFoundError: If no backend is usable.
     """
-    global _active
+    global _active, _owner
     _refuse_fork()
     wanted = _wanted_variant(variant)
     count = _wanted_threads(threads)
@@ -288,6 +305,7 @@ def setup(variant: str | None = None, threads: int | None = None) -> Backend:
         import drjit.cuda.ad as types
 
         version = None
+        _owner = os.getpid()  # no forked child can use the driver that this process has started
     else:
         version = _loaded_llvm(dr)
         _refuse_processor()

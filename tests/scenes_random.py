@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from drgs import runtime
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
 from drgs.lab.accuracy import (
@@ -27,6 +28,7 @@ __all__ = [
     "Errors",
     "Oracle",
     "around_camera",
+    "assert_same_sums",
     "camera",
     "compare",
     "gaussians",
@@ -38,6 +40,16 @@ __all__ = [
     "rotation",
     "twist_basis",
 ]
+
+
+def assert_same_sums(found, wanted) -> None:
+    """Of the same bits, as one thread sums; on a card, whose order of sums is not fixed, to rounding of float32."""
+    found, wanted = (torch.as_tensor(x, dtype=torch.float64) for x in (found, wanted))
+    if runtime.backend().name == "cuda":
+        size = float(wanted.abs().max()) if wanted.numel() else 0.0
+        torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-6 * size)
+    else:
+        assert torch.equal(found, wanted)
 
 
 def around_camera(g: Gaussians, cam: Camera) -> Gaussians:

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import drgs
+from drgs import runtime
 from drgs.cameras import orbit
 from drgs.fitting.config import SelectionConfig
 from drgs.gain import CRITERIA, Prior, ViewCriterion, criterion_named, information_gain, scorer
@@ -149,7 +150,7 @@ def test_a_criterion_is_one_row(world):
     g, cams = world
     CRITERIA["mine"] = ViewCriterion(lambda ratio, variance: ratio / (1 + ratio) * variance, True, True, prior=1e-2)
     own, usual = (select(g, cams[2:], cams[:2], 3, settings=FAST, criterion=name) for name in ("mine", "v_opt"))
-    assert own.scores == pytest.approx(usual.scores, rel=1e-12)
+    assert own.scores == pytest.approx(usual.scores, rel=1e-6 if runtime.backend().name == "cuda" else 1e-12)
     assert [pick.index for pick in own.picks] == [pick.index for pick in usual.picks]
     assert own.evaluations == usual.evaluations
     CRITERIA["plain"] = lambda ratio, variance: (ratio >= 1).double()

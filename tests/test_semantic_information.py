@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from dense_jacobian import error
-from scenes_random import gaussians
+from scenes_random import assert_same_sums, gaussians
 from test_select import ring
 
 from drgs import cli, fisher, reference
@@ -253,7 +253,7 @@ def test_blocks_that_are_scored(world):
     plain = select(g.replace(features=None), candidates, train, blocks=("geometry",))
     assert scores["geometry",] == plain.scores
     everything = select(g, candidates, train, blocks=("geometry", "semantic", "backdrop"), semantics=m)
-    assert everything.scores == select(g, candidates, train, semantics=m).scores
+    assert_same_sums(everything.scores, select(g, candidates, train, semantics=m).scores)
     latent = select(g, candidates, train).semantics
     assert latent["width"] == 3
     assert latent["gamma"] == 1

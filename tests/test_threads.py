@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import gc
 import multiprocessing
 import subprocess
@@ -124,14 +125,28 @@ def in_child():
 def test_forks():
     """A child forked before the first render renders; one forked behind it refuses, in one line, and ends.
 
-    Before, the latter waited for workers that only its parent has.
+    Before, the latter waited for workers that only its parent has. On a card both refuse: it was in use.
     """
     done = _run(SCENE + "in_child()\ndraw()\nin_child()\ndraw()\n")
     assert done.returncode == 0, done.stderr
     first, second = done.stdout.splitlines()
-    assert first == "drawn True"
-    assert second.startswith("refused: drgs: a process must not render when it was forked from one that has rendered")
-    assert "spawn" in second
+    assert first == "drawn True" or runtime.backend().name == "cuda"
+    for line in [second] if first == "drawn True" else [first, second]:
+        assert line.startswith("refused: drgs: a process must not render when it was forked from one that has rendered")
+        assert "spawn" in line
+
+
+def test_backward_in_another_thread():
+    """One that comes back, as torch's own for what is on a card, gets the gradients of the thread that has rendered."""
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        for name in ("fast", "exact", "fast", "gsplat"):
+            settings, found = RenderSettings.preset(name), []
+            for differentiate in (lambda loss: loss.backward(), lambda loss: pool.submit(loss.backward).result()):
+                rng = np.random.default_rng(1)
+                g, cam = gaussians(rng, 20, 1), camera(rng, (18, 14))
+                differentiate(render(g, cam, settings).rgb.square().sum())
+                found.append(g.means.grad)
+            torch.testing.assert_close(*found)
 
 
 def test_spawn():

@@ -138,7 +138,7 @@ class RayModel:
             k = torch.cat([radial, radial.new_zeros(4 - len(radial))])
             distance = plane.norm(dim=1)
             angle = distance.clone()
-            powers = torch.arange(1, 5)
+            powers = torch.arange(1, 5, device=K.device)
             for _ in range(_NEWTON):
                 term = angle[:, None] ** (2 * powers) * k
                 slope = 1 + (term * (2 * powers + 1)).sum(1)

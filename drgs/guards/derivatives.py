@@ -13,7 +13,7 @@ import torch
 
 from drgs.guards.arguments import ArgumentError
 
-__all__ = ["check_has_numbers", "check_unbatched", "first_only", "refuse_batched", "refuse_meta"]
+__all__ = ["check_has_numbers", "check_unbatched", "ends_of", "first_only", "refuse_batched", "refuse_meta"]
 
 Derivatives = tuple[torch.Tensor | None, ...]
 
@@ -105,6 +105,12 @@ def check_has_numbers(where: str, name: str, x: torch.Tensor) -> None:
     """
     refuse_meta(where, name, x)
     check_unbatched(where, x)
+
+
+def ends_of(x: torch.Tensor) -> tuple[float, float]:
+    """The least and the largest entry of a tensor that has some: NaN if one is. Also of a dual number."""
+    low, high = torch.stack((x.amin(), x.amax())).tolist()  # `aminmax` has no forward mode in all of torch's releases
+    return low, high
 
 
 def refuse_meta(where: str, name: str, x: torch.Tensor) -> None:

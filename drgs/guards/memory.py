@@ -59,6 +59,9 @@ def require(where: str, needed: int, what: str, advice: str, cuda: bool = False)
     if needed < _SMALL:
         return
     there = _device() if cuda else available()
+    if cuda and there is not None and needed + _OTHER > there:
+        _release()
+        there = _device()
     if there is not None and needed + _OTHER > there:
         raise ValueError(
             f"{where}: there must be memory for {what}, which takes at least {_gigabytes(needed)}, "
@@ -82,6 +85,15 @@ def _device() -> int | None:
     import torch
 
     return torch.cuda.mem_get_info()[0] if torch.cuda.is_available() else None
+
+
+def _release() -> None:
+    """Give back what torch and Dr.Jit keep of a card for later use."""
+    import drjit as dr
+    import torch
+
+    dr.flush_malloc_cache()
+    torch.cuda.empty_cache()
 
 
 def _machine() -> int | None:

@@ -32,6 +32,13 @@ CHUNK = 32  # feature channels of one traversal
 _SHARED = 3  # tangents of four pixels that fit a card's registers
 
 
+def _pixels_a_lane(rows: bool, columns: int) -> int:
+    """In the order of the list, for a traversal that keeps rows of Gaussians, or carries so many tangents."""
+    if runtime.backend().name == "cuda" and (rows or columns > _SHARED):
+        return 1  # LLVM is faster with four, of which ptxas would spill what a hit has
+    return 4
+
+
 class Arguments(NamedTuple):
     """What a `Compositor` composites: the arguments of its `forward`, attached to the graph of a call's inputs."""
 
@@ -178,10 +185,10 @@ class Compositor:
         self.passes = [self._channels(0, joint, color=True)]
         chunks = range(joint, self.width, CHUNK)
         self.passes += [self._channels(k, min(CHUNK, self.width - k)) for k in chunks]
-        # In the order of the list four pixels can share a lane; more channels or a basis each would not fit registers.
-        share = 4 if self.settings.order == "center" and self.settings.traversal == "tiles" and not self.basis else 1
-        if runtime.backend().name == "cuda" and (rows or columns > _SHARED):
-            share = 1  # LLVM is faster with four, of which ptxas would spill what a hit has
+        share = 1
+        # In the order of the list pixels can share a lane; more channels or a basis each would not fit registers.
+        if self.settings.order == "center" and self.settings.traversal == "tiles" and not self.basis:
+            share = _pixels_a_lane(rows, columns)
         weighed = self.width > joint
         self.parts = view.weighed(share, MATRIX // (1 + columns)) if weighed else view.parts(share)
         out = self._composited(frozenset(self.want | ({"replay"} if keep else set())), count_of(record))

@@ -39,6 +39,7 @@ TABLES = 128 << 20
 """Bytes of the rows of pixels that are sorted at a time, and of a table that the adjoint fills in exact order
 (information: twice that, with a semantic channel four times); a single tile's may have more.
 """
+_CORNERS = {1: [(0, 0)], 2: [(0, 0), (0, 4)], 4: [(0, 0), (4, 0), (0, 4), (4, 4)]}  # of pixels that share a lane
 _NOWHERE = 2**64 - 1
 _HELD = 128 << 20  # bytes of the orders of all pixels, which derivatives need again
 _TAILS = 5e-6  # what the tails left out of a pixel may add up to
@@ -179,7 +180,7 @@ class TileTraversal:
         in_lists: Callable[[], Part] | None = None,
         weights: Weights | None = None,
     ) -> Part:
-        """The pixels of tiles, given per lane, `share` a lane, along the tiles' lists or their own `hits`."""
+        """The pixels of tiles, given per lane, `share` (1, 2 or 4) a lane, along the tiles' lists or their own `hits`."""
         lib, lists = self.lib, self.lists
         per_tile = TILE * TILE // share
         inner = dr.arange(lib.UInt32, dr.width(tile)) % per_tile
@@ -188,7 +189,7 @@ class TileTraversal:
         # 16 consecutive lanes, a packet, are 4x4 pixels.
         x = (tile % lists.columns) * TILE + (block % 2) * 4 + k % 4
         y = (tile // lists.columns) * TILE + (block // 2) * 4 + k // 4
-        corners = [(0, 0), (4, 0), (0, 4), (4, 4)] if share == 4 else [(0, 0)]
+        corners = _CORNERS[share]
         pixels = [(x + a, y + b) for a, b in corners]
         inside = [(px < self.width) & (py < self.height) for px, py in pixels]
         flat = [py * self.width + px for px, py in pixels]
