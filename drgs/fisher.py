@@ -251,7 +251,8 @@ def coverage(
         seen = gaussians_at("fisher.coverage", gaussians, camera)
         check_same_parameters("fisher.coverage", "coverage", tuple(total.shape), (len(seen),))
         if len(seen):
-            total += Replay(seen, camera, settings, geometry=False, mask=mask).sums((GEOMETRY,), [1.0] * 3)[:, GEOMETRY]
+            replay = Replay(seen, camera, settings, geometry=False, mask=mask)
+            total += replay.sums((GEOMETRY,), [1.0] * 3)[:, GEOMETRY].cpu()
     return total
 
 

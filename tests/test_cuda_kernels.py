@@ -141,25 +141,30 @@ else:
 """
 
 
-def test_one_pixel_a_lane_tells_the_same(monkeypatch):
-    """Information and tangents as a card takes them in the order of centers, where LLVM shares a lane among four."""
-    from types import SimpleNamespace
-
+@pytest.mark.parametrize("preset", ["fast", "exact"])
+@pytest.mark.parametrize("share", [1, 2])
+def test_pixels_a_lane_tell_the_same(monkeypatch, preset, share):
+    """Images, gradients, tangents and information as a card takes them, where LLVM shares a lane among four."""
     import drgs
     from drgs import fisher
     from drgs.testing import random_scene
-    from drgs.tracing import composite
+    from drgs.tracing import composite, tiles
 
     g, (camera,) = random_scene()
-    fast = drgs.RenderSettings.preset("fast")
+    settings = drgs.RenderSettings.preset(preset)
     tangents = {"means": torch.randn(5, *g.means.shape, generator=torch.Generator().manual_seed(0))}
 
     def told() -> dict[str, torch.Tensor]:
-        pushed = drgs.render_jvp(g, camera, tangents, fast).rgb
-        return {"pushed": pushed, **fisher.diagonal(g, camera, fast), "blocks": fisher.blocks(g, camera, fast)}
+        own = drgs.Gaussians(**{name: x.detach().requires_grad_() for name, x in g.parameters().items()})
+        out = drgs.render(own, camera, settings)
+        out.rgb.square().sum().backward()
+        pushed = drgs.render_jvp(g, camera, tangents, settings).rgb
+        found = {"rgb": out.rgb.detach(), "gradient": own.means.grad, "pushed": pushed}
+        return {**found, **fisher.diagonal(g, camera, settings), "blocks": fisher.blocks(g, camera, settings)}
 
     four = told()
-    monkeypatch.setattr(composite, "runtime", SimpleNamespace(backend=lambda: SimpleNamespace(name="cuda")))
+    for module in (composite, tiles):
+        monkeypatch.setattr(module, "pixels_a_lane", lambda basis=0: share)
     for name, one in told().items():
         assert torch.allclose(one, four[name], rtol=1e-4, atol=1e-5 * float(four[name].abs().max())), name
 

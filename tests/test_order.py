@@ -78,6 +78,7 @@ def test_tables_of_few_tiles(rng, monkeypatch, width):
     for size, held in ((tiles.TABLES, room), (60 << 10, room), (60 << 10, 0), (60 << 10, 9000)):
         monkeypatch.setattr(tiles, "TABLES", size)
         monkeypatch.setattr(tiles, "_HELD", held)
+        monkeypatch.setattr(tiles, "_CARD", 1)
         leaves = {name: x.clone().requires_grad_() for name, x in g.detach().parameters().items()}
         out = render(g.detach().replace(**leaves), cam, EXACT)
         ((out.rgb * v).sum() + (out.features.sum() if width else 0)).backward()

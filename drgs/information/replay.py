@@ -108,7 +108,7 @@ class Replay:
         self.inputs = {name: to_drjit(lib, x) for name, x in call.inputs.items()}
         self.compositor, arguments = call.prepare(self.inputs)
         with dr.suspend_grad():  # nothing is recorded: what is wanted are the hits of this view
-            images = self.compositor.forward(*arguments, keep=True, joint=call.width, rows=True)
+            images = self.compositor.forward(*arguments, keep=True, joint=call.width)
         self.opacity = images["alpha"].torch().cpu().reshape(call.shape)  # (H, W)
         p = {name: x.array for name, x in self.inputs.items()}
         self.mask = None if mask is None else to_drjit(lib, mask.float().reshape(-1).to(call.home)).array
@@ -235,23 +235,25 @@ class Replay:
         weights: Sequence[float],
         beside: Sequence[WalkSums] = (),
     ) -> torch.Tensor:
-        """(N, width) float64: what `sink_of(walk, reduce mode)` sums up in its `buffer`, over all walks; their hits are
-        added to the sums `beside`, too.
+        """(N, width) float64, where kernels run: what `sink_of(walk, reduce mode)` sums up in its `buffer`, over all
+        walks; their hits are added to the sums `beside`, too.
         """
-        total = torch.zeros(self.count, width, dtype=torch.float64)
+        total = torch.zeros(self.count, width, dtype=torch.float64, device=self.call.home)
         for walk in self.walks(weights):
             sink = sink_of(walk, walk.part.reduction)
             others = [sums.sink(self, walk) for sums in beside]
             # A buffer is float32, which one traversal fills; what several add up to is float64.
             dr.eval(self.run(walk, Together([sink, *others])), sink.buffer, [other.buffer for other in others])
-            found = _torch(sink.buffer).reshape(self.count, -1)[:, :width]
+            found = sink.buffer.torch().double().reshape(self.count, -1)[:, :width]
             total[:, : found.shape[1]] += found
         return total
 
     def sums(
         self, entries: Sequence[int], weights: Sequence[float], summed: bool = False, beside: Sequence[WalkSums] = ()
     ) -> torch.Tensor:
-        """(N, 11) float64: squares of the geometry, and sum w^2; those of SH along each ray are kept in `light`."""
+        """(N, 11) float64, where kernels run: squares of the geometry, and sum w^2; those of SH along each ray are kept
+        in `light`.
+        """
         bands = self.call.coefficients if self.along_ray and self.extras is not None and GEOMETRY in entries else 0
 
         def made(walk: Walk, mode: dr.ReduceMode) -> Diagonal:
@@ -265,36 +267,37 @@ class Replay:
     def diagonal(
         self, groups: dict, weights: Sequence[float], fisherrf: bool, beside: Sequence[WalkSums] = ()
     ) -> Information:
-        """`fisher.diagonal` of one view; its hits are added to the sums `beside`, too."""
+        """`fisher.diagonal` of one view, on the CPU; its hits are added to the sums `beside`, too."""
         entries = sorted({k for group in groups.values() for k in group.entries})
         sums = self.sums(entries, weights, fisherrf, beside)
         result = {}
-        scale = torch.tensor([1.0] * 3 if fisherrf else weights, dtype=torch.float64)
+        scale = torch.tensor([1.0] * 3 if fisherrf else weights, dtype=torch.float64, device=self.call.home)
         for name, group in groups.items():
-            result[name] = group.collect(sums[:, group.entries], self, scale)
+            # On a card all sums are made there: the CPU would take many times as long as the kernels.
+            result[name] = group.collect(sums[:, group.entries], self, scale).cpu()
             if fisherrf:
                 result[name] = result[name] / group.fisherrf(self.call.inputs)
         return result
 
     def blocks(self, weights: Sequence[float]) -> torch.Tensor:
-        """`fisher.blocks` of one view."""
+        """`fisher.blocks` of one view, on the CPU."""
         lib, size = self.lib, Blocks.SIZE
         made = lambda walk, mode: Blocks(lib, self.count, walk.weights, mode)  # noqa: E731
-        row, column = torch.tril_indices(size, size)
+        row, column = torch.tril_indices(size, size, device=self.call.home)
         total = self._summed(made, len(row), weights)
-        full = torch.zeros(self.count, size, size, dtype=torch.float64)
+        full = torch.zeros(self.count, size, size, dtype=torch.float64, device=self.call.home)
         full[:, row, column] = total
         full[:, column, row] = total
-        return full
+        return full.cpu()
 
     def variance(self, information: Information, weights: Sequence[float]) -> torch.Tensor:
         """`fisher.variance_map` of one view, by weights of the groups (`information`) and of the channels."""
         lib = self.lib
-        table = torch.zeros(self.count, 16, dtype=torch.float64)
+        table = torch.zeros(self.count, 16, dtype=torch.float64, device=self.call.home)
         for name, values in information.items():
             group = GROUPS[name]
             assert group.spread is not None, name  # `variance_map` has refused the others
-            spread = group.spread(values.double().cpu(), self)
+            spread = group.spread(values.to(self.call.home, torch.float64), self)
             # Squared weights w^2 are of one color each, then of all other channels.
             first = GEOMETRY + 3 if name == "features" else group.entries[0]
             table[:, first : first + spread.shape[1]] = spread
@@ -323,12 +326,12 @@ class Replay:
             return self.light * weights
         seen = squares[:, 0].nonzero()[:, 0]
         if 2 * len(seen) > self.count:  # to copy them to where they belong takes longer than zeros of the others
-            seen = torch.arange(self.count)
+            seen = torch.arange(self.count, device=squares.device)
         basis, lit = self._squared_basis(seen)
         found = basis[:, :, None] * (squares[seen] * lit * weights)[:, None, :]
         if len(seen) == self.count:
             return found
-        return torch.zeros(self.count, *found.shape[1:], dtype=torch.float64).index_copy_(0, seen, found)
+        return found.new_zeros(self.count, *found.shape[1:]).index_copy_(0, seen, found)
 
     @property
     def feature_scale(self) -> float:
@@ -339,20 +342,16 @@ class Replay:
         """(N, 3) weights of w^2 in each channel, from (N, K, 3) of SH; along rays they stay with the pixel."""
         if self.along_ray:
             self.light = weights
-            return torch.zeros(self.count, 3, dtype=torch.float64)
-        basis, lit = self._squared_basis(torch.arange(self.count))
+            return weights.new_zeros(self.count, 3)
+        basis, lit = self._squared_basis(torch.arange(self.count, device=weights.device))
         return (basis[:, :, None] * weights).sum(1) * lit
 
     def _squared_basis(self, rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Of n Gaussians (n, K) squares of the SH basis towards them, and (n, 3) 1 where a channel is above 0, or 0."""
-        chosen = lambda x: x.torch().cpu()[rows]  # noqa: E731
+        chosen = lambda x: x.torch()[rows]  # noqa: E731
         basis, lit = (torch.stack([chosen(x) for x in xs], 1).double() for xs in (self.basis, self.lit))
         return basis.square_(), lit
 
 
 def _unit(k: int) -> list[float]:
     return [float(j == k) for j in range(3)]
-
-
-def _torch(x: Float) -> torch.Tensor:
-    return x.torch().double().cpu()

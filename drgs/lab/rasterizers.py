@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import functools
 import inspect
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -126,7 +127,7 @@ def load_rasterizer(
             raise ValueError("--rasterizer gsplat: must be installed, is not; run pip install gsplat") from None
         if not torch.cuda.is_available():
             raise ValueError("--rasterizer gsplat: must have a CUDA card, torch finds none; use a dump made on one")
-        return function(rasterization, text, along_rays)
+        return function(_within_gsplat(rasterization), text, along_rays)
     found = imported_function("--rasterizer", text, "drgs:PRESET, gsplat, a file .npz or .safetensors, or ")
     return function(found, text, along_rays)
 
@@ -191,6 +192,19 @@ def function(call: Callable, name: str, along_rays: bool = False) -> Rasterizer:
         return image, alpha
 
     return Rasterizer(name, draw, *_taste(draw))
+
+
+def _within_gsplat(rasterization: Callable) -> Callable:
+    """gsplat's function, without the images that end the process: along rays its kernels assert three channels."""
+
+    @functools.wraps(rasterization)
+    def checked(**arguments: Any) -> Any:
+        channels = arguments["colors"].shape[-1]
+        if arguments.get("with_eval3d") and channels != 3:
+            raise NotImplementedError(f"along rays its images have 3 channels, not {channels}")
+        return rasterization(**arguments)
+
+    return checked
 
 
 def _lens_arguments(camera: Camera, like: dict, accepted: Mapping[str, inspect.Parameter]) -> dict:

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import drjit as dr
 import torch
 
-from drgs import runtime
 from drgs.settings import RenderSettings
 from drgs.tracing.arrays import Float, Lib, Mask, UInt32
 from drgs.tracing.derivatives import Adjoint, Tangent
@@ -23,20 +22,12 @@ from drgs.tracing.hit_table import Table, along_lists
 from drgs.tracing.kernels import Channels, Emit, HitModel, Primal
 from drgs.tracing.records import RECORD, count_of, pack, pack_records
 from drgs.tracing.sums import add_row
-from drgs.tracing.walk import Part, Traversal
+from drgs.tracing.walk import Part, Traversal, pixels_a_lane
 from drgs.tracing.weights import MATRIX, PIXELS, Weights, in_rows, without_graph
 
 __all__ = ["CHUNK", "Arguments", "Composite", "Compositor", "compositor_of"]
 
 CHUNK = 32  # feature channels of one traversal
-_SHARED = 3  # tangents of four pixels that fit a card's registers
-
-
-def _pixels_a_lane(rows: bool, columns: int) -> int:
-    """In the order of the list, for a traversal that keeps rows of Gaussians, or carries so many tangents."""
-    if runtime.backend().name == "cuda" and (rows or columns > _SHARED):
-        return 1  # LLVM is faster with four, of which ptxas would spill what a hit has
-    return 4
 
 
 class Arguments(NamedTuple):
@@ -152,7 +143,6 @@ class Compositor:
         keep: bool,
         columns: int = 0,
         joint: int = 0,
-        rows: bool = False,
     ) -> dict:
         """Flat images rgb, alpha, and where there are any depth and features.
 
@@ -167,7 +157,6 @@ class Compositor:
             columns: So many tangents may follow.
             joint: Feature channels that the first traversal composites with the colors, none or all, so that each of
                 its hits knows all that it composites (`information.replay`).
-            rows: The Jacobian's rows of each hit may follow.
         """
         view = self.traversal
         self.absolute: Any = absolute
@@ -185,10 +174,8 @@ class Compositor:
         self.passes = [self._channels(0, joint, color=True)]
         chunks = range(joint, self.width, CHUNK)
         self.passes += [self._channels(k, min(CHUNK, self.width - k)) for k in chunks]
-        share = 1
-        # In the order of the list pixels can share a lane; more channels or a basis each would not fit registers.
-        if self.settings.order == "center" and self.settings.traversal == "tiles" and not self.basis:
-            share = _pixels_a_lane(rows, columns)
+        in_lists = self.settings.order == "center" and self.settings.traversal == "tiles"
+        share = pixels_a_lane(self.basis) if in_lists else 1
         weighed = self.width > joint
         self.parts = view.weighed(share, MATRIX // (1 + columns)) if weighed else view.parts(share)
         out = self._composited(frozenset(self.want | ({"replay"} if keep else set())), count_of(record))

@@ -29,7 +29,7 @@ from drgs.tracing.records import load_record
 from drgs.tracing.responses import response_of
 from drgs.tracing.rows import MemoryBudget, SortedHits
 from drgs.tracing.sort_keys import ascending
-from drgs.tracing.walk import ListStream, Part, Slots
+from drgs.tracing.walk import ListStream, Part, Slots, pixels_a_lane
 from drgs.tracing.weights import PIXELS, Weights, signed
 
 __all__ = ["TABLES", "TILE", "Lists", "TileTraversal", "build", "depth_order"]
@@ -39,6 +39,7 @@ TABLES = 128 << 20
 """Bytes of the rows of pixels that are sorted at a time, and of a table that the adjoint fills in exact order
 (information: twice that, with a semantic channel four times); a single tile's may have more.
 """
+_CARD = 8  # times as many bytes on a card, whose lanes must be many
 _CORNERS = {1: [(0, 0)], 2: [(0, 0), (0, 4)], 4: [(0, 0), (4, 0), (0, 4), (4, 4)]}  # of pixels that share a lane
 _NOWHERE = 2**64 - 1
 _HELD = 128 << 20  # bytes of the orders of all pixels, which derivatives need again
@@ -94,14 +95,14 @@ class TileTraversal:
         size = self.width, self.height
         self.lists = build(self.lib, self.projected, self.settings, *size, records, self.trimmed, self.lens)
         self.certificate["pairs"] = self.lists.pairs
-        self.budget = MemoryBudget(_HELD if replayed else 0)
+        self.budget = MemoryBudget(_room(_HELD) if replayed else 0)
         if self.settings.order == "ray":
             self.certificate |= {"rays": self.rays, "redone": 0}  # rows hold every hit
 
     def parts(self, share: int) -> list[Part]:
         """All pixels as one part; in `ray` order as `weighed`, for tables of two numbers."""
         if self.settings.order == "ray":
-            return [self._band_part(share, band) for band in self._bands(TABLES // 2)]
+            return [self._band_part(share, band) for band in self._bands(_room(TABLES) // 2)]
         count = self.lists.columns * self.lists.rows
         per_tile = TILE * TILE // share
         return [self._part(share, dr.arange(self.lib.UInt32, count * per_tile) // per_tile)]
@@ -109,7 +110,7 @@ class TileTraversal:
     def weighed(self, share: int, size: int) -> list[Part]:
         """All pixels, in parts of consecutive tiles whose weights take `size` bytes, or a tile's more, and are held."""
         index = signed(self.lists.index)
-        size = min(size, TABLES // 2) if self.settings.order == "ray" else size
+        size = min(size, _room(TABLES) // 2) if self.settings.order == "ray" else size
         made = []
         for band in self._bands(size):
             pixels = self._pixels(torch.arange(band.begin, band.end, device=band.lengths.device))
@@ -140,10 +141,9 @@ class TileTraversal:
         memory.require("render", 8 * size, what, "lower extent", runtime.backend().name == "cuda")
         tiles = dr.arange(lib.UInt32, band.end - band.begin) + dr.opaque(lib.UInt32, band.begin)
         cut = None if self.lists.cut is None else dr.gather(lib.Float, self.lists.cut, tiles)
-        # Hits are found four pixels a lane; derivatives that carry an SH basis of each pixel would not fit registers.
-        found_by = functools.partial(self._band_in_lists, band, 4)
+        found_by = functools.partial(self._band_in_lists, band, pixels_a_lane())
         hits = SortedHits(lib, found_by, self.lists.index, band.lengths, cut, self.budget)
-        in_lists = functools.partial(self._band_in_lists, band, 1 if self.basis else 4)
+        in_lists = functools.partial(self._band_in_lists, band, pixels_a_lane(self.basis))
         return self._band_in_lists(band, share, hits, in_lists, weights)
 
     def _band_in_lists(
@@ -158,7 +158,7 @@ class TileTraversal:
         lib = self.lib
         per_tile = PIXELS // share
         lane = dr.arange(lib.UInt32, (band.end - band.begin) * per_tile)
-        columns = [lane % per_tile + 16 * k for k in range(share)]
+        columns = [lane % per_tile + per_tile * k for k in range(share)]
         # Opaque: another band is no other kernel.
         slots = Slots(dr.opaque(lib.UInt32, band.first), band.slots, columns)
         tile = lane // per_tile + dr.opaque(lib.UInt32, band.begin)
@@ -180,7 +180,7 @@ class TileTraversal:
         in_lists: Callable[[], Part] | None = None,
         weights: Weights | None = None,
     ) -> Part:
-        """The pixels of tiles, given per lane, `share` (1, 2 or 4) a lane, along the tiles' lists or their own `hits`."""
+        """The pixels of tiles, given per lane, 1, 2 or 4 a lane, along the tiles' lists or their own `hits`."""
         lib, lists = self.lib, self.lists
         per_tile = TILE * TILE // share
         inner = dr.arange(lib.UInt32, dr.width(tile)) % per_tile
@@ -530,6 +530,11 @@ class _Boxes:
             dr.while_loop(start, lambda k, x, y: k < self.amount, body)
         dr.eval(keys)
         return keys if tiles is None else dr.gather(lib.UInt64, keys, dr.compress(keys != _NOWHERE))
+
+
+def _room(size: int) -> int:
+    """Bytes for what bands of tiles hold."""
+    return _CARD * size if runtime.backend().name == "cuda" else size
 
 
 def _area(lib: Lib, x: Sequence[Int32], y: Sequence[Int32]) -> UInt32:

@@ -19,6 +19,7 @@ from typing import Any, Protocol
 
 import drjit as dr
 
+from drgs import runtime
 from drgs.tracing.arrays import Float, Lib, Mask, UInt32
 from drgs.tracing.errors import own_errors
 from drgs.tracing.kernels import HitModel
@@ -29,7 +30,7 @@ from drgs.tracing.responses.peak import entry
 from drgs.tracing.sort_keys import BEYOND, EMPTY, ascending, name_of, positive, push, word_of
 from drgs.tracing.weights import PIXELS, Weights
 
-__all__ = ["BUFFER", "NOWHERE", "ListStream", "Part", "Slots", "Traversal"]
+__all__ = ["BUFFER", "NOWHERE", "ListStream", "Part", "Slots", "Traversal", "pixels_a_lane"]
 
 BUFFER = 20  # hits that a ray is sorted among
 _DEEP = 48  # of rays for which these were too few
@@ -37,6 +38,16 @@ _MANY = 1000  # such rays, from which on a kernel of their own is worth compilin
 NOWHERE = 0xFFFFFFFF  # place in a list of a ray that composited nothing
 _WORD = 32  # bits of a word beside the key: the lane and the Gaussian
 _MAX_HITS = 1 << 25  # of one sorted list; longer ones are split by rays
+
+
+def pixels_a_lane(basis: int = 0) -> int:
+    """How many pixels of a tile share a lane along its list.
+
+    Four on a CPU, which loads a Gaussian for all of them at once, unless each carries an SH basis: registers would not
+    hold it. One on a card, whose memory is waited for by other lanes, the more the better, and whose registers hold no
+    more.
+    """
+    return 1 if basis or runtime.backend().name == "cuda" else 4
 
 
 class ListStream:
