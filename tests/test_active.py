@@ -546,6 +546,7 @@ def without_times(path: Path) -> dict:
 
 @pytest.mark.parametrize("policy", ["fisher", "random"])
 @pytest.mark.parametrize("moment", ["between picks", "between choosing and saving"])
+@pytest.mark.same_bits
 def test_killed_run_picks_the_same_views(still, tmp_path, monkeypatch, policy, moment, two_threads):
     """With `deterministic`, a run killed after or during its second pick ends in the same bits."""
     active, cfg = plan(policy=policy, add=3), config(deterministic=True)

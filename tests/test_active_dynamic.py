@@ -221,6 +221,7 @@ def test_the_first_pick_knows_of_the_field(swing, tmp_path):
 # ---- resuming
 
 
+@pytest.mark.same_bits
 def test_killed_fits_pick_the_same(swing, tmp_path, monkeypatch):
     """With `deterministic`, a fit killed in the static stage and between two picks ends in the same picks and bits."""
     import drjit as dr

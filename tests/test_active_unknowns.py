@@ -374,6 +374,7 @@ def same_run(a, b):
 
 
 @pytest.mark.parametrize("moment", ["between picks", "between choosing and saving"])
+@pytest.mark.same_bits
 def test_a_killed_fit_goes_on_with_gains_and_poses(uneven, tmp_path, moment):
     """Killed after or during its second pick, it ends in the same bits: gains, poses, Gaussians, picks, config.json."""
     settings = config(

@@ -245,6 +245,7 @@ def test_further_photographs(joined, captured):
     json_page.check("held_out.json", json.loads((folder / "capture/scene" / HELD_OUT).read_text()))
 
 
+@pytest.mark.same_bits
 def test_further_photographs_end_with_the_same_bits(joined, captured, tmp_path):
     """As a fit that was never stopped, from the checkpoint that the first photographs left."""
     folder, _ = joined

@@ -123,6 +123,7 @@ def run_case(name, still, views, workers=None, **more):
 
 
 @pytest.mark.parametrize("name", CASES)
+@pytest.mark.same_bits
 def test_one_worker_finds_the_bits_of_none(cluster, moving, name):
     """Every policy that asks for information: picks, margins, scores, parts and notes are those of this process."""
     _, still, cams = moving
@@ -544,6 +545,7 @@ def study_of(folder: Path, **fields) -> Study:
     )
 
 
+@pytest.mark.same_bits
 def test_a_killed_worker_costs_the_steps_since_its_checkpoint(cluster, still_folder, tmp_path):
     """Three cells on two workers, one of which is killed once it has written a checkpoint: all rows come, the cell goes
     on where it was, and ends with the numbers of a cell that nobody disturbed.

@@ -100,6 +100,7 @@ def test_photographs_fit_better_with_gains(dataset, tmp_path):
 
 
 @pytest.mark.parametrize("at", [3, 9], ids=["static", "dynamic"])
+@pytest.mark.same_bits
 def test_learned_gains_go_on_in_either_stage(dataset, whole_and_resumed, at):
     """Stopped before a step of either stage and resumed it ends with the same bits, the gauge held over all
     photographs, those of later times included.

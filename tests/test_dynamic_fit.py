@@ -145,6 +145,7 @@ class Killed(BaseException):
 
 
 @pytest.mark.parametrize("at", [3, 9], ids=["static", "dynamic"])
+@pytest.mark.same_bits
 def test_killed_in_either_stage(dataset, tmp_path, monkeypatch, at):
     """It goes on from the last checkpoint, and ends with the same bits: of Gaussians, gates, field and optimizers."""
     step = Trainer.step
@@ -212,6 +213,7 @@ def test_an_interrupted_streak_of_bad_steps_is_not_saved(dataset, tmp_path, monk
     assert load_state(Run(tmp_path / "run").state)[1]["step"] == 3
 
 
+@pytest.mark.same_bits
 def test_nothing_of_it_where_nothing_can_move(dataset, tmp_path, monkeypatch):
     """Views of one time, or of none, or that are to be taken for such, are fitted without the code of deformations, and
     to the same bits.

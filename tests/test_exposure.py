@@ -102,6 +102,7 @@ def test_learned_gains_keep_zero_mean_and_held_ones_stay():
     assert json.dumps(held.module.log_gains.tolist())
 
 
+@pytest.mark.same_bits
 def test_a_fit_with_gains_goes_on(dataset, whole_and_resumed):  # noqa: F811
     """Stopped in its middle and resumed it ends with the same gains, Gaussians and record; information about the scene
     is asked for with exposure eliminated.

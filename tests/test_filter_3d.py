@@ -137,6 +137,7 @@ def test_rates_follow_density_control(dataset):  # noqa: F811
     assert len(trainer.scene()) == len(trainer.rows) == len(after) + 2
 
 
+@pytest.mark.same_bits
 def test_a_resumed_fit_keeps_its_rates(dataset, tmp_path):  # noqa: F811
     """Between two times of density control a checkpoint goes on to the same bits; one without its rates is refused."""
     whole = trainer_of(dataset, config(filter_3d="on"))

@@ -74,7 +74,7 @@ def test_lambda_is_one_unless_told_otherwise(place, monkeypatch, capsys):
     default, _ = run(line, place, monkeypatch, capsys)
     given, _ = run(f"{line} --prior 1", place, monkeypatch, capsys)
     assert default["prior"] == given["prior"] == {"value": 1.0, "relative": False}
-    assert default["views"][0]["gain"] == given["views"][0]["gain"]
+    assert default["views"][0]["gain"] == pytest.approx(given["views"][0]["gain"], rel=1e-6)
     relative, _ = run(f"{line} --relative-prior", place, monkeypatch, capsys)
     assert relative["prior"] == {"value": 1e-6, "relative": True}
 

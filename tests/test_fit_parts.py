@@ -87,6 +87,7 @@ def steps(trainer: Trainer, count: int) -> list[StepResult]:
     return [trainer.step() for _ in range(count)]
 
 
+@pytest.mark.same_bits
 def test_new_parts_are_fitted_and_resumed_to_the_bit(dataset, tmp_path):  # noqa: F811
     """A term, features and a network take part in every step, and a checkpoint in the middle changes no bit."""
     whole, first = trainer_of(dataset), trainer_of(dataset)

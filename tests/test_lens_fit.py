@@ -68,6 +68,7 @@ def test_photographs_are_those_of_the_files(bent):
     assert small.camera.K[0, 0] == pytest.approx(taken.camera.K[0, 0] * small.camera.width / SIZE)
 
 
+@pytest.mark.same_bits
 def test_a_fit_through_the_lens(bent, tmp_path, whole_and_resumed):
     """It learns, says how it was made, is measured through the lens, again, too, and goes on bit for bit."""
     settings = config(max_steps=100, undistort="off")

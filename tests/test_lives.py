@@ -348,6 +348,7 @@ def test_what_appears_and_vanishes(tmp_path):
         assert away[not is_on] < 0.4 * away[is_on], time  # measured: at most 0.2
 
 
+@pytest.mark.same_bits
 def test_a_fit_that_was_stopped_ends_with_the_same_bits(dataset, tmp_path):
     """Lives are in the checkpoint; damaged ones are refused, with their name."""
     how = config(max_steps=60, deterministic=True, save_every=30)

@@ -63,6 +63,7 @@ def small(**options) -> Planner:
 
 @pytest.mark.parametrize("depth", [True, False])
 @pytest.mark.parametrize("at", [1, 3, 5])
+@pytest.mark.same_bits
 def test_same_bits(tmp_path, depth, at):
     """Whether there is a model already, or more photographs than are kept; what views told is not asked again."""
     right = list(loop(small(), 0, ROUNDS, depth))
@@ -183,6 +184,7 @@ def started(path: Path, kill_at_save: int = 0) -> subprocess.Popen:
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs POSIX")
+@pytest.mark.same_bits
 def test_killed(tmp_path):
     """While it writes, and in between: the file is the last good one, and all answers are as without."""
     path = tmp_path / "p.safetensors"

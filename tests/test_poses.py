@@ -212,6 +212,7 @@ def test_evidence(photographs, angle, clear):
         assert found.pixels == pytest.approx(angle * frames[0].camera.K[0, 0])
 
 
+@pytest.mark.same_bits
 def test_a_fit_refines_and_everybody_sees_the_cameras(dataset, whole_and_resumed):  # noqa: F811
     """Stopped in its middle and resumed, a fit ends with the same cameras; a run's views are loaded with these,
     held-out views keep theirs, and information is asked for with poses eliminated.
@@ -243,6 +244,7 @@ def test_a_fit_refines_and_everybody_sees_the_cameras(dataset, whole_and_resumed
         fit_record(runs[0])
 
 
+@pytest.mark.same_bits
 def test_poses_stay_where_nothing_says_they_are_off(dataset, tmp_path):  # noqa: F811
     """A data set without observations: auto refines nothing and fits to the same bits as with fixed poses."""
     runs = []

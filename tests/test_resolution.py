@@ -162,6 +162,7 @@ def test_without_it_nothing_is_told_or_kept(dataset):  # noqa: F811
     assert not made.resolution._kept
 
 
+@pytest.mark.same_bits
 def test_a_resumed_fit_has_the_same_bits(dataset, whole_and_resumed, seen):  # noqa: F811
     """Stopped while pictures are small, a run ends as one without a stop."""
     runs = whole_and_resumed(dataset, config(max_steps=20, save_every=5, num_downscales=1, deterministic=True), 7)
@@ -171,6 +172,7 @@ def test_a_resumed_fit_has_the_same_bits(dataset, whole_and_resumed, seen):  # n
     assert [side for side, *_ in seen][:20] == [SIZE // 2] * 10 + [SIZE] * 10
 
 
+@pytest.mark.same_bits
 def test_everything_goes_on_with_the_same_bits(dataset):  # noqa: F811
     """Masks, gains, poses, the 3D filter and what is transient together: from a checkpoint after the first look, while
     pictures are small, to some steps at the full size."""

@@ -58,6 +58,7 @@ def test_two_fits_in_one_folder(dataset, run, capsys):  # noqa: F811
     assert not (run.path / locks.NAME).exists()
 
 
+@pytest.mark.same_bits
 def test_terminated_fit_saves_and_goes_on_with_the_same_bits(
     dataset,  # noqa: F811
     tmp_path,

@@ -148,6 +148,7 @@ def test_features_learn_from_all_renderers_in_turn(taught, rendered):
 
 
 @pytest.mark.parametrize("size", ["image", "teacher"])
+@pytest.mark.same_bits
 def test_features_leave_the_geometry_alone(taught, size, monkeypatch):
     """Uncoupled, the gradients of everything but features are those of a fit of colors, to the bit; coupled, not.
 
@@ -223,6 +224,7 @@ def test_outside_a_mask_a_teacher_has_no_say(taught):
     assert term(shown, dataclasses.replace(frame, mask=0 * left), g) is None
 
 
+@pytest.mark.same_bits
 def test_without_a_teacher_no_feature_code_runs(dataset, taught, tmp_path, monkeypatch):  # noqa: F811
     """A data set without maps, and one whose maps are to be ignored, are fitted without importing anything of
     features, to the same bits, and leave the same files.
@@ -272,6 +274,7 @@ def test_a_run_keeps_its_decoder_and_classes(run, taught):
     assert all(event["features"] > 0 for event in run.run.events() if event["event"] == "train")
 
 
+@pytest.mark.same_bits
 def test_a_resumed_fit_has_the_same_bits(run, taught, tmp_path, monkeypatch):
     """Interrupted halfway and resumed: features, decoder and all moments are those of a whole fit."""
     step, count = Trainer.step, 0

@@ -205,6 +205,7 @@ def test_held_out_views_are_better_and_the_file_has_it(tmp_path):
     assert int((away > RADIUS).sum()) == recorded["gaussians"]
 
 
+@pytest.mark.same_bits
 def test_a_near_scene_has_the_bits_of_a_fit_without(tmp_path):
     """Nothing is far away: `auto` changes nothing."""
     dataset = dataset_of(photographs(NEAR), tmp_path)
@@ -219,6 +220,7 @@ def test_a_near_scene_has_the_bits_of_a_fit_without(tmp_path):
     assert all(torch.equal(one[name], two[name]) for name in one)
 
 
+@pytest.mark.same_bits
 def test_resumed_fit_has_the_same_bits(tmp_path):
     """A checkpoint knows which Gaussians are far away, and says so if it cannot be."""
     frames = photographs()

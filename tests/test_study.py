@@ -384,6 +384,7 @@ def test_a_cell_that_was_evaluated_again(still, faked, tmp_path, monkeypatch):
 # ---- one real cell
 
 
+@pytest.mark.same_bits
 def test_a_killed_cell_goes_on(still, tmp_path, monkeypatch):
     """A fit that is killed after a pick is resumed from its checkpoint and ends as one that was not."""
     study = small(still, deterministic=True)

@@ -63,6 +63,7 @@ def kills():
     return module
 
 
+@pytest.mark.same_bits
 def test_a_killed_fit_goes_on(kills, tmp_path):
     """Three kills at random moments: every file is whole, and the end has the bits and picks of a fit left in peace."""
     row = kills.campaign("active", tmp_path, kills=3)

@@ -128,6 +128,7 @@ def test_eval_command_repeats_the_metrics(dataset, tmp_path, monkeypatch, capsys
     assert (again["split"], again["count"]) == ("train", 7)
 
 
+@pytest.mark.same_bits
 def test_resumed_run_equals_an_uninterrupted_one(dataset, tmp_path, monkeypatch, two_threads):
     """With `deterministic`, interrupting at step 33 and resuming gives the same PLY, bit for bit."""
     cfg = config(deterministic=True)

@@ -135,6 +135,7 @@ def test_auto_decides_by_evidence():
     assert float(frames[3].transient[there].float().mean()) > 0.7
 
 
+@pytest.mark.same_bits
 def test_a_clean_fit_has_the_same_bits():
     """One look, nothing found, and the Gaussians of a fit that never looked."""
     ends = []
@@ -159,6 +160,7 @@ def test_few_photographs_or_steps_are_not_looked_at():
     assert not Transients("keep").is_due(60, 120, 12)
 
 
+@pytest.mark.same_bits
 def test_resumed_fit_goes_on_with_its_masks(tmp_path):
     """A fit from a checkpoint after the first look ends as the one that was not interrupted."""
     frames, _ = photographs()

@@ -65,7 +65,7 @@ class Field:
         given = {**self.fixed, **parameters}
         fields = self.scene.deform(given, given.pop("time", self.time)).parameters()
         if self.shift is not None:
-            fields["means"] = fields["means"] - self.shift
+            fields["means"] = fields["means"] - self.shift.to(fields["means"].device)
         return {name: fields[name] for name in self.names}
 
 
