@@ -9,7 +9,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
@@ -167,21 +166,6 @@ def test_pixels_a_lane_tell_the_same(monkeypatch, preset, share):
         monkeypatch.setattr(module, "pixels_a_lane", lambda basis=0: share)
     for name, one in told().items():
         assert torch.allclose(one, four[name], rtol=1e-4, atol=1e-5 * float(four[name].abs().max())), name
-
-
-def test_slots_of_warps():
-    """32 lanes go on until the last of them has finished."""
-    import warps
-
-    blocks = np.zeros((2, 8, 8), np.int64)
-    blocks[0, 0, 0] = 5  # a pixel of lane 0 of the first tile
-    blocks[1] = 2
-    own = warps.lanes(blocks, 4)
-    assert own.shape == (2, 16)
-    assert (own[0, 0], own[0, 1:].max(), own[1].min()) == (5, 0, 2)
-    assert warps.slots(own, 4, False) == (5 * 32 * 4, 5)
-    one = warps.lanes(blocks, 1)
-    assert warps.slots(one, 1, False) == ((5 + 0 + 2 + 2) * 32, 9)
 
 
 def test_check_says_what_is_missing(tmp_path):

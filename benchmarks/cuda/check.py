@@ -2,6 +2,7 @@
 
     make cuda-check                                      into out/cuda-check.json
     python benchmarks/cuda/check.py [-o FILE] [--quick]
+    python benchmarks/cuda/check.py --page               table of docs/cuda.md, from h200.json
 
 Images, gradients and information of the card beside those of LLVM, times of frames and of a pick beside gsplat's own
 kernels, crossval against these on both of their paths (rasterization, and Gaussians along rays: `with_ut`,
@@ -246,6 +247,22 @@ def timed() -> None:
         print(json.dumps(row | {"picked": found.picks[0].name}), flush=True)
 
 
+def page() -> list[str]:
+    """Markdown: milliseconds of frames on the card of h200.json."""
+    rows = json.loads((HERE / "h200.json").read_text())["times"]
+    found = {(r["renderer"], r["gaussians"], r["kind"]): r for r in rows if "kind" in r}
+    columns = list(dict.fromkeys((r["gaussians"], tuple(r["size"])) for r in rows if "kind" in r))
+    kinds = {"forward": "forward", "step": "with gradient", "diagonal": "Fisher diagonal"}
+    named = [f"{name}, {count:,} at {width}x{height}" for count, (width, height) in columns for name in kinds.values()]
+    made = ["| ms | " + " | ".join(named) + " |", "|---|" + "---|" * len(named)]
+    for renderer in dict.fromkeys(name for name, *_ in found):
+        own = [found.get((renderer, count, kind)) for count, _ in columns for kind in kinds]
+        cells = [f"{1e3 * r['median']:.1f}" if r else "" for r in own]
+        label = renderer if "kernels" in renderer else f"`{renderer}`"
+        made.append(f"| {label} | " + " | ".join(cells) + " |")
+    return made
+
+
 def described() -> dict:
     """The machine, the card and all versions."""
     from drgs import runtime
@@ -261,7 +278,13 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="a tenth of the suite, for a first look")
     parser.add_argument("--part", choices=("frames", "compare", "gsplat", "times"), help="one part, in this process")
     parser.add_argument("--npz", type=Path, default=ROOT / "out" / "cuda-frames.npz", help="arrays of part frames")
+    parser.add_argument("--page", action="store_true", help="write the table of docs/cuda.md, and nothing else")
     args = parser.parse_args()
+    if args.page:
+        from drgs.studies.tables import fill_between
+
+        fill_between(ROOT / "docs" / "cuda.md", "measured", "\n".join(page()))
+        return 0
     if lacks := missing() if args.part is None else None:
         print(f"cuda-check: {lacks}", file=sys.stderr)
         return 2

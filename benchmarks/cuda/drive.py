@@ -23,7 +23,7 @@ from cases import CASES, FRAMES, OPTIX  # noqa: E402
 
 from drgs import runtime  # noqa: E402
 from drgs.tracing import rows as rows_of_hits  # noqa: E402
-from drgs.tracing import sort_keys  # noqa: E402
+from drgs.tracing import sort_keys, tiles  # noqa: E402
 
 FOLDER = Path(os.environ["CARD_MODULES"])
 _LARGE = 8 << 20  # numbers: above the pixels of an image of 1920x1080, below those of a band's rows
@@ -82,7 +82,9 @@ def main() -> None:
     """Write what each case has done."""
     out, *names = sys.argv[1:]
     warnings.simplefilter("ignore")
-    sort_keys._by_torch = lambda: True  # on LLVM, too, as on a card
+    # On LLVM, too, as on a card.
+    sort_keys._by_torch = lambda: True
+    tiles._room = lambda size: tiles._CARD * size
     known = {**CASES, **FRAMES, **(OPTIX if os.environ.get("DRJIT_LIBOPTIX_PATH") else {})}
     rows = {}
     for name, case in known.items():
