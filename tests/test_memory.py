@@ -8,6 +8,7 @@ import os
 import resource
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from drgs.cameras import orbit
 from drgs.data.camera_lists import save_cameras_json
 from drgs.files import save_ply
 from drgs.guards import memory
+from drgs.tracing import tiles
 
 TILES = drgs.RenderSettings.preset("fast")
 TOLD = r"there must be memory for .*, which takes at least [0-9.]+ GiB, got [0-9.]+ GiB available; "
@@ -146,6 +148,14 @@ def test_tile_lists_that_do_not_fit(gaussians, monkeypatch):
     monkeypatch.setattr(memory, where, lambda: memory.frame_bytes(64 * 64, TILES, gradients=True) + 1)
     with pytest.raises(ValueError, match="entries of tile lists"):
         drgs.render(wide.replace(means=wide.means.clone().requires_grad_()), camera(64), TILES)
+
+
+@pytest.mark.parametrize(("gigabytes", "times"), [(None, 8), (8, 1), (24, 2), (80, 8), (140, 8)])
+def test_bands_on_a_card(monkeypatch, gigabytes, times):
+    """Wide ones, for many lanes, where its memory can hold what sorting takes."""
+    monkeypatch.setattr(tiles, "runtime", SimpleNamespace(backend=lambda: SimpleNamespace(name="cuda")))
+    monkeypatch.setattr(memory, "of_card", lambda: gigabytes and gigabytes << 30)
+    assert tiles._room(1000) == 1000 * times
 
 
 @pytest.mark.parametrize("source", ["options", "cameras.json"])

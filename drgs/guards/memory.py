@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from drgs.settings import RenderSettings
 
-__all__ = ["PAIR", "PICTURES", "TANGENT", "available", "frame_bytes", "is_out_of_memory", "require"]
+__all__ = ["PAIR", "PICTURES", "TANGENT", "available", "frame_bytes", "is_out_of_memory", "of_card", "require"]
 
 # Measured: what a frame of 1024^2 to 4096^2 pixels adds to the resident set of a fresh process (LLVM, one thread; rgb,
 # alpha and depth of 1,000 Gaussians), divided by its pixels; the constants are the least of them. Tiles: 61 to 67 bytes
@@ -79,6 +79,13 @@ def available() -> int | None:
     """Bytes that this process may still take: of the machine, its control group and its limits; None if unknown."""
     known = [x for x in (_machine(), _control_group(), _address_space()) if x is not None]
     return min(known, default=None)
+
+
+def of_card() -> int | None:
+    """Bytes of a card's memory, whoever has them; None if unknown."""
+    import torch
+
+    return torch.cuda.mem_get_info()[1] if torch.cuda.is_available() else None
 
 
 def _device() -> int | None:

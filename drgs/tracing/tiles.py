@@ -39,7 +39,8 @@ TABLES = 128 << 20
 """Bytes of the rows of pixels that are sorted at a time, and of a table that the adjoint fills in exact order
 (information: twice that, with a semantic channel four times); a single tile's may have more.
 """
-_CARD = 8  # times as many bytes on a card, whose lanes must be many
+_CARD = 8  # times as many bytes on a card, whose lanes must be many, if
+_FOR_EACH = 10 << 30  # it has so much memory for each: torch takes a tenth of it to sort the hits of a band
 _CORNERS = {1: [(0, 0)], 2: [(0, 0), (0, 4)], 4: [(0, 0), (4, 0), (0, 4), (4, 4)]}  # of pixels that share a lane
 _NOWHERE = 2**64 - 1
 _HELD = 128 << 20  # bytes of the orders of all pixels, which derivatives need again
@@ -534,7 +535,10 @@ class _Boxes:
 
 def _room(size: int) -> int:
     """Bytes for what bands of tiles hold."""
-    return _CARD * size if runtime.backend().name == "cuda" else size
+    if runtime.backend().name != "cuda":
+        return size
+    whole = memory.of_card()
+    return size * (_CARD if whole is None else min(max(whole // _FOR_EACH, 1), _CARD))
 
 
 def _area(lib: Lib, x: Sequence[Int32], y: Sequence[Int32]) -> UInt32:
