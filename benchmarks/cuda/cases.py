@@ -230,18 +230,12 @@ def deep() -> None:
     loss(drgs.render(crowd, camera, BVH)).backward()
 
 
-def frame(count: int, width: int, height: int, settings: RenderSettings, kind: str, sh_degree: int = 0) -> None:
-    """One frame of the cube of the benchmarks: `forward`, a `step` of a fit without its optimizer, or `diagonal`."""
+def frame(count: int, width: int, height: int, settings: RenderSettings) -> None:
+    """One frame of the cube of the benchmarks and its gradient: a step of a fit without its optimizer."""
     cube = importlib.import_module("cubes")
-    g = cube.cube(count, sh_degree=sh_degree)
-    g = Gaussians(**{name: x.to(home).requires_grad_(kind == "step") for name, x in of(g).items()})
-    view = cube.camera(width, height)
-    if kind == "diagonal":
-        fisher.diagonal(g, view, settings, groups=GROUPS)
-        return
-    image = drgs.render(g, view, settings, outputs=()).rgb
-    if kind == "step":
-        image.square().mean().backward()
+    fields = of(cube.cube(count, sh_degree=3))
+    g = Gaussians(**{name: x.to(home).requires_grad_() for name, x in fields.items()})
+    drgs.render(g, cube.camera(width, height), settings, outputs=()).rgb.square().mean().backward()
 
 
 def plugin() -> None:
@@ -344,20 +338,13 @@ OPTIX: dict[str, _Case] = {
     "mi.render": plugin,
 }
 
-_KINDS = ("forward", "step", "diagonal")
-FRAMES: dict[str, _Case] = {
-    f"{kind}, {name}": functools.partial(frame, 100_000, 512, 512, Preset(name), kind)
-    for name in ("fast", "gsplat", "exact")
-    for kind in _KINDS
-    if (kind, name) != ("diagonal", "gsplat")
-}
 SIZES = ((100_000, 960, 540), (200_000, 960, 540))
 LARGE = ((100_000, 1920, 1080), (200_000, 1920, 1080), (1_000_000, 1920, 1080))
 """(Gaussians, width, height) of the steps of which frames.py counts memory, the large ones of `fast` alone: LLVM takes
 minutes for their rows in exact order.
 """
-FRAMES |= {
-    f"step, {name}, {count}, {width}x{height}": functools.partial(frame, count, width, height, Preset(name), "step", 3)
+FRAMES: dict[str, _Case] = {
+    f"step, {name}, {count}, {width}x{height}": functools.partial(frame, count, width, height, Preset(name))
     for name, sizes in (("fast", SIZES + LARGE), ("exact", SIZES))
     for count, width, height in sizes
 }

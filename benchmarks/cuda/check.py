@@ -144,11 +144,10 @@ def frames() -> Iterator[tuple[str, np.ndarray]]:
                     yield f"{scene}/{preset}/information of {name}", x.numpy()
 
 
-def compared(theirs: dict[str, np.ndarray]) -> list[dict]:
-    """How far this backend's arrays are from another's: the largest difference over the largest number, and rms over
-    rms.
+def compared(theirs: dict[str, np.ndarray]) -> None:
+    """Print how far this backend's arrays are from another's: the largest difference over the largest number, and rms
+    over rms.
     """
-    rows = []
     for name, x in frames():
         y = theirs[name].astype(np.float64)
         both = np.isfinite(x) & np.isfinite(y)
@@ -157,25 +156,21 @@ def compared(theirs: dict[str, np.ndarray]) -> list[dict]:
         row: dict = {"name": name, "elsewhere finite": int((np.isfinite(x) != np.isfinite(y)).sum())}
         row["largest"] = float(np.abs(off).max() / max(size.max(), 1e-30))
         row["rms"] = float(np.sqrt((off**2).mean() / max((size**2).mean(), 1e-60)))
-        rows.append(row)
         print(json.dumps(row), flush=True)
-    return rows
 
 
-def medians(kinds: dict, **named: Any) -> list[dict]:
-    """Seconds of each kind: the first call, and median, least and most of seven more, in turns."""
+def medians(kinds: dict, **named: Any) -> None:
+    """Print seconds of each kind: the first call, and median, least and most of seven more, in turns."""
     seconds: dict[str, list[float]] = {kind: [] for kind in kinds}
     for _ in range(8):
         for kind, call in kinds.items():
             began = time.perf_counter()
             call()
             seconds[kind].append(time.perf_counter() - began)
-    rows = []
     for kind, all_ in seconds.items():
         own = sorted(all_[1:])
-        rows.append({**named, "kind": kind, "first": all_[0], "median": own[3], "least": own[0], "most": own[-1]})
-        print(json.dumps(rows[-1]), flush=True)
-    return rows
+        row = {**named, "kind": kind, "first": all_[0], "median": own[3], "least": own[0], "most": own[-1]}
+        print(json.dumps(row), flush=True)
 
 
 def gsplat_frames(g: drgs.Gaussians, camera: drgs.Camera) -> dict:
@@ -187,11 +182,10 @@ def gsplat_frames(g: drgs.Gaussians, camera: drgs.Camera) -> dict:
     Ks = torch.tensor(camera.K, dtype=torch.float32, device="cuda")[None]
     degree = round(g.sh.shape[1] ** 0.5) - 1
 
-    def drawn(
-        means: torch.Tensor, quats: torch.Tensor, scales: torch.Tensor, opacities: torch.Tensor, sh: torch.Tensor
-    ):
+    def drawn(*raw: torch.Tensor) -> torch.Tensor:
+        means, quats, log_scales, logit_opacities, sh = raw
+        activated = (means, quats, log_scales.exp(), logit_opacities.sigmoid(), sh)
         size = {"width": camera.width, "height": camera.height}
-        activated = (means, quats, scales.exp(), opacities.sigmoid(), sh)
         return rasterization(*activated, viewmats, Ks, sh_degree=degree, packed=False, **size)[0]
 
     raw = [x.detach() for x in (g.means, g.quats, g.log_scales, g.logit_opacities, g.sh)]
