@@ -101,6 +101,16 @@ def _flags() -> dict:
 
 
 @pytest.fixture
+def functions_in_float64(monkeypatch):
+    """Rasterizers in torch are compared on the CPU: a card would give them float32, of which fewer central differences
+    converge.
+    """
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+
+
+@pytest.fixture
 def two_threads():
     """Dr.Jit and torch have two threads each during the test."""
     import drjit as dr

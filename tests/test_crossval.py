@@ -29,6 +29,8 @@ from drgs.lab.rasterizers import function
 from drgs.lab.raw import PARAMETERS, depth_of, posed, raw_of, with_pose
 from drgs.testing import assert_matches, random_scene
 
+pytestmark = pytest.mark.usefixtures("functions_in_float64")
+
 BACKGROUND = (0.3, 0.6, 0.2)
 # Documented choices: they are named, and no bug.
 CHOSEN = {
@@ -52,12 +54,6 @@ CONVENTIONS = {
     "sh_direction_reversed": "SH direction",
     "early_stop": "transmittance_min",
 }
-
-
-@pytest.fixture(autouse=True)
-def _functions_in_float64(monkeypatch):
-    """On the CPU: with a card torch functions are given float32 there, and central differences converge less often."""
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
 
 
 def _made(seed):

@@ -21,7 +21,7 @@ from drgs import cli
 from drgs.cameras import Camera, c2w_to_opengl
 from drgs.ellipsoids import Gaussians
 from drgs.files import save_ply
-from drgs.lab import dumps
+from drgs.lab import dumps, rasterizers
 from drgs.lab.crossval import crossval
 from drgs.lab.ladder import ladder
 from drgs.lab.rasterizers import function, load_rasterizer, ours
@@ -29,6 +29,8 @@ from drgs.lab.raw import MOTIONS, PARAMETERS, raw_of
 from drgs.settings import RenderSettings
 from drgs.shutters import SHUTTERS
 from drgs.testing import assert_matches
+
+pytestmark = pytest.mark.usefixtures("functions_in_float64")
 
 BACKGROUND = (0.3, 0.6, 0.2)
 # A rasterizer in plain torch is dense: what boxes of the unscented transform leave out is asked of one that has them.
@@ -50,10 +52,15 @@ CONVENTIONS = {
 }
 
 
-@pytest.fixture(autouse=True)
-def _functions_in_float64(monkeypatch):
-    """On the CPU: with a card torch functions are given float32 there, and central differences converge less often."""
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+def test_gsplat_is_asked_for_three_channels_along_rays():
+    """Its kernels end the process for others; on the image plane it may have any number."""
+    asked = []
+    checked = rasterizers._three_channels_along_rays(lambda **given: asked.append(given["colors"].shape[-1]))
+    checked(colors=torch.zeros(2, 3), with_eval3d=True)
+    checked(colors=torch.zeros(2, 6))
+    with pytest.raises(NotImplementedError, match="along rays its images have 3 channels, not 6"):
+        checked(colors=torch.zeros(2, 6), with_eval3d=True)
+    assert asked == [3, 6]
 
 
 def _made(seed=0, lens="pinhole"):

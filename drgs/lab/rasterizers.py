@@ -127,7 +127,7 @@ def load_rasterizer(
             raise ValueError("--rasterizer gsplat: must be installed, is not; run pip install gsplat") from None
         if not torch.cuda.is_available():
             raise ValueError("--rasterizer gsplat: must have a CUDA card, torch finds none; use a dump made on one")
-        return function(_within_gsplat(rasterization), text, along_rays)
+        return function(_three_channels_along_rays(rasterization), text, along_rays)
     found = imported_function("--rasterizer", text, "drgs:PRESET, gsplat, a file .npz or .safetensors, or ")
     return function(found, text, along_rays)
 
@@ -194,7 +194,7 @@ def function(call: Callable, name: str, along_rays: bool = False) -> Rasterizer:
     return Rasterizer(name, draw, *_taste(draw))
 
 
-def _within_gsplat(rasterization: Callable) -> Callable:
+def _three_channels_along_rays(rasterization: Callable) -> Callable:
     """gsplat's function, without the images that end the process: along rays its kernels assert three channels."""
 
     @functools.wraps(rasterization)

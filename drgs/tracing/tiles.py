@@ -39,8 +39,11 @@ TABLES = 128 << 20
 """Bytes of the rows of pixels that are sorted at a time, and of a table that the adjoint fills in exact order
 (information: twice that, with a semantic channel four times); a single tile's may have more.
 """
-_CARD = 8  # times as many bytes on a card, whose lanes must be many, if
-_FOR_EACH = 10 << 30  # it has so much memory for each: torch takes a tenth of it to sort the hits of a band
+_CARD = 8
+"""On a card bands are up to so many times as wide, because many lanes must run at once: as many times as `_FOR_EACH`
+fits into its memory. To sort the hits of a band torch takes up to a tenth of that.
+"""
+_FOR_EACH = 10 << 30  # bytes
 _CORNERS = {1: [(0, 0)], 2: [(0, 0), (0, 4)], 4: [(0, 0), (4, 0), (0, 4), (4, 4)]}  # of pixels that share a lane
 _NOWHERE = 2**64 - 1
 _HELD = 128 << 20  # bytes of the orders of all pixels, which derivatives need again
