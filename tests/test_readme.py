@@ -27,25 +27,6 @@ def folder(tmp_path_factory):
     return make_folder(tmp_path_factory.mktemp("readme"))
 
 
-def test_first_lines():
-    """A stranger reads one sentence, sees a picture, and then two commands that the Makefile has."""
-    title, sentence, figure = README.split("\n\n")[:3]
-    assert title == "# drgs"
-    assert re.fullmatch(r"[^.]+\.", sentence)
-    picture = ROOT / re.match(r"!\[[^]]+\]\((.+)\)$", figure)[1]
-    assert picture.stat().st_size < 300_000
-    first = re.search(r"```bash\n(.*?)```", README, flags=re.S)
-    assert [line.split()[:2] for line in first[1].splitlines()] == [["make", "demo"], ["make", "test"]]
-    assert README[: first.start()].count("\n") < 15
-    makefile = (ROOT / "Makefile").read_text()
-    assert all(re.search(rf"^{name}:", makefile, flags=re.M) for name in ("demo", "test", "smoke"))
-
-
-def test_it_is_short():
-    """What a visitor reads in a few minutes; the rest is on pages."""
-    assert len(README.split()) <= 1200
-
-
 def test_every_command_is_shown():
     """The list of commands is complete."""
     assert {command[0] for command in _commands()} == set(cli._OPTIONS)
@@ -94,19 +75,6 @@ def test_python_runs(tmp_path):
         _, error = process.communicate(timeout=300)
         assert process.returncode == 0, error
         assert not any(place.iterdir())
-
-
-def test_terms_are_explained():
-    """Words of the field are explained where they come first."""
-    text = " ".join(_COMMANDS.read_text(encoding="utf-8").split())
-    for term, explanation in {
-        "FLIP": "FLIP (what an eye sees when it flips between two images",
-        "Fisher information": "**Fisher information** about a parameter is the sum over the pixels",
-        "`logdet`": "`logdet` sums log(1 + that ratio)",
-        "`eig`": "`eig`, FisherRF's criterion, sums over the parameters the candidate's information divided by that of",
-        "teacher": "A **teacher** is a network, such as LSeg, whose feature maps describe each pixel",
-    }.items():
-        assert explanation in text, term
 
 
 def test_presets_and_settings_exist():
