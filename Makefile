@@ -1,6 +1,8 @@
 # make demo      environment, then a still life made, fitted, rendered and compared: pictures in out/demo
-# make test      environment, then the tests
+# make test      environment, then the tests; with PYTEST_FLAGS="-q -n 2 --dist loadfile --slow" each of their cases
+# make check     before a commit: form, types, and the tests that a change of the core needs; two minutes on two cores
 # make numerics  the tests of images, gradients, information and extremes once more, compiled for other processors
+# make smoke     each command of docs/commands.md once, on scenes that are made in seconds
 # make browser   Chromium by apt, for tests of the report and the viewer that are skipped without one
 # make cuda-check  on a machine with an NVIDIA card: suite, stress, gsplat, times, in one file to send back
 # make docs      environment, then the documentation as a site: out/site/index.html
@@ -19,15 +21,25 @@ TARGETS ?= $(shell grep -qsw fma /proc/cpuinfo && echo x86-64-v2/4/+fma; grep -q
 NUMERICS := integrator extremes order tiles lenses shutter unscented features fisher gain backdrop mitsuba_preset
 VENV := .venv
 BIN := $(VENV)/bin
+BASE := $(VENV)/.drgs-base
 STAMP := $(VENV)/.drgs-installed
 
-.PHONY: setup demo test numerics cuda-check browser smoke docs lint llvm clean
+.PHONY: setup demo check test numerics cuda-check browser smoke docs lint llvm clean
 .DEFAULT_GOAL := setup
 
 setup: $(STAMP) llvm
 
-demo: setup
+# Packages of the tests, the pages and the teachers are not needed here: half of what `make setup` installs.
+demo: $(BASE) llvm
 	$(BIN)/drgs demo -o out/demo
+
+# mypy runs beside the tests, which wait for compilers and processes now and then.
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	@$(BIN)/mypy & types=$$!; \
+	$(BIN)/python -m pytest $(PYTEST_FLAGS) -m core; tests=$$?; \
+	wait $$types && exit $$tests
 
 test: setup
 	$(BIN)/python -m pytest $(PYTEST_FLAGS)
@@ -98,15 +110,19 @@ lint: setup
 clean:
 	rm -rf $(VENV) .pytest_cache .ruff_cache .mypy_cache *.egg-info
 
-$(STAMP): pyproject.toml constraints.txt
+$(BASE): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	  echo "make: Python >= 3.11 is needed, $(PYTHON) is $$($(PYTHON) --version 2>&1); use make PYTHON=..." >&2; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install $(PIP_FLAGS) -c constraints.txt -e '.[report]'
+	touch $@
+
+$(STAMP): $(BASE)
 	$(BIN)/python -m pip install $(PIP_FLAGS) -c constraints.txt -e '.[dev]'
 	touch $@
 
 # Not a stamp: a library can go away, and looking takes a few hundredths of a second. A CUDA card needs no libLLVM.
-llvm: $(STAMP)
+llvm: $(BASE)
 	@$(BIN)/python -c 'from drgs.libllvm import require_llvm; require_llvm()' 2>/dev/null \
 	  || ldconfig -p 2>/dev/null | grep -q libcuda.so.1 \
 	  || $(MAKE) --no-print-directory install-llvm

@@ -6,6 +6,7 @@ tests the CPU unless asked otherwise). Nothing heavy is imported until a test do
 
 from __future__ import annotations
 
+import gc
 import os
 import random
 import signal
@@ -30,6 +31,18 @@ ROOT = Path(__file__).resolve().parent.parent
 def pytest_addoption(parser):
     """`--slow` runs the tests marked slow as well."""
     parser.addoption("--slow", action="store_true", help="run tests marked slow")
+
+
+def pytest_collection_modifyitems(items):
+    """Cases of a test that is marked `every(n)` are slow but for each n-th, counted from the first."""
+    counts: dict[str, int] = {}
+    for item in items:
+        marker = item.get_closest_marker("every")
+        if marker:
+            name = item.nodeid.partition("[")[0]
+            count = counts[name] = counts.get(name, -1) + 1
+            if count % marker.args[0]:
+                item.add_marker("slow")
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -80,6 +93,15 @@ def _isolated(request):
         torch.set_grad_enabled(True)
         torch.set_default_dtype(torch.float32)
         torch.use_deterministic_algorithms(False)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _memory_is_given_back():
+    """Dr.Jit keeps freed arrays for arrays of the same size: over all files of tests that is 4 GB a process."""
+    yield
+    if "drjit" in sys.modules:
+        gc.collect()
+        sys.modules["drjit"].flush_malloc_cache()
 
 
 @pytest.fixture(autouse=True)

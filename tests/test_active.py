@@ -544,6 +544,7 @@ def without_times(path: Path) -> dict:
     return record
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("policy", ["fisher", "random"])
 @pytest.mark.parametrize("moment", ["between picks", "between choosing and saving"])
 @pytest.mark.same_bits

@@ -131,6 +131,7 @@ def test_a_schedule_follows_from_what_is_fitted(swing):
     ]
 
 
+@pytest.mark.slow
 def test_one_camera_at_each_later_time(swing, tmp_path, opened):  # noqa: F811
     """All cameras at the first time, then one at each later time, in order; an image is opened once it is picked, and
     no other image of a training camera ever. What the fit found out by itself may be stated on resuming, not changed.
@@ -157,6 +158,7 @@ def test_one_camera_at_each_later_time(swing, tmp_path, opened):  # noqa: F811
         fit(lazily(swing), tmp_path / "run", config(selection=plan(add=2)), resume=True, progress=False)
 
 
+@pytest.mark.slow
 def test_pairs_are_picked_freely(swing, tmp_path):
     """Any camera at any later time, as many as the budget says; by default one for each later time. The command passes
     its options on.
@@ -221,6 +223,7 @@ def test_the_first_pick_knows_of_the_field(swing, tmp_path):
 # ---- resuming
 
 
+@pytest.mark.slow
 @pytest.mark.same_bits
 def test_killed_fits_pick_the_same(swing, tmp_path, monkeypatch):
     """With `deterministic`, a fit killed in the static stage and between two picks ends in the same picks and bits."""

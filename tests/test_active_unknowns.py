@@ -263,6 +263,7 @@ def events(run: Path, kind: str) -> list[dict]:
     return [event for event in Run(run).events() if event["event"] == kind]
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("use", ["points", "learned", "auto"])
 def test_joining_photographs_get_their_gains(uneven, tmp_path, use):
     """From points that they share with those that are in; config.json and the log say so, of those that are in; each
@@ -373,6 +374,7 @@ def same_run(a, b):
     assert said[0] == said[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moment", ["between picks", "between choosing and saving"])
 @pytest.mark.same_bits
 def test_a_killed_fit_goes_on_with_gains_and_poses(uneven, tmp_path, moment):

@@ -8,6 +8,10 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.core
+
 PACKAGE = Path(__file__).parents[1] / "drgs"
 
 # From the ground up. A module belongs to the longest name that is listed; it may import what stands on its own floor

@@ -14,6 +14,8 @@ from drgs.cameras import intrinsics, look_at
 from drgs.gain import information_gain
 from drgs.select import select
 
+pytestmark = pytest.mark.core
+
 CAM = drgs.Camera(K=intrinsics(9, 9, 4, 3), w2c=look_at((0, 0, -3), (0, 0, 0), (0, -1, 0)), width=8, height=6)
 EXACT = drgs.RenderSettings.preset("exact")
 

@@ -37,6 +37,8 @@ from drgs.files import Run
 from drgs.lab.dumps import read_dump
 from drgs.metrics import _read_weights
 
+pytestmark = pytest.mark.core
+
 
 @pytest.fixture
 def little_room():

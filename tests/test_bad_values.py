@@ -21,6 +21,8 @@ from drgs.display import pictures
 from drgs.settings import RenderSettings
 from drgs.train import FitConfig
 
+pytestmark = pytest.mark.core
+
 
 @pytest.mark.parametrize(
     ("field", "value", "told"),

@@ -23,6 +23,8 @@ from drgs.information.seen_view import SeenView
 from drgs.select import Cache, Scoring, select
 from drgs.settings import RenderSettings
 
+pytestmark = pytest.mark.core
+
 FAST = RenderSettings.preset("fast")
 
 

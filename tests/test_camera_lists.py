@@ -48,6 +48,7 @@ def test_what_was_picked_is_rendered(place, monkeypatch):
         assert [camera.name for camera in load_cameras_json(place / again)] == names
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize(
     ("line", "file", "count"),
     [

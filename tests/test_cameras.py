@@ -24,6 +24,8 @@ from drgs.cameras import (
 )
 from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 
+pytestmark = pytest.mark.core
+
 POSE = look_at((1.0, 2.0, 3.0), (0.2, -0.1, 0.3))
 OPENCV = (-0.2, 0.05, 1e-3, -2e-3, 0.01)
 FISHEYE = (-0.02, 0.005, 1e-3, -2e-4)

@@ -257,6 +257,7 @@ def test_further_photographs_end_with_the_same_bits(joined, captured, tmp_path):
     assert all(torch.equal(x, wanted[name]) for name, x in found.items())
 
 
+@pytest.mark.slow
 def test_many_that_join_are_fitted_anew(captured, photographs, tmp_path, monkeypatch, capsys):
     """With all steps, from points, and a line says so; the checkpoint of before does not stay behind."""
     monkeypatch.setattr(capture, "_ANEW", 0.3)

@@ -96,6 +96,7 @@ def test_version(capsys):
     assert "drgs --version" in capsys.readouterr().out
 
 
+@pytest.mark.core
 @pytest.mark.parametrize(
     ("line", "expected"),
     [

@@ -354,6 +354,7 @@ def scheduler():
     made.close(timeout=10)
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("what", ["code", "threads", "tasks"])
 def test_workers_of_another_kind_are_refused(scheduler, tmp_path, what):
     """Real ones, started by hand: of a copy of the package with one line changed, with two Dr.Jit threads, or with two
@@ -458,6 +459,7 @@ def test_without_dask(tmp_path, command):
 _STARTS = "    with opened(workers=1) as c:\n        print('started', flush=True)\n"
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize(
     ("what", "told"),
     [
@@ -545,6 +547,7 @@ def study_of(folder: Path, **fields) -> Study:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.same_bits
 def test_a_killed_worker_costs_the_steps_since_its_checkpoint(cluster, still_folder, tmp_path):
     """Three cells on two workers, one of which is killed once it has written a checkpoint: all rows come, the cell goes
@@ -643,6 +646,7 @@ def _sees_nothing(token: str) -> bool:
 # ---- the end
 
 
+@pytest.mark.slow
 def test_workers_end_with_their_client():
     """However it ends: by itself, by Ctrl-C in the middle of a task, or killed. Dask says nothing of its own."""
     script = (

@@ -21,6 +21,8 @@ from drgs.codecs.bounded import pixels_of_webp
 from drgs.codecs.values import flipped, logits_of_bytes, logits_of_opacities
 from drgs.oracle import sh_basis
 
+pytestmark = pytest.mark.core
+
 # What a quaternion's components may be off by: half a step of the format, and what that does to the one that is left
 # out.
 _QUATS = {

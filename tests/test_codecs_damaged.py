@@ -20,6 +20,8 @@ from splat_samples import NAMES, glb_document, sog_scene, write_sample
 
 from drgs.codecs import gltf, ksplat, load_gaussians, packed_ply, sog, splat, spz  # noqa: F401
 
+pytestmark = pytest.mark.core
+
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"0" * 64 + b"\nsize 123456\n"
 
 

@@ -18,6 +18,8 @@ from drgs.cameras import orbit
 from drgs.codecs import load_gaussians, save_gaussians, sog
 from drgs.codecs.clustering import codebook, morton_order, palette
 
+pytestmark = pytest.mark.core
+
 SUFFIXES = ("sog", "splat", "compressed.ply")
 # What a quaternion's angle may be off by, in degrees: components have steps of sqrt(2) / 255, 1 / 128, sqrt(2) / 1023.
 _ANGLES = {"sog": 0.6, "splat": 0.8, "compressed.ply": 0.2}

@@ -214,6 +214,7 @@ def test_only_a_person_names_functions_of_others(files):
     assert again == FitConfig.of(policy="mine:policy", add=2)
 
 
+@pytest.mark.slow
 def test_select_and_reproduce_take_the_same_file(files, tmp_path):
     """`select` the settings and what scores views; `reproduce` all, over the fits of its scale."""
     from drgs.studies.plan import plan_of

@@ -38,6 +38,7 @@ def covariances_of(given, shape=None):
     return axes @ axes.mT
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize("path", PATHS)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_gradients_of_covariances(shape, path):

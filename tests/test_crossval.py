@@ -111,6 +111,7 @@ def _check(name, g, cameras, background, preset):
         assert all(row["verdict"] == "agreement" for row in report["groups"].values()), text
 
 
+@pytest.mark.every(5)
 @pytest.mark.parametrize(
     ("name", "seed"),
     [
@@ -124,6 +125,7 @@ def test_every_defect_is_named(name, seed):
     _check(name, *_made(seed), "gsplat")
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("preset", ["gsplat", "auto"])
 @pytest.mark.parametrize("seed", range(4))
 def test_no_false_alarm(seed, preset):
@@ -138,6 +140,7 @@ def test_no_false_alarm(seed, preset):
     assert result.report["image"]["after"] < 1e-5
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("name", ["early_stop", "quaternion_order", "opacity_detached", "pixel_center"])
 def test_preset_is_found_beside_a_defect(name):
     """What a rasterizer claims to be need not be said."""
@@ -148,6 +151,7 @@ def test_preset_is_found_beside_a_defect(name):
     assert (result.verdict == "gradient bug") == (name == "opacity_detached")
 
 
+@pytest.mark.every(7)
 @pytest.mark.real_data
 @pytest.mark.parametrize("name", ["correct", *DEFECTS])
 def test_a_real_scene(data_dir, name):
@@ -314,6 +318,7 @@ def test_entries_that_jump_are_left_out():
     assert not own.kept.all()
 
 
+@pytest.mark.slow
 def test_a_model_beside_another():
     """A rasterizer that is far from what it claims is another model, or undecided; no bug is made up."""
     g, cameras = random_scene(0, count=40, width=32, height=24)
@@ -331,6 +336,7 @@ def test_cameras_that_show_nothing():
         crossval(function(torch_rasterizer.rasterization, "correct"), g, [away], "gsplat")
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("preset", ["exact", "fast", "inria", "gsplat", "3dgut"])
 def test_our_own_presets_agree_with_the_oracle(preset):
     """`drgs:PRESET` is held against float64."""
@@ -341,6 +347,7 @@ def test_our_own_presets_agree_with_the_oracle(preset):
     assert result.report["preset"] == preset
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("contrast", [0.05, 0.0])
 def test_near_ties_are_no_difference(contrast, monkeypatch):
     """Where depths tie within float32 either order is right: it is no convention, and no other model.
@@ -402,6 +409,7 @@ def test_crops_show_something():
     assert "a crop of 32x32 pixels of 2 views (1 more show nothing) of 160x128, at (" in text
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(
     "fields",
     [{"response": "integral"}, {"order": "center", "extent": 3.0}, {"traversal": "bvh", "sh_direction": "ray"}],

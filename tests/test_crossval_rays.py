@@ -107,6 +107,7 @@ def _checked(name, result):
         assert found == {*defect.groups, *(["colors"] if "sh" in defect.groups else [])}, text
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("lens", LENSES)
 def test_a_right_one_agrees(lens, seed):
@@ -129,6 +130,7 @@ def test_it_is_recognized(lens):
     assert result.report["preset"] == "3dgut"
 
 
+@pytest.mark.every(6)
 @pytest.mark.parametrize(
     ("name", "lens"),
     [(name, "pinhole") for name, d in DEFECTS.items() if d.kind in ("gradient", "convention")]
@@ -141,6 +143,7 @@ def test_every_defect_is_named(name, lens):
     _checked(name, crossval(function(torch_rays.broken(name, RIGHT), name), g, [camera], "3dgut", FIELDS))
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(
     ("name", "shutter", "lens"),
     [
@@ -232,6 +235,7 @@ def test_projected_instead_of_along_rays():
     assert result.verdict == "other convention"
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("lens", LENSES)
 def test_our_own_preset(lens):
     """`drgs:3dgut` is held against the oracle through lenses, too, boxes included."""
@@ -241,6 +245,7 @@ def test_our_own_preset(lens):
     assert (result.report["preset"], result.report["reference"]) == ("3dgut", "float64 oracle")
 
 
+@pytest.mark.slow
 def test_assert_matches_along_rays():
     """The helper for other people's tests takes scenes with a lens."""
     g, camera = _made(1, "fisheye")

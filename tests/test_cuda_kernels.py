@@ -29,6 +29,7 @@ def compiled(tmp_path: Path, names: list[str]) -> tuple[dict, list[dict]]:
     return cases, kernels.rows(tmp_path, cases, ("sm_90",))
 
 
+@pytest.mark.slow
 @NEEDED
 def test_kernels_compile_and_spill_nothing(tmp_path):
     """Forward, backward and three tangents of a frame, from the projection to the walk along lists."""
@@ -102,6 +103,7 @@ def test_tensors_of_both_sides_are_refused():
     assert torch.equal(x.grad, torch.full((3,), 2.0))
 
 
+@pytest.mark.slow
 def test_answers_are_given_in_the_order_of_the_questions():
     """Another question than LLVM has answered is an error that names both.
 
@@ -140,6 +142,7 @@ else:
 """
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("preset", ["fast", "exact"])
 @pytest.mark.parametrize("share", [1, 2])
 def test_pixels_a_lane_tell_the_same(monkeypatch, preset, share):

@@ -12,6 +12,8 @@ import pytest
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, look_at
 from drgs.data import Dataset, View, load, scene_extent
 
+pytestmark = pytest.mark.core
+
 cv2 = pytest.importorskip("cv2")
 WIDTH, HEIGHT = 24, 16
 K = intrinsics(20, 22, 11.0, 8.5)

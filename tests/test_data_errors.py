@@ -23,6 +23,8 @@ from test_data import (
 
 from drgs.data import load
 
+pytestmark = pytest.mark.core
+
 
 def one_line(error) -> None:
     """An error must be one line."""

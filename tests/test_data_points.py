@@ -156,6 +156,7 @@ def test_triangulates_views_far_apart(tmp_path, rng):
     assert len(initial_points(views, max_points=100)[0]) == 100
 
 
+@pytest.mark.slow
 def test_one_view_more_costs_its_own_pairs(tmp_path, rng):
     """What was found in earlier views is kept: the same points as from all at once, and only those that the last view
     shows; random ones after them.
@@ -178,6 +179,7 @@ def test_one_view_more_costs_its_own_pairs(tmp_path, rng):
     assert np.median(np.abs(views[3].image()[rows, columns] - colors[:found])) < 0.1
 
 
+@pytest.mark.slow
 def test_points_do_not_depend_on_how_many_views_came_at_once(tmp_path, rng, monkeypatch):
     """Where cameras are matched with the nearest ones only, those that were nearest before others came do not count:
     a fit that was killed and resumed, which matches all views at once, has the points of one that was not.

@@ -75,6 +75,7 @@ def test_text(result):
     assert str(out / "demo.json") in text
 
 
+@pytest.mark.slow
 def test_again(result, monkeypatch, capsys):
     """A second demo in the same folder keeps the still life and replaces the run."""
     out, _, _ = result

@@ -99,6 +99,7 @@ def test_a_second_derivative_raises_by_the_pose_and_the_cotangent():
             torch.autograd.grad(slope.sum(), x, retain_graph=True)
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("door", DOORS)
 def test_transforms_of_transforms_raise(door):
     """`torch.func.grad` of `grad` was 0; forward over reverse and reverse over forward had no derivative at all."""
@@ -177,6 +178,7 @@ def test_meta_tensors_are_refused(call, told):
     _one_line(error)
 
 
+@pytest.mark.every(3)
 @pytest.mark.filterwarnings("ignore::UserWarning:torch")
 @pytest.mark.parametrize("door", ["rgb", "rays", "rasterization"])
 def test_compiled_code_calls_them_as_they_are(door):

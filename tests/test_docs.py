@@ -36,6 +36,7 @@ def made(tmp_path_factory):
     return make_folder(tmp_path_factory.mktemp("docs"))
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(
     "page", [pytest.param(page, id=_name(page)) for page in PAGES if page not in _ELSEWHERE and blocks(page)]
 )

@@ -15,6 +15,8 @@ from drgs.ellipsoids import Gaussians
 from drgs.information.drift import DriftCache, Shapes, Unanswered
 from drgs.information.pool import ViewQuestion
 
+pytestmark = pytest.mark.core
+
 
 def scene(n=12, K=4, seed=0) -> Gaussians:
     return gaussians(np.random.default_rng(seed), n, K, scale=0.2).detach()

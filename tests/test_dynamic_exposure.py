@@ -89,6 +89,7 @@ def test_each_frame_has_its_own_gain(dataset, tmp_path):
     assert np.abs(tensors["exposure.parameter.log_gains"].numpy() - truth(names)).max() < 0.03
 
 
+@pytest.mark.slow
 def test_photographs_fit_better_with_gains(dataset, tmp_path):
     """The loss of the photographs falls further: their own gains are what no field can explain."""
     last = []
@@ -99,6 +100,7 @@ def test_photographs_fit_better_with_gains(dataset, tmp_path):
     assert last[1] > last[0] + 0.5
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("at", [3, 9], ids=["static", "dynamic"])
 @pytest.mark.same_bits
 def test_learned_gains_go_on_in_either_stage(dataset, whole_and_resumed, at):
@@ -113,6 +115,7 @@ def test_learned_gains_go_on_in_either_stage(dataset, whole_and_resumed, at):
     assert runs[0].config()["exposure"] == runs[1].config()["exposure"]
 
 
+@pytest.mark.slow
 def test_frames_that_join_get_their_gains(dataset, tmp_path):
     """An active fit at later times: a frame that is picked has its gain beside the others', and exposure is eliminated
     from what all of them tell about the field; killed and resumed it ends in the same bits.

@@ -95,6 +95,7 @@ def config(**fields) -> FitConfig:
     return FitConfig.of(**{**short, **rates, **fields})
 
 
+@pytest.mark.slow
 def test_two_cameras_are_told_of_before_the_first_step(dataset, tmp_path, caplog, monkeypatch):
     """As too few for what moves, of the training views alone; four are not."""
     told, step = [], Trainer.step
@@ -144,6 +145,7 @@ class Killed(BaseException):
     """What ends a process without a word, as far as the loop of a fit can see."""
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("at", [3, 9], ids=["static", "dynamic"])
 @pytest.mark.same_bits
 def test_killed_in_either_stage(dataset, tmp_path, monkeypatch, at):
@@ -470,6 +472,7 @@ def test_eval_shows_what_moves(dataset, run, tmp_path, monkeypatch, capsys):
     assert f"5 of {len(scene)} Gaussians move" in said
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("way", [0.0, 0.7], ids=["still", "moving"])
 def test_who_moves_is_learned(tmp_path, way):
     """Where nothing moves almost no gate stays open (of 16; measured: 0). Where three in front go by some times their

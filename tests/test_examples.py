@@ -406,6 +406,7 @@ def test_a_fit_with_their_selector(tmp_path):
     assert len(chosen["picks"]) == 2
 
 
+@pytest.mark.slow
 def test_a_flight(tmp_path):
     """By plan, with costs, and along the trajectory: each photograph is taken once, and the model gets better."""
     folder = tmp_path / "still"

@@ -94,6 +94,7 @@ def test_a_policy_and_a_criterion_by_name(site, folder):
     assert scores[0] > 0
 
 
+@pytest.mark.slow
 def test_a_data_set_and_a_response_by_name(site, folder):
     """`drgs fit` of a folder in the new format, and `drgs render --set response=narrow` of what it made."""
     done(site, folder, "fit", "lines", "-o", "runs/lines", "--max-steps", "6", "--max-gaussians", "200", "--quiet")
@@ -109,6 +110,7 @@ def test_a_data_set_and_a_response_by_name(site, folder):
     assert narrow.mean() < peak.mean()  # thinner Gaussians before black
 
 
+@pytest.mark.slow
 def test_a_codec_by_name(site, folder):
     """`drgs convert` writes the new format, and reads it by its mark."""
     done(site, folder, "convert", "point_cloud.ply", "out/cloud.rows", "--quiet")
@@ -116,6 +118,7 @@ def test_a_codec_by_name(site, folder):
     assert len(drgs.load_ply(folder / "out/again.ply")) == len(drgs.load_ply(folder / "point_cloud.ply"))
 
 
+@pytest.mark.slow
 def test_without_the_package_the_names_are_refused(folder):
     """It is the installed package that adds them: without it each command says in one line what there is."""
     for words, told in (

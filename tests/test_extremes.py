@@ -43,11 +43,19 @@ def _check(row):
     assert row.fisher is None or row.fisher <= 1e-4, row
 
 
-@pytest.mark.parametrize(
-    ("name", "traversal"),
-    [(case.name, traversal) for case in CASES for traversal in case.traversals],
-    ids=lambda text: text.replace("`", ""),
-)
+def _rows():
+    """Every case of the default model on tiles; of the other models and of bvh each fourth, the rest are slow."""
+    others = 0
+    for case in CASES:
+        for traversal in case.traversals:
+            is_repeated = False
+            if traversal == "bvh" or case.settings.response != "peak":
+                is_repeated = others % 4 > 0
+                others += 1
+            yield pytest.param(case.name, traversal, marks=[pytest.mark.slow] if is_repeated else [])
+
+
+@pytest.mark.parametrize(("name", "traversal"), list(_rows()), ids=lambda text: text.replace("`", ""))
 def test_extremes(name, traversal):
     """Image within 1e-5, derivatives and information within 1e-4 of the oracle, in the worst places too.
 
@@ -67,6 +75,7 @@ def test_extremes(name, traversal):
         assert truth.oracle.out.count.max() > 0
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("case", REFUSALS, ids=lambda c: c.name)
 def test_refusals(case):
     """What cannot be rendered is told in one line."""
@@ -74,6 +83,7 @@ def test_refusals(case):
     assert row.verdict == "warns", row
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("response", ["peak", "integral", "ewa"])
 @pytest.mark.parametrize("traversal", ["tiles", "bvh"])
 def test_opacity_of_one_half_is_no_kink(response, traversal):
@@ -94,6 +104,7 @@ def test_opacity_of_one_half_is_no_kink(response, traversal):
     assert all(math.isclose(a, b, rel_tol=1e-5) for a, b in zip(*slopes, strict=True)), slopes
 
 
+@pytest.mark.every(3)
 @pytest.mark.filterwarnings("ignore:render:UserWarning")
 @pytest.mark.parametrize("name", CROWDS)
 def test_bvh_finds_the_hits(rng, name):

@@ -103,6 +103,7 @@ def settings_of(width):
     return Preset(fields.pop("preset"), **fields)
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("width", WIDTHS)
 def test_any_width(rng, width):
     """Images, all gradients and forward mode against the oracle."""
@@ -132,6 +133,7 @@ def everything(g, cam, settings, **options):
     }
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("width", [128, 1])
 def test_blocks_of_weights(rng, width, monkeypatch):
     """Weights that are held for a few tiles at a time give the same, and are never more than the bound."""

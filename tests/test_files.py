@@ -15,6 +15,8 @@ from drgs import files
 from drgs.ellipsoids import Gaussians
 from drgs.files import Run, load_ply, load_state, save_ply, save_state
 
+pytestmark = pytest.mark.core
+
 INRIA_HEADER = (
     "ply\nformat binary_little_endian 1.0\nelement vertex {n}\n"
     + "".join(

@@ -38,6 +38,8 @@ def _settings(response, order, traversal):
     return Preset("exact", response=response, order=order, traversal=traversal, dilation=dilation)
 
 
+@pytest.mark.core
+@pytest.mark.every(5)
 @pytest.mark.parametrize(("response", "order", "traversal", "K"), KINDS)
 @pytest.mark.parametrize("seed", range(3))
 def test_diagonal_and_blocks(response, order, traversal, K, seed):
@@ -101,6 +103,7 @@ def _one(K=4, seed=5, direction="gaussian", **options):
     return g, cam, settings, dense.jacobian(g, out), out
 
 
+@pytest.mark.core
 def test_columns_equal_exact():
     """Forward mode, a column for every parameter, says the same."""
     g, cam, settings, _, _ = _one()
@@ -194,6 +197,7 @@ def test_fisherrf_loses_what_cancels_between_channels():
         assert float(theirs[name].max()) < 1e-6 * float(true[name].max())
 
 
+@pytest.mark.core
 def test_views_add_up_and_groups_can_be_chosen():
     """A list of cameras is their sum; a part of the groups is that part."""
     g, cam, settings, _, _ = _one()
@@ -269,6 +273,7 @@ def test_channel_weights():
         assert error(found[name], want) <= 1e-4, name
 
 
+@pytest.mark.every(5)
 @pytest.mark.parametrize("preset", ["fast", "inria", "gsplat", "3dgut", "mitsuba"])
 def test_presets(preset):
     """With every system's cut-offs the information is that of its columns."""
@@ -279,6 +284,7 @@ def test_presets(preset):
         assert error(columns[name], exact[name]) <= 1e-4, name
 
 
+@pytest.mark.every(5)
 @pytest.mark.parametrize("case", CASES, ids=lambda c: c.name.replace("`", ""))
 def test_extremes(case):
     """Finite where the renderer is, and the squares of the columns: of three random parameters of every group."""

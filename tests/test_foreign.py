@@ -17,6 +17,8 @@ from drgs.data.camera_lists import load_cameras_json
 from drgs.data.checks import read_image
 from drgs.files import load_ply, load_state
 
+pytestmark = pytest.mark.core
+
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"0" * 64 + b"\nsize 123456\n"
 CONVERT = r"convert it with `drgs convert .*scene.* .*\.ply`, or read it with drgs.load_gaussians"
 META = b'{"version":2,"count":3,"means":{"mins":[0,0,0],"files":["means_l.webp","means_u.webp"]}}'

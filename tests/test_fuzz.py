@@ -50,6 +50,7 @@ def hold(bench: Bench, examples: int) -> None:
     check()
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("name", [name for name in TARGETS if name != "run folders"])
 def test_a_reader_under_damage(bench, name, caplog):
     """Every reader, on files that are damaged by bytes and by what their format is made of."""

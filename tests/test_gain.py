@@ -26,6 +26,8 @@ from drgs.gain import (
 )
 from drgs.settings import RenderSettings
 
+pytestmark = pytest.mark.core
+
 DIAGONAL = tuple(name for name in CRITERIA if name != "block_logdet")
 
 

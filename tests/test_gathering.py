@@ -133,6 +133,7 @@ def test_too_few_frames_for_the_videos(shoot, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_poses_of_a_video_and_photographs(walk, tmp_path, capsys):
     """One command for both: all have a pose, the video has a camera of its own, and frames.json the times."""
     path = film(tmp_path / "clip.mp4", walk)

@@ -143,6 +143,7 @@ def test_named_when_missing(tmp_path, gradient, monkeypatch, capsys):
     assert not (tmp_path / "scene").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("suffix", "masked"), [("heic", False), ("avif", True), ("webp", False)])
 def test_structure_from_motion(corner, tmp_path, suffix, masked):  # noqa: F811
     """Poses from photographs of a phone, two of them JPEGs, with the focal length that EXIF states; then a fit's data.

@@ -31,6 +31,7 @@ def soft(rng, cam):
     return drawn.clamp(0, 1)
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("kind", KINDS)
 def test_rows_are_multiplied(kind, rng):
     """The oracle's Jacobian with each row times its pixel's mask: diagonal, blocks, columns."""

@@ -72,7 +72,7 @@ KINDS = {
         ((9, 7), 15, 16, 0, {**CUTS, "fov_clamp": "gsplat", "depth_key": "z", "stop": "before_eq", "max_hits": 3}),
     ),
 }
-SCENES = 15  # of each kind: 7 x 2 x 15 = 210
+SCENES = 5  # of each kind and part: 7 x 2 x 3 x 5 = 210
 
 
 def traversals(response, order):
@@ -101,9 +101,12 @@ def check(errors, image=IMAGE, gradient=GRADIENT):
 # ------------------------------------------------------------------------------------ random scenes
 
 
+@pytest.mark.core
+@pytest.mark.every(3)
+@pytest.mark.parametrize("part", range(3))
 @pytest.mark.parametrize("kind", [0, 1])
 @pytest.mark.parametrize(("response", "order"), KINDS)
-def test_random_scenes(rng, response, order, kind):
+def test_random_scenes(rng, response, order, kind, part):
     """Images, adjoint and forward mode on both traversals, which also equal each other."""
     kind = KINDS[response, order][kind]
     base = RenderSettings(response=response, order=order, traversal="bvh" if order == "entry" else "tiles")
@@ -238,6 +241,7 @@ def _rasterizer_scene(rng, size):
     return g, cam
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("preset", ["inria", "gsplat"])
 def test_presets_equal_the_rasterizers(rng, preset):
     """Images to 1e-5 of an oracle written from those systems' formulas, gradients to 1e-4 of ours."""
@@ -284,6 +288,7 @@ def test_gsplat_image(data_dir):
 # ------------------------------------------------------------------------- finite differences
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("response", ["peak", "integral", "ewa"])
 def test_finite_differences(response):
     """Central differences of the renderer itself converge to its derivatives with slope 2, group by group."""
@@ -461,6 +466,7 @@ def test_skew(rng):
     _equal(tiles, world, torch.ones(11, 16, dtype=bool), 2e-5)
 
 
+@pytest.mark.core
 def test_outputs_asked_for(rng):
     """Outputs that are not asked for are absent, and do not change the others."""
     cam, g = camera(rng, (9, 7)), gaussians(rng, 12, 1, 0)
@@ -471,6 +477,7 @@ def test_outputs_asked_for(rng):
         render(g, cam, outputs=("normals",))
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("fields", [{}, {"traversal": "bvh", "order": "center"}])
 def test_list_of_cameras(rng, fields):
     """A list is its views with a leading axis: bit for bit in images, to rounding in what threads add up.
@@ -498,6 +505,7 @@ def test_list_of_cameras(rng, fields):
 # ------------------------------------------------------------------------------------- bad input
 
 
+@pytest.mark.core
 @pytest.mark.parametrize(
     ("fields", "alternative"),
     [
@@ -515,6 +523,7 @@ def test_illegal_combinations(fields, alternative):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("name", ["means", "quats", "log_scales", "logit_opacities", "sh", "features"])
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_parameters_that_are_not_finite(rng, name, value):
@@ -544,6 +553,7 @@ def test_zero_quaternion(rng):
         render(g, cam)
 
 
+@pytest.mark.core
 @pytest.mark.parametrize(("response", "order"), KINDS)
 def test_no_gaussian(rng, response, order):
     """Nothing renders as background, and is differentiable."""
@@ -581,6 +591,7 @@ def test_rays_that_cannot_be_traced(rng, origins, directions, options, message):
         render_rays(gaussians(rng, 3, 1), torch.tensor(origins), torch.tensor(directions), settings)
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("traversal", ["tiles", "bvh"])
 def test_float64_parameters_have_gradients(rng, traversal):
     """Parameters in float64 get the gradients of the same ones in float32, the SH among them."""

@@ -50,6 +50,7 @@ def bent_views(place):
     return {view.name: view for view in drgs.data.load(place / "data").views}
 
 
+@pytest.mark.slow
 def test_pictures_of_a_run(place, tmp_path, capsys):
     """Its views are drawn as they were taken, unless undistorted ones are asked for; presets of a plane are refused."""
     command = ["render", str(place / "run"), "--cameras", str(place / "run"), "--format", "png,exr", "--limit", "2"]
@@ -96,6 +97,7 @@ def test_a_list_of_cameras_with_lenses(place, tmp_path):
     assert not np.array_equal(a, c)
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("candidates", ["data", "orbit", "dome"])
 def test_selection(place, monkeypatch, capsys, candidates):
     """Candidates and known views have the lens, those that are made, too; asked for, none has."""

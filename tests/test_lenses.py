@@ -61,6 +61,7 @@ def quietly(function, *args, **options):
         return function(*args, **options)
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize("near", [False, True])
 @pytest.mark.parametrize("response", ["peak", "integral"])
 @pytest.mark.parametrize("name", LENSES)
@@ -89,6 +90,7 @@ def _everywhere(self, guides):
     return [x * 0 + sign * 1e9 for sign, x in zip((-1, -1, 1, 1), guides, strict=True)]
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize("anisotropy", [0.5, 2.5])
 @pytest.mark.parametrize("name", LENSES)
 def test_what_bounds_leave_out_changes_nothing(rng, monkeypatch, name, anisotropy):
@@ -136,6 +138,7 @@ KINDS = [
 ]
 
 
+@pytest.mark.every(5)
 @pytest.mark.parametrize(("name", "fields"), KINDS, ids=lambda f: f if isinstance(f, str) else "-".join(map(str, f)))
 def test_images_and_derivatives(rng, name, fields):
     """Images, adjoint and forward mode, the pose's among them, within the tolerances of pinholes."""
@@ -163,6 +166,7 @@ INFORMED = [
 ]
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize(("name", "response", "order"), INFORMED)
 def test_information(rng, name, response, order):
     """Fisher diagonal, blocks, columns and the pose's information equal those of the oracle's dense Jacobian."""
@@ -209,6 +213,7 @@ MOVED = [
 LENSES["pinhole"] = ("pinhole", (), 1.0)
 
 
+@pytest.mark.every(5)
 @pytest.mark.parametrize(("name", "fields"), MOVED, ids=lambda f: f if isinstance(f, str) else "-".join(map(str, f)))
 def test_derivatives_by_the_lens(rng, name, fields):
     """Reverse and forward, by focal lengths, principal point, skew and distortion: the oracle's along its rays, times
@@ -276,6 +281,7 @@ def test_panoramas_have_no_seam(rng, order):
     torch.testing.assert_close(images[2], images[0].flip(0, 1), rtol=1e-4, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_derivatives_by_the_lens_through_torch(rng):
     """`torch.func` in both modes, and cameras that share a lens."""
     cam, g = lens_camera(rng, "barrel", (9, 7)), gaussians(rng, 10, 1).detach()

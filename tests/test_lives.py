@@ -228,6 +228,7 @@ def filmed(folder, cameras_a_time: int, way: float = FLIGHT, shown: tuple[float,
     return Dataset(folder, "transforms", views, wall.means.double().numpy(), colors, "made")
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(
     ("cameras_a_time", "near"),
     [(1, 0.15), (6, 0.15)],
@@ -315,6 +316,7 @@ def of_the_ball(scene, times=TIMES) -> float:
     return float(np.mean(errors))
 
 
+@pytest.mark.slow
 def test_a_fit_shows_what_flies(dataset, tmp_path):
     """From where no photograph was taken, at a third of the error of a fit without lives; the run keeps them, and says
     how many there are."""
@@ -329,6 +331,7 @@ def test_a_fit_shows_what_flies(dataset, tmp_path):
     assert not scene.gaussians.sh[scene.living][:, 1:].any()  # one color in all directions
 
 
+@pytest.mark.slow
 def test_what_appears_and_vanishes(tmp_path):
     """A lamp that is on for a third of the time is seen then, and not before or after; it comes and goes within two
     times between photographs, for opacity is a bell in time.
@@ -348,6 +351,7 @@ def test_what_appears_and_vanishes(tmp_path):
         assert away[not is_on] < 0.4 * away[is_on], time  # measured: at most 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.same_bits
 def test_a_fit_that_was_stopped_ends_with_the_same_bits(dataset, tmp_path):
     """Lives are in the checkpoint; damaged ones are refused, with their name."""

@@ -12,6 +12,8 @@ from drgs import data
 from drgs.cameras import Camera, look_at
 from drgs.data import LOADERS, Dataset, Format, View, load
 
+pytestmark = pytest.mark.core
+
 
 def load_stills(path, background=(0.0, 0.0, 0.0), lazy=False):
     """A view of every image, from one place each."""

@@ -214,6 +214,7 @@ def shell(count: int = 2500) -> Gaussians:
     )
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("kind", ["median", "expected"])
 def test_gaussians_over_a_sphere(kind):
     mesh = mesh_of(shell(), around(6), RenderSettings.preset("fast"), MeshOptions(depth=kind, voxel=0.025))

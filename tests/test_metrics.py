@@ -14,6 +14,8 @@ from drgs.commands.eval import print_table
 from drgs.fitting.frames import Frame
 from drgs.settings import RenderSettings
 
+pytestmark = pytest.mark.core
+
 
 def images(rng, height=40, width=50):
     a, b = (torch.from_numpy(rng.random((height, width, 3), dtype=np.float32)) for _ in range(2))

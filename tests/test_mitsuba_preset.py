@@ -13,6 +13,8 @@ import drgs
 from drgs import reference, runtime
 from drgs.testing import random_scene
 
+pytestmark = pytest.mark.core
+
 mi = runtime.mitsuba()
 
 

@@ -44,6 +44,7 @@ def named(corner, tmp_path_factory):  # noqa: F811
     return out
 
 
+@pytest.mark.slow
 def test_from_photographs_to_a_report(named, tmp_path, capsys):
     """Every command that reads or writes them; each view has a picture of its own, and the report shows the names."""
     run, tiny = tmp_path / "a run (é) %20", ["--width", "40", "--height", "30"]

@@ -64,6 +64,7 @@ def close(found, want):
         assert float((x - want[name]).abs().max()) <= 4e-5 * float(want[name].max()) + 1e-12, name
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("preset", ["exact", "fast", "gsplat", "3dgut"])
 def test_slopes_are_those_of_a_traversal_each(preset):
     """Also of colors that depend on the mean, and where some Gaussians stand still."""

@@ -68,6 +68,7 @@ def check(found, J, N, whole, P=None):
         assert float((x - truth).abs().max()) <= BOUND * float(whole[name].max()), name
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("kind", KINDS)
 def test_diagonal_blocks_and_columns(kind, rng):
     """J^T J - J^T N (N^T N)^-1 N^T J of the oracle, N of both unknowns, within a soft mask and weighted channels."""
@@ -212,6 +213,7 @@ def test_far_from_the_origin(rng):
         assert float((near[name] - there[name]).abs().max()) <= 1e-4 * float(near[name].max())
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("method", ["exact", "columns", "probes"])
 def test_features(method, rng):
     """Decoded features are rows that a pose moves and an exposure does not; what they tell about themselves and about

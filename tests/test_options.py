@@ -20,6 +20,8 @@ from drgs.guards.records import hints_of, part_of, texts_of, ways_of
 from drgs.information.choices import CRITERION_NAMES, POLICY_NAMES, Criterion, Policy
 from drgs.settings import PRESETS, RenderSettings
 
+pytestmark = pytest.mark.core
+
 
 def _choices(command: type, name: str) -> tuple:
     """What an option may be, by its type."""

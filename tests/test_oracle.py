@@ -19,6 +19,8 @@ from drgs.ellipsoids import Gaussians
 from drgs.integrator import render
 from drgs.settings import RenderSettings
 
+pytestmark = pytest.mark.core
+
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh", "features")
 FIELDS = ("rgb", "alpha", "depth", "features")
 CUTS = {

@@ -27,6 +27,7 @@ def shallow(monkeypatch):
     monkeypatch.setattr(walk, "_MANY", 1)
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("width", [0, 3])
 @pytest.mark.parametrize("response", ["peak", "integral"])
 def test_rays_walked_three_times(rng, monkeypatch, response, width):
@@ -61,6 +62,7 @@ def test_information_of_rays_walked_three_times(rng, monkeypatch, direction):
         assert dense.error(fisher.blocks(g, cam, settings), torch.einsum("pni,pnj->nij", rows, rows)) <= 1e-4
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("width", [0, 3])
 def test_tables_of_few_tiles(rng, monkeypatch, width):
     """Derivatives whose tables are filled for a few tiles at a time are the same, whatever orders are held."""
@@ -159,6 +161,7 @@ def test_both_ways_to_sort_rows(rng, monkeypatch, threads):
     assert other[:-1].tolist() == expected
 
 
+@pytest.mark.slow
 def test_tails_left_out_of_tiles(rng, monkeypatch):
     """Where a tile lists few of N, tails are left out; derivatives of what is left agree with the oracle."""
     cam, g = camera(rng, (40, 32)), gaussians(rng, 3000, 1, 3, scale=0.01, opacity=1.0).detach()

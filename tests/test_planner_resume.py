@@ -61,6 +61,7 @@ def small(**options) -> Planner:
 # ------------------------------------------------------------------------------------------------------- the same bits
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("depth", [True, False])
 @pytest.mark.parametrize("at", [1, 3, 5])
 @pytest.mark.same_bits
@@ -183,6 +184,7 @@ def started(path: Path, kill_at_save: int = 0) -> subprocess.Popen:
     return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs POSIX")
 @pytest.mark.same_bits
 def test_killed(tmp_path):

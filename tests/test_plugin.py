@@ -15,6 +15,8 @@ from drgs import plugin, runtime  # noqa: F401 - the plugin registers the integr
 from drgs.ellipsoids import ellipsoids_shape
 from drgs.settings import RenderSettings
 
+pytestmark = pytest.mark.core
+
 mi = runtime.mitsuba()
 
 

@@ -12,6 +12,8 @@ import drgs
 from drgs.cameras import intrinsics_from_fov, look_at
 from examples import pose_factor
 
+pytestmark = pytest.mark.core
+
 
 def stepped(c2w, xi):
     """T exp(xi), xi = (rotation, translation) in the camera's axes."""

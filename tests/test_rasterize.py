@@ -85,6 +85,7 @@ def agree(given, ours, theirs, image=2e-5, gradient=2e-4):
         assert error < gradient, (name, error)
 
 
+@pytest.mark.every(4)
 @needs_gsplat
 @pytest.mark.parametrize("mode", ["RGB", "D", "ED", "RGB+D", "RGB+ED"])
 @pytest.mark.parametrize("rasterize_mode", ["classic", "antialiased"])
@@ -147,6 +148,7 @@ def in_front(lead, per_camera, degree, n=40, cameras=3, width=30, height=20):
     }
 
 
+@pytest.mark.every(4)
 @needs_gsplat
 @pytest.mark.parametrize("per_camera", [True, False])
 @pytest.mark.parametrize("degree", [None, 3])
@@ -169,6 +171,7 @@ def test_the_table_of_gsplats_own_test(lead, degree, per_camera):
     assert 0.05 < float(alpha.mean()) < 1
 
 
+@pytest.mark.core
 @needs_gsplat
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_every_degree_is_gsplats(degree):

@@ -83,6 +83,7 @@ def oracle(given, fields, settings, **options):
 UT = RenderSettings.preset("3dgut", culling="ut")
 
 
+@pytest.mark.every(5)
 @pytest.mark.parametrize("lens", LENSES)
 def test_images_and_gradients_through_lenses(lens):
     """Image and every gradient are the oracle's; no gradient is gsplat's that is none of ours."""

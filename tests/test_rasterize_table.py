@@ -199,6 +199,7 @@ def compared(given, options, mode, signals=None, normals=True):
     return errors, slopes, float(good.double().mean())
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize("kind", TABLE)
 def test_every_camera_is_the_oracles(kind):
     """Images with hit distances, normals and signals within 1e-5 and every gradient within 1e-4 of the oracle."""
@@ -214,6 +215,7 @@ def test_every_camera_is_the_oracles(kind):
     assert expected <= set(slopes)
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("kind", ["pinhole", "rolling_top_to_bottom", "distance"])
 def test_every_mode_is_the_oracles(mode, kind):

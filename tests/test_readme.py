@@ -32,6 +32,7 @@ def test_every_command_is_shown():
     assert {command[0] for command in _commands()} == set(cli._OPTIONS)
 
 
+@pytest.mark.slow
 def test_commands_run(folder, monkeypatch, capsys):
     """The commands run in the order of their page, then those of the README, each on what those before have left."""
     monkeypatch.chdir(folder)

@@ -14,6 +14,8 @@ from drgs import reference
 from drgs.reference import render
 from drgs.settings import RenderSettings
 
+pytestmark = pytest.mark.core
+
 LEGAL = [
     *[(r, o) for r in ("peak", "integral") for o in ("center", "ray", "entry")],
     ("ewa", "center"),
@@ -504,6 +506,7 @@ def _twist(xi):
     return torch.linalg.matrix_exp(torch.stack(rows + [zero] * 4).reshape(4, 4))
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("fields", [{}, {"sh_direction": "ray", "extent": 6.0, "near": 0.2}])
 @pytest.mark.parametrize(("response", "order"), LEGAL)
 def test_gradcheck(response, order, fields):

@@ -18,6 +18,8 @@ from drgs.information.refining import _moved
 from drgs.select import Refine, Scoring, select
 from drgs.settings import RenderSettings
 
+pytestmark = pytest.mark.core
+
 FAST = RenderSettings.preset("fast")
 
 

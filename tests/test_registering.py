@@ -57,6 +57,7 @@ def poses(folder) -> dict[str, np.ndarray]:
     return {view.image_path.name: view.camera.w2c for view in load(folder).views}
 
 
+@pytest.mark.slow
 def test_a_second_batch(corner, first, scene, tmp_path):  # noqa: F811
     """Poses that were there stay, new ones are right in the same world, and what was shown stays shown."""
     photos, cameras = corner

@@ -9,6 +9,8 @@ import pytest
 from drgs.guards import registry
 from drgs.guards.registry import Registry
 
+pytestmark = pytest.mark.core
+
 
 @pytest.fixture
 def package(tmp_path, monkeypatch):

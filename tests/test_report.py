@@ -139,6 +139,7 @@ def test_charts_share_no_ids(active):
     assert all(not a & b for i, a in enumerate(ids) for b in ids[:i])
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("name", ["<script>alert(1)</script>", "$\\frac{", '" onload="x', "a" * 300], ids=str)
 def test_names_are_text(run, tmp_path, name):
     """Whatever a file calls a view, the run or a parameter, a page shows, and makes nothing else of it."""

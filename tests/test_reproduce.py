@@ -307,6 +307,7 @@ def test_workers_get_whole_paths(tmp_path, monkeypatch):
     assert "--lpips-weights w.pth --no-figures`" in page
 
 
+@pytest.mark.slow
 def test_a_study_that_is_killed_goes_on(tmp_path):
     """SIGKILL in the middle of the second cell: the first is kept, the rest is done, tables and figures are there; what
     is finished is not done again, and a row that lost its end is.
@@ -373,6 +374,7 @@ def test_data_without_labels(still, tmp_path, capsys):
     assert "must be of one still, holds rows of" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_no_room_for_a_study(still, tmp_path):
     """A disk that is full in the middle: one line that says so, exit code 2, and nothing lost once there is room."""
     out = tmp_path / "out"

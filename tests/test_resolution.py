@@ -172,6 +172,7 @@ def test_a_resumed_fit_has_the_same_bits(dataset, whole_and_resumed, seen):  # n
     assert [side for side, *_ in seen][:20] == [SIZE // 2] * 10 + [SIZE] * 10
 
 
+@pytest.mark.slow
 @pytest.mark.same_bits
 def test_everything_goes_on_with_the_same_bits(dataset):  # noqa: F811
     """Masks, gains, poses, the 3D filter and what is transient together: from a checkpoint after the first look, while

@@ -302,6 +302,7 @@ def test_users_variant_beats_environment():
     assert done.stdout.split() == ["llvm_ad_rgb", "llvm_ad_rgb"], done.stderr
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("old", [14, 15, 16])
 def test_drjit_imported_first_with_an_old_library(old):
     """The user's own import loaded a library that would abort: refused before any kernel runs."""
@@ -395,6 +396,7 @@ print(drgs.render(g, orbit((0, 0, 0), 3.0, 1, width=8, height=8)[0]).rgb.isfinit
 """
 
 
+@pytest.mark.every(4)
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="about instructions of x86-64")
 @pytest.mark.parametrize("target", ["nehalem/4", "x86-64-v2/8", "nehalem/4/+sse4.2,-avx,-fma", "haswell/8/-fma"])
 def test_a_processor_without_fma_is_refused(target):

@@ -28,6 +28,7 @@ def test_one(n):
 """
 
 
+@pytest.mark.slow
 def test_each_test_has_one_turn(tmp_path):
     """Real processes that wait for ever, are killed and abort, at a file's end and within: each is named, with stacks
     where it waited, and what comes after it is run by others."""

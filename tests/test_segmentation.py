@@ -22,6 +22,8 @@ from drgs.features.pictures import (
 )
 from drgs.features.segmentation import SCORE_DEFINITIONS, Classes, classify, cosines, scores
 
+pytestmark = pytest.mark.core
+
 NAMES = ("wall", "floor", "chair", "table", "lamp")
 
 

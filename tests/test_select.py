@@ -250,6 +250,8 @@ def test_nan_gaussians(world):
 # -------------------------------------------------- lazy greedy
 
 
+@pytest.mark.core
+@pytest.mark.every(4)
 @pytest.mark.parametrize("criterion", ["logdet", "eig", "trace_cov", "v_opt"])
 @pytest.mark.parametrize("whole", [False, True], ids=["generic", "ties"])
 def test_lazy_is_greedy(criterion, whole):

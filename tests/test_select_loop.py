@@ -74,6 +74,7 @@ def test_the_order_and_the_names_of_views_do_not_matter(still):
     assert (again.computed, cache.misses) == (0, misses)
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(
     "options",
     [
@@ -102,6 +103,7 @@ def test_a_cache_changes_nothing(still, options):
     assert [pick.index for pick in found.picks] == [pick.index for pick in wanted.picks]
 
 
+@pytest.mark.slow
 def test_a_cache_is_bounded_in_bytes(still):
     """What was used least recently goes; the picks stay what they are, and what does not fit is said."""
     g, cameras = still

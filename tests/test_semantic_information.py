@@ -54,6 +54,7 @@ def truth(g, out, m: SemanticMetric) -> tuple[dict, torch.Tensor]:
     return diagonal, blocks
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize(
     ("response", "order", "D"),
     [

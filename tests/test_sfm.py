@@ -148,6 +148,7 @@ def test_recovers_poses_and_loads(corner, tmp_path):
     assert (out / "sparse" / "0" / "points3D.bin").read_bytes() == b"refined"
 
 
+@pytest.mark.slow
 def test_what_was_turned_is_found_by_its_masks(turntable, tmp_path):
     """Before a background that stands still an object that turns has poses by masks, which the data set keeps."""
     folder, cameras = turntable
@@ -269,6 +270,7 @@ def test_masks_of_others_stay(masked, tmp_path):
     assert mine.read_text() == "hours of work"
 
 
+@pytest.mark.slow
 def test_photos_that_fall_apart(tmp_path, capsys, monkeypatch):
     """Two places and a blank photo: which model was kept, what the other holds, what is in none, and what helps."""
     from drgs import cli

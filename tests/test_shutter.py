@@ -56,6 +56,7 @@ KINDS = [
 ]
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize(
     ("shutter", "model", "fields"), KINDS, ids=lambda f: f if isinstance(f, str) else "-".join(map(str, f))
 )
@@ -164,6 +165,7 @@ def test_what_bounds_leave_out_changes_nothing(rng, monkeypatch, kind, anisotrop
     assert sum(pairs[::2]) <= (1.0 if kind == "rays anywhere" else 0.8) * sum(pairs[1::2])
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("preset", ["exact", "fast", "3dgut", "bvh"])
 def test_rays_of_the_caller(rng, preset):
     """Images and derivatives by rays, in both modes; a pixel without a ray shows the background."""

@@ -340,6 +340,7 @@ def test_a_run_that_goes_on_keeps_the_reason(tmp_path):
     assert "skybox" not in run.config()
 
 
+@pytest.mark.slow
 def test_as_many_as_there_may_be_and_evenly():
     """Never more; what is left out is left out evenly, whatever the lens: no picture has an empty side."""
     for count in (1, 37, 300):

@@ -11,6 +11,8 @@ from drgs import fisher
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
 
+pytestmark = pytest.mark.core
+
 GSPLAT = drgs.RenderSettings.preset("gsplat")
 SIZE = {"n": 30, "width": 24, "height": 20}
 

@@ -14,6 +14,8 @@ from scenes_random import camera
 from drgs import cli, fisher
 from drgs.lab import accuracy, extremes, refusals, stress
 
+pytestmark = pytest.mark.core
+
 TWO = "Gaussian, `gsplat`"  # two cases, on tiles
 NAMES = {"1 Gaussian, `gsplat`", "camera inside a Gaussian, `gsplat`"}
 # Every item of the design's list of extremes, and part of a name.

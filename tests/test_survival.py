@@ -63,6 +63,7 @@ def kills():
     return module
 
 
+@pytest.mark.slow
 @pytest.mark.same_bits
 def test_a_killed_fit_goes_on(kills, tmp_path):
     """Three kills at random moments: every file is whole, and the end has the bits and picks of a fit left in peace."""
@@ -91,6 +92,7 @@ def test_a_kill_that_loses_something_is_seen(kills, tmp_path):
         kills.check_whole(tmp_path / "run")
 
 
+@pytest.mark.every(3)
 @pytest.mark.skipif(sys.platform != "linux", reason="limits and capabilities are those of Linux")
 @pytest.mark.parametrize(
     ("trouble", "expected"),

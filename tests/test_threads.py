@@ -13,6 +13,7 @@ from pathlib import Path
 
 import drjit as dr
 import numpy as np
+import pytest
 import torch
 from scenes_random import camera, gaussians
 
@@ -57,6 +58,7 @@ def test_two_workers(two_threads):
         assert float((a - b).abs().max()) <= 1e-5 * float(b.abs().max())
 
 
+@pytest.mark.slow
 def test_four_threads(monkeypatch):
     """Forward, backward and forward mode of four scenes at once equal those of one thread.
 
@@ -201,6 +203,7 @@ print("ended")
 """
 
 
+@pytest.mark.slow
 def test_graphs_end_beside_computations():
     """Garbage in cycles, and images that are dropped, of one thread do not stop others that compute, nor itself."""
     done = _run(GARBAGE)

@@ -127,6 +127,7 @@ def test_image_smaller_than_a_tile_and_larger(rng):
         torch.testing.assert_close(render(g, part, settings).rgb, whole[:height, :width], rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_too_many_pairs(monkeypatch):
     """2^32 list entries are refused before anything of that size is allocated, however much memory there is."""
     monkeypatch.setattr("drgs.guards.memory.available", lambda: None)

@@ -23,6 +23,8 @@ from drgs.guards.arguments import ArgumentError
 from drgs.integrator import render, render_jvp
 from drgs.select import select
 
+pytestmark = pytest.mark.core
+
 
 class Drift:
     """Gaussians that move with constant velocities: the smallest scene with a time."""

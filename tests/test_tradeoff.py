@@ -131,6 +131,7 @@ def test_errors_are_what_they_say(report, place):
     assert row["information"]["groups"]["means"]["l1"] == pytest.approx(float(l1), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_gradient_error_is_the_jacobians(place, monkeypatch):
     """Over many cotangents, the mean squared relative error is that of the Jacobian in the Frobenius norm."""
     g = load_ply(place / "scene.ply").take(slice(0, 5))
@@ -218,6 +219,7 @@ def test_what_leads_is_timed_as_it_is_drawn(report):
     assert "forward" in report["full"]
 
 
+@pytest.mark.slow
 def test_size_is_what_is_drawn_or_what_fits(place, monkeypatch):
     """Errors are of views of --max-pixels, times of the views themselves or what the seconds allow, which is said."""
     few(monkeypatch, "fast")

@@ -23,6 +23,7 @@ def seen(rng, kind, size=(61, 45)):
     return camera(rng, size) if kind == "pinhole" else lens_camera(rng, kind, size)
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("kind", ["pinhole", "barrel", "fisheye", "f-theta", "panorama", "rolling"])
 def test_what_is_left_out(rng, kind):
     """Large Gaussians around the camera are cut off at the tiles of their boxes, where the oracle cuts them off."""
@@ -41,6 +42,7 @@ def test_what_is_left_out(rng, kind):
     assert changed > 0.05  # it does leave something out
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("kind", ["pinhole", "fisheye", "rolling"])
 def test_derivatives(rng, kind):
     """Boxes have none: what is drawn has the derivatives that it has."""

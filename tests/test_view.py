@@ -863,6 +863,7 @@ def test_messages_that_are_none_are_one_line(viewers, caplog, capfd):
     assert "Traceback" not in "".join(capfd.readouterr())
 
 
+@pytest.mark.slow
 def test_what_a_browser_leaves_is_freed(viewers):
     """Browsers that come and go leave neither a session nor what was sent to them, though Python's own search for
     circles of references is off meanwhile."""

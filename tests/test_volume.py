@@ -13,6 +13,8 @@ import torch
 from drgs import reference
 from drgs.settings import RenderSettings
 
+pytestmark = pytest.mark.core
+
 BACKGROUND = (0.1, 0.2, 0.3)
 SORTED = RenderSettings(
     response="integral", order="ray", traversal="bvh", extent=12.0, transmittance_min=0.0, background=BACKGROUND
@@ -209,6 +211,7 @@ def test_nothing_to_see():
     assert int(behind.nodes) == 0
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(
     ("preset", "response"),
     [("exact", "peak"), ("exact", "integral"), ("exact", "ewa"), ("inria", "ewa"), ("gsplat", "ewa")],
