@@ -29,7 +29,7 @@ from drgs.cameras import Camera, intrinsics
 from drgs.codecs import load_gaussians
 from drgs.data import load
 from drgs.data.camera_lists import load_cameras_json
-from drgs.data.checks import check_npz, file_inside, read_image, read_npy
+from drgs.data.checks import check_npz, file_inside, image_size, read_image, read_npy
 from drgs.data.image_headers import can_hold, is_whole, stated_size
 from drgs.features.decoder import Decoder, load_decoder, save_decoder
 from drgs.features.teacher import read_map
@@ -83,6 +83,25 @@ def test_chunks_of_png_that_claim_more_than_the_file(tmp_path, little_room):
     for length in (len(body) + 17, 1 << 30, (1 << 32) - 1):
         path.write_bytes(head + chunk(b"IDAT", body, length) + chunk(b"IEND", b""))
         assert not is_whole(path)
+        refused(read_image, path, "must be a whole image, its data end early")
+
+
+def test_a_jpeg_that_is_cut_off(tmp_path):
+    """Found by its end, before anything is decoded; an embedded preview has an end, too, and phones append more."""
+    path = tmp_path / "a.jpg"
+    picture = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
+    data = cv2.imencode(".jpg", picture)[1].tobytes()
+    preview = cv2.imencode(".jpg", picture[:8, :8])[1].tobytes()
+    data = data[:2] + b"\xff\xe1" + struct.pack(">H", 2 + len(preview)) + preview + data[2:]
+    for whole in (data, data + b"\xff\xd8 a film of the moment"):
+        path.write_bytes(whole)
+        assert is_whole(path)
+        assert image_size(path) == (60, 40)
+        assert read_image(path).shape == (40, 60, 3)
+    for length in (len(data) // 2, len(data) - 100, len(data) - 1):
+        path.write_bytes(data[:length])
+        assert not is_whole(path)
+        refused(image_size, path, "must be a whole image, its data end early")
         refused(read_image, path, "must be a whole image, its data end early")
 
 

@@ -38,7 +38,7 @@ from drgs.train import SelectionConfig, Trainer, fit
 pytest.importorskip("pycolmap")
 cv2 = pytest.importorskip("cv2")
 
-from test_sfm import corner_camera, corner_photo, corner_walls, write_photo  # noqa: E402
+from test_sfm import add_bad_entries, corner_camera, corner_photo, corner_walls, write_photo  # noqa: E402
 from test_share import write_viewer  # noqa: E402
 
 STEPS = 40
@@ -339,7 +339,7 @@ def test_bad_photographs(photographs, tmp_path, capsys):
     first = photographs / "first"
     assert "must be at least 3 photographs, got 1" in refused([first / "IMG_0.png", "-o", tmp_path / "a"], capsys)
     (tmp_path / "damaged").mkdir()
-    for index in range(3):
+    for index in range(2):
         shutil.copy(first / f"IMG_{index}.png", tmp_path / "damaged")
     whole = (first / "IMG_3.png").read_bytes()
     (tmp_path / "damaged/IMG_3.jpg").write_bytes(whole[: len(whole) // 3])
@@ -347,6 +347,27 @@ def test_bad_photographs(photographs, tmp_path, capsys):
     assert "must be photographs or a video, found none" in refused([tmp_path / "no", "-o", tmp_path / "c"], capsys)
     assert "must be photographs" in refused(["-o", tmp_path / "d"], capsys)
     assert "--budget must be a time with its unit" in refused([first, "-o", tmp_path / "e", "--budget", "10"], capsys)
+
+
+def test_one_that_is_bad_stops_nothing(photographs, tmp_path, caplog):
+    """The user's own file is named; what ended before there were poses is begun anew by the same command."""
+    photos = shutil.copytree(photographs / "first", tmp_path / "photos")
+    wanted = add_bad_entries(photos, photos / "IMG_0.png")
+    args = Capture(paths=(photos,), output=tmp_path / "run", quiet=True)
+    with stopped_at("features"):
+        capture_photographs(args, CONFIG)
+    assert steps_of(tmp_path / "run") == ["photos"]
+    linked = sorted(path.name for path in (tmp_path / "run/capture/photos").iterdir())
+    assert linked == [f"IMG_{index}.png" for index in range(6)]
+    told = "\n".join(caplog.messages)
+    for name, text in wanted.items():
+        assert any(
+            line.startswith(f"left out: {photos}") and name in line and text in line for line in caplog.messages
+        ), told
+    assert str(tmp_path / "run") not in told
+    with stopped_at("sharpness"):
+        capture_photographs(dataclasses.replace(args, paths=(photographs / "first",)), CONFIG)
+    assert steps_of(tmp_path / "run") == []
 
 
 def test_photographs_without_overlap(tmp_path, capsys):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 
@@ -45,13 +46,21 @@ def rows_of(folder):
     return json.loads((folder / FRAMES).read_text())
 
 
-def test_what_is_named(shoot, tmp_path):
+def test_what_is_named(shoot, tmp_path, caplog):
     """Folders and files, each once; the moment of a photograph is left out unless it is named itself."""
     photos, other = shoot
     found = named_files([photos, other / "clip.mp4", photos / "IMG_2.png", photos / ".." / "photos" / "clip.mp4"])
     assert [path.name for path in found[0]] == ["IMG_1.jpg", "IMG_2.png"]
     assert found[1] == [photos / "clip.mp4", other / "clip.mp4"]
     assert named_files([photos / "IMG_1.MOV"]) == ([], [photos / "IMG_1.MOV"])
+    os.mkfifo(tmp_path / "pipe.jpg")
+    (tmp_path / "link.mp4").symlink_to("gone.mp4")
+    found = named_files([tmp_path / "pipe.jpg", photos / "IMG_2.png", tmp_path / "link.mp4"])
+    assert found == ([photos / "IMG_2.png"], [])
+    assert caplog.messages == [
+        f"left out: {tmp_path}/pipe.jpg: must be a file, is a pipe or a device; restore or remove it",
+        f"left out: {tmp_path}/link.mp4: must be a file, is a link to gone.mp4, where nothing is; restore or remove it",
+    ]
     (tmp_path / "empty").mkdir()
     for path, message in (
         (tmp_path / "gone", "gone: must be photographs or a video, found none"),

@@ -4,7 +4,9 @@ input.
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -13,6 +15,8 @@ from test_data_points import HEIGHT, WIDTH, plane_views, render_plane, texture
 from drgs.cameras import Camera, intrinsics, look_at
 from drgs.data import load
 from drgs.data.mapping import _gaps, runs
+from drgs.data.matching import extract
+from drgs.data.photo_files import photo_fault
 from drgs.data.sfm import run_sfm
 
 pytest.importorskip("pycolmap")
@@ -81,6 +85,34 @@ def corner(tmp_path_factory):
     return folder, cameras
 
 
+def add_bad_entries(folder, whole) -> dict[str, str]:
+    """What a folder of photographs may also hold: name of each -> what is said of it.
+
+    Args:
+        folder: The folder.
+        whole: A photograph.
+    """
+    data = cv2.imencode(".jpg", cv2.imread(str(whole)))[1].tobytes()
+    (folder / "cut.jpg").write_bytes(data[: len(data) // 2])
+    (folder / "empty.jpg").touch()
+    assert cv2.imwrite(str(folder / "tiny.png"), np.zeros((1, 1, 3), np.uint8))
+    assert cv2.imwrite(str(folder / "strip.png"), np.zeros((20, 3200, 3), np.uint8))
+    os.mkfifo(folder / "pipe.jpg")
+    (folder / "gone.jpg").symlink_to("nowhere.jpg")
+    (folder / "folder.png").mkdir()
+    shutil.copy(whole, folder / "two\nlines.png")
+    return {
+        "cut.jpg": "must be a whole image, its data end early",
+        "empty.jpg": "must be an image, could not be decoded",
+        "tiny.png": "must be 16 pixels high and wide to have features, is 1x1",
+        "strip.png": "is 3200x20 at 1600 pixels along the longer side",
+        "pipe.jpg": "must be a file, is a pipe or a device",
+        "gone.jpg": "must be a file, is a link to nowhere.jpg, where nothing is",
+        "folder.png": "must be a file, is a folder",
+        "two\\nlines.png": "must be one line of UTF-8",
+    }
+
+
 @pytest.fixture(scope="module")
 def turntable(tmp_path_factory):
     """Photos of the corner as an object that turns before a camera that stands still, masks, and its cameras."""
@@ -101,9 +133,11 @@ def turntable(tmp_path_factory):
     return folder, cameras
 
 
-def test_recovers_poses_and_loads(corner, tmp_path):
-    """All photos found, centers right up to a similarity, result replaceable."""
-    folder, cameras = corner
+def test_recovers_poses_and_loads(corner, tmp_path, tmp_path_factory):
+    """All photos found, centers right up to a similarity, result replaceable; what is no photo is left out."""
+    made, cameras = corner
+    folder = shutil.copytree(made, tmp_path_factory.mktemp("photos") / "photos")
+    add_bad_entries(folder, folder / "0.png")
     stages, doing = [], []
     out = tmp_path / "out"
     summary = run_sfm(folder, out, progress=lambda *step: stages.append(step), doing=doing.append)
@@ -337,6 +371,37 @@ def test_photos_that_do_not_connect(tmp_path, rng):
         run_sfm(photos, out)
     assert "\n" not in str(error.value)
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
+def test_a_photo_that_cannot_be_used_is_named(tmp_path, corner):
+    """Each with what is wrong with it; where too few are left, in one line."""
+    whole = corner[0] / "0.png"
+    wanted = add_bad_entries(tmp_path, whole)
+    for path in sorted(tmp_path.iterdir()):
+        fault = photo_fault(path)
+        assert "\n" not in fault
+        assert wanted[path.name.replace("\n", "\\n")] in fault
+        assert path.name.replace("\n", "\\n") in fault
+    assert photo_fault(tmp_path / "strip.png", 3200) == ""
+    assert photo_fault(whole) == ""
+    with pytest.raises(ValueError, match=r"must hold at least 2 photos that can be used, got 0; .*cut.jpg: must be"):
+        run_sfm(tmp_path, tmp_path / "out")
+    (tmp_path / "link.jpg").symlink_to("cut.jpg")  # as a capture has them
+    assert photo_fault(tmp_path / "link.jpg").startswith(f"{tmp_path / 'cut.jpg'}: must be a whole image")
+
+
+def test_a_crash_of_the_detector_is_one_line(tmp_path, corner, capfd):
+    """COLMAP's own, over a picture that `run_sfm` does not let through; the next ones have features."""
+    assert cv2.imwrite(str(tmp_path / "tiny.png"), np.zeros((15, 15, 3), np.uint8))
+    options = {"camera_model": "SIMPLE_RADIAL", "shared_camera": False, "wide_baseline": True}
+    with pytest.raises(ValueError, match=r"^") as error:
+        extract(tmp_path / "a.db", tmp_path, ["tiny.png"], **options)
+    assert str(error.value) == (
+        f"{tmp_path / 'tiny.png'}: must be a photograph that COLMAP finds features in, the process that reads it ended "
+        "with SIGSEGV; leave it out"
+    )
+    assert capfd.readouterr().err == ""
+    extract(tmp_path / "b.db", corner[0], ["0.png"], max_image_size=160, **options)
 
 
 def test_bad_input(tmp_path, rng):

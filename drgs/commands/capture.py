@@ -32,6 +32,7 @@ from drgs.commands.report import report_of
 from drgs.data.checks import list_images
 from drgs.data.gathering import gather, named_files
 from drgs.data.held_out import HELD_OUT, write_held_out
+from drgs.data.photo_files import usable_photos
 from drgs.data.registering import register
 from drgs.data.sfm import run_sfm
 from drgs.display.progress import Bar
@@ -165,6 +166,11 @@ def _is_droppable(record: CaptureRecord) -> bool:
     return len(record.batches) > 1 and record.batch.step("poses") is None
 
 
+def _is_unposed(record: CaptureRecord) -> bool:
+    """Whether a capture ended before its first photographs had poses: the same command begins it anew."""
+    return len(record.batches) == 1 and record.batch.step("poses") is None
+
+
 def _record(args: Capture, inputs: list, is_dataset: bool) -> CaptureRecord:
     """The record to go on with, whose last batch is the one to work at.
 
@@ -175,7 +181,7 @@ def _record(args: Capture, inputs: list, is_dataset: bool) -> CaptureRecord:
     folder = args.output / FOLDER
     options = {"frames": args.frames, "masks": args.masks, "seed": args.seed}
     before = CaptureRecord.read(folder)
-    if before is None:
+    if before is None or (_is_unposed(before) and not args.add and not args.resume):
         if args.add:
             raise ValueError(f"{args.output}: --add must have a capture to add to, found none; leave --add out")
         if is_run(args.output):
@@ -326,6 +332,8 @@ class _Capture:
             if frames < self.args.frames:
                 self._say(f"plan for {duration(self.clock.budget)}: at most {frames} frames of videos, for their poses")
         with claim(self.folder, "capture") as held, Bar("photos") as bar:
+            fewest = 0 if videos else 1 if self.is_added else _FEWEST
+            photographs = usable_photos(photographs, self.args.paths[0], fewest)
             held.remove(self.photos)  # of a command that ended before it could say so
             gathered = gather(photographs, videos, held, self.photos.name, frames, bar.stage)
         names = [path.name for path in list_images(gathered.folder)]

@@ -216,13 +216,15 @@ def _reading_archive(path: Path, what: str) -> Iterator[None]:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) of an image; only the header is read, where it says so.
+    """(width, height) of an image; only the header is read, where it says so, and whether a PNG or JPEG ends.
 
     Raises:
-        ValueError: Not an image, of no or more than 2^31 pixels, or of more than its file can hold.
+        ValueError: Not an image, of no or more than 2^31 pixels, or of more than its file can hold, or cut off.
     """
     if is_heif(path):
         return heif_size(path)
+    if not is_whole(path):
+        raise _ends_early(path)
     stated = stated_size(path)
     width, height = stated or read_image(path).shape[1::-1]
     if not 1 <= width * height <= _MAX_PIXELS or (stated and not can_hold(path, width, height)):

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from drgs.data.checks import IMAGE_SUFFIXES, list_images
-from drgs.data.photo_files import link_or_copy
+from drgs.data.photo_files import entry_fault, leave_out, link_or_copy
 from drgs.data.shooting import Finding
 from drgs.data.video_frames import Picked, examine
 from drgs.data.videos import VIDEO_SUFFIXES, list_videos
@@ -58,7 +58,8 @@ class Gathered:
 
 
 def named_files(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
-    """Photographs and videos that paths name: files, or folders with some; each once.
+    """Photographs and videos that paths name: files, or folders with some; each once. The log names those that are left
+    out: pipes, folders, links to nothing, and names that COLMAP cannot hold.
 
     Raises:
         FileNotFoundError: Nothing there, or a folder without either.
@@ -74,7 +75,7 @@ def named_files(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
                 )
             photographs += found[0]
             videos += [video for video in found[1] if not _is_moment(video, found[0])]
-        elif not path.exists():
+        elif not path.exists() and not path.is_symlink():
             raise FileNotFoundError(f"{path}: must be photographs or a video, found none; check the path")
         elif path.suffix.lower() in IMAGE_SUFFIXES:
             photographs.append(path)
@@ -86,6 +87,7 @@ def named_files(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
                 f"{path}: must be a photograph or a video ({', '.join(_SUFFIXES)}), got {path.suffix or 'no suffix'}; "
                 "convert it, or leave it out"
             )
+    photographs, videos = (leave_out(files, entry_fault, paths[0]) for files in (photographs, videos))
     return _once(photographs), _once(videos)
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import mmap
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,9 @@ __all__ = ["can_hold", "is_whole", "stated_size"]
 _PIXELS_A_BYTE = 8_256  # deflate makes one byte of at most 1,032, each of at most 8 pixels of one bit
 _WEBP_SIDE = 1 << 14  # pixels: 14 bits
 _PNG = b"\x89PNG\r\n\x1a\n"
+# Frame headers are C0..CF, except the tables C4 (Huffman), C8 (reserved) and CC (arithmetic).
+_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_JPEG_SCAN = (0xDA,)
 _DIRECTORY = 4096  # entries of a TIFF that are looked at
 
 
@@ -37,9 +41,14 @@ def can_hold(path: Path, width: int, height: int) -> bool:
 
 
 def is_whole(path: Path) -> bool:
-    """Whether the chunks of a PNG lie within its file, since OpenCV allocates what they claim; of others, yes."""
+    """Whether the chunks of a PNG lie within its file, since OpenCV allocates what they claim, and a JPEG has an end;
+    of others, yes. No pixel is decoded.
+    """
     with path.open("rb") as file:
-        if file.read(8) != _PNG:
+        head = file.read(8)
+        if head.startswith(b"\xff\xd8"):
+            return _has_end(file)
+        if head != _PNG:
             return True
         size = path.stat().st_size
         at = 8
@@ -96,6 +105,29 @@ def _tiff(head: bytes, file: Any) -> tuple[int, int] | None:
 
 def _jpeg(head: bytes, file: Any) -> tuple[int, int] | None:
     """(width, height) in the frame header of a JPEG; None if there is none."""
+    if _jpeg_segment(file, _JPEG_FRAMES) is None:
+        return None
+    height, width = struct.unpack(">HH", file.read(5)[1:5])
+    return (width, height) if width and height else None
+
+
+def _has_end(file: Any) -> bool:
+    """Whether the marker of the end follows the first scan of a JPEG; also where there is no scan."""
+    try:
+        start = _jpeg_segment(file, _JPEG_SCAN)
+    except struct.error:
+        return True
+    if start is None:
+        return True
+    # From the end, where it is, or before what phones append; the data of a scan have 00 or a restart marker after FF.
+    with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        return data.rfind(b"\xff\xd9") >= start
+
+
+def _jpeg_segment(file: Any, kinds: Collection[int]) -> int | None:
+    """Place behind the marker and the length of the first segment of one of some kinds, where the file is then; None if
+    there is none.
+    """
     file.seek(2)
     while True:
         marker = file.read(2)
@@ -105,10 +137,8 @@ def _jpeg(head: bytes, file: Any) -> tuple[int, int] | None:
             file.seek(-1, 1)
             continue
         (length,) = struct.unpack(">H", file.read(2))
-        # Frame headers are C0..CF, except the tables C4 (Huffman), C8 (reserved) and CC (arithmetic).
-        if 0xC0 <= marker[1] <= 0xCF and marker[1] not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack(">HH", file.read(5)[1:5])
-            return (width, height) if width and height else None
+        if marker[1] in kinds:
+            return file.tell()
         file.seek(length - 2, 1)
 
 

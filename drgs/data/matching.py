@@ -1,5 +1,5 @@
-"""Local features and their matches, by pycolmap on the CPU, in steps small enough to report
-progress.
+"""Local features, by a process of its own (extraction.py), and their matches, by pycolmap on the CPU, in steps small
+enough to report progress.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from drgs.data.photo_files import own_file
+from drgs.data.reader_process import Child
 from drgs.guards import interrupts
 from drgs.guards.unfinished import temporary_folder
 from drgs.runtime import thread_count
@@ -19,7 +21,8 @@ __all__ = ["extract", "match", "nearby_pairs", "quiet", "sequential_pairs", "sta
 
 Progress = Callable[[str, int, int], None]
 _PAIRS_A_STEP = 16  # a thread: all of them are busy, and progress is seen
-_MASKED_CONTRAST = 0.002  # a third of COLMAP's: an object alone has few features, and weak ones match as well
+
+_extractor = Child("drgs.data.extraction", "a photograph that COLMAP finds features in", "leave it out")
 
 
 @contextlib.contextmanager
@@ -48,6 +51,7 @@ def extract(
     masks: Path | None = None,
     camera: int | None = None,
     progress: Progress | None = None,
+    originals: Path | None = None,
 ) -> None:
     """SIFT features of images into a COLMAP database.
 
@@ -62,42 +66,30 @@ def extract(
         masks: Folder with `NAME.EXT.png` of every image, of its size: no features where it is 0.
         camera: Number of a camera in the database that the images share; default a new one.
         progress: Called with ("features", done, total).
+        originals: Folder of the photographs that messages name, where those in `folder` are copies.
+    Raises:
+        ValueError: COLMAP crashed over an image.
     """
-    from drgs.data.colmap_bindings import pycolmap
-
     threads = thread_count()
-    options = pycolmap.FeatureExtractionOptions()
-    options.use_gpu = False
-    options.num_threads = threads
-    if max_image_size:
-        options.max_image_size = max_image_size
-    options.sift.estimate_affine_shape = wide_baseline
-    options.sift.domain_size_pooling = wide_baseline
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = camera_model
-    if masks is not None:
-        reader.mask_path = masks
-        options.sift.peak_threshold = _MASKED_CONTRAST
     shared_camera = shared_camera or camera is not None
-    mode = pycolmap.CameraMode.SINGLE if shared_camera else pycolmap.CameraMode.PER_IMAGE
-    if camera is not None:
-        reader.existing_camera_id = camera
     for start in range(0, len(names), threads):  # one a thread: all of them are busy, and progress is seen
         if progress:
             progress("features", start, len(names))
-        if shared_camera and start and camera is None:
-            # Every call would otherwise open a camera of its own; the first of these is the newest.
-            with pycolmap.Database.open(database) as handle:
-                reader.existing_camera_id = max(found.camera_id for found in handle.read_all_cameras())
-        pycolmap.extract_features(
-            database,
-            folder,
-            image_names=names[start : start + threads],
-            camera_mode=mode,
-            reader_options=reader,
-            extraction_options=options,
-            device=pycolmap.Device.cpu,
-        )
+        some = names[start : start + threads]
+        options = {
+            "database": str(database),
+            "folder": str(folder),
+            "camera_model": camera_model,
+            "shared_camera": shared_camera,
+            "max_image_size": max_image_size,
+            "wide_baseline": wide_baseline,
+            "masks": None if masks is None else str(masks),
+            "camera": camera,
+            "threads": threads,
+        }
+        shown = " or ".join(str(own_file((originals or folder) / name)) for name in some)
+        # Every call would otherwise open a camera of its own.
+        camera = _extractor.ask("features", Path(shown), some, options)
     if progress:
         progress("features", len(names), len(names))
 

@@ -1,12 +1,17 @@
-"""Photographs as COLMAP needs them: under names that its model can hold, in formats that it decodes."""
+"""Photographs as COLMAP needs them: whole, large enough, with names that its model can hold, in formats it decodes.
+
+Those that are not are left out by `drgs sfm` and `drgs capture`, with a line that names the user's own file, before any
+feature is looked for.
+"""
 
 from __future__ import annotations
 
+import functools
 import logging
 import re
 import shutil
 import unicodedata
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,29 +19,34 @@ import numpy as np
 from drgs.data.checks import IMAGE_SUFFIXES, read_image
 from drgs.data.heif import heif_as_jpeg, is_heif
 
-__all__ = ["check_names", "link_or_copy", "readable_photos"]
+__all__ = [
+    "check_names",
+    "entry_fault",
+    "leave_out",
+    "link_or_copy",
+    "own_file",
+    "photo_fault",
+    "readable_photos",
+    "usable_photos",
+]
 
 _QUALITY = 98  # of JPEG, for what has been compressed before
 _LONGEST = 251  # bytes of a name, where file systems allow 255 and COLMAP wants .png behind it
 _SHOWN = 5  # names that a message repeats
+_FAULTS = 20  # photographs that the log says what is wrong with
+_SMALLEST = 16  # pixels: COLMAP 4's detector with affine shapes crashes over images with 15 rows or columns
 
 _log = logging.getLogger(__name__)
 
 
-def check_names(folder: Path, names: list[str], masked: bool = False) -> None:
-    """Refuse names that a COLMAP model cannot hold: with line breaks or other control characters, or bytes that are not
-    UTF-8; with masks, whose names are those and `.png`, also too long ones. Say which photographs are hidden, and left
-    out.
+def check_names(folder: Path, names: Sequence[str], masked: bool = False) -> None:
+    """Refuse names that are too long for masks, whose names are those and `.png`. Say which photographs are hidden, and
+    left out.
 
     Raises:
         ValueError: There is one.
     """
     for name in names:
-        if any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") for c in name):
-            raise ValueError(
-                f"{folder}: the name of a photo must be one line of UTF-8 without control characters, got "
-                f"{name[:80]!r}; rename this photo"
-            )
         if masked and len(name.encode()) > _LONGEST:
             raise ValueError(
                 f"{folder}: with masks, the name of a photo must have at most {_LONGEST} bytes, got "
@@ -47,6 +57,97 @@ def check_names(folder: Path, names: list[str], masked: bool = False) -> None:
     if hidden:
         shown = ", ".join(sorted(hidden)[:_SHOWN]) + (", ..." if len(hidden) > _SHOWN else "")
         _log.warning("%s: %d hidden photos are left out (%s); rename them to use them", folder, len(hidden), shown)
+
+
+def usable_photos(photos: Sequence[Path], where: Path, fewest: int = 0, max_image_size: int = 1600) -> list[Path]:
+    """Those photographs that features can be found in; all are decoded. The log names the others.
+
+    Args:
+        photos: Files.
+        where: What was named, for the message.
+        fewest: How many there must be.
+        max_image_size: Pixels on the longer side that features are found at; 0 for the photographs' own.
+    Raises:
+        ValueError: Fewer are left; the message says what is wrong with the first other one.
+    """
+    return leave_out(photos, lambda photo: photo_fault(photo, max_image_size), where, fewest)
+
+
+def leave_out(photos: Sequence[Path], fault_of: Callable[[Path], str], where: Path, fewest: int = 0) -> list[Path]:
+    """Those photographs that have no fault; the log names the others.
+
+    Args:
+        photos, where, fewest: The arguments of `usable_photos`.
+        fault_of: What is wrong with one, a line that names it; empty where nothing is.
+    Raises:
+        ValueError: Fewer are left.
+    """
+    found = {photo: fault_of(photo) for photo in photos}
+    kept = [photo for photo in photos if not found[photo]]
+    faults = [fault for fault in found.values() if fault]
+    if faults and len(kept) < fewest:
+        raise ValueError(f"{where}: must hold at least {fewest} photos that can be used, got {len(kept)}; {faults[0]}")
+    for fault in faults[:_FAULTS]:
+        _log.warning("left out: %s", fault)
+    if len(faults) > _FAULTS:
+        _log.warning("%s: %d more photos are left out for such reasons", where, len(faults) - _FAULTS)
+    return kept
+
+
+def entry_fault(path: Path) -> str:
+    """Why an entry of a folder is no photograph or video, a line that names it; empty where it may be one: a file whose
+    name a COLMAP model can hold. It is not opened.
+    """
+    if any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") for c in path.name):
+        return (
+            f"{path.parent}: the name of a photo must be one line of UTF-8 without control characters, got "
+            f"{path.name[:80]!r}; rename this photo"
+        )
+    if path.is_file():
+        return ""
+    if not path.exists():
+        kind = f"a link to {path.readlink()}, where nothing is" if path.is_symlink() else "not there"
+    else:
+        kind = "a folder" if path.is_dir() else "a pipe or a device"
+    return f"{path}: must be a file, is {kind}; restore or remove it"
+
+
+def photo_fault(path: Path, max_image_size: int = 1600) -> str:
+    """Why features cannot be found in a photograph, a line that names it; empty where they can. It is decoded, once.
+
+    Args:
+        path: The photograph.
+        max_image_size: Pixels on the longer side that features are found at; 0 for its own.
+    """
+    if fault := entry_fault(path):
+        return fault
+    path = own_file(path)
+    status = path.stat()
+    found = _decoded(path, status.st_size, status.st_mtime_ns)
+    if isinstance(found, str):
+        return found
+    shrunk = min(1.0, max_image_size / max(found)) if max_image_size else 1.0
+    if shrunk * min(found) < _SMALLEST:
+        size = f"{found[0]}x{found[1]}" + (f" at {max_image_size} pixels along the longer side" if shrunk < 1 else "")
+        return (
+            f"{path}: a photo must be {_SMALLEST} pixels high and wide to have features, is {size}; take a larger one"
+        )
+    return ""
+
+
+@functools.lru_cache(maxsize=4096)
+def _decoded(path: Path, size: int, changed: int) -> tuple[int, int] | str:
+    """(width, height) of a photograph that can be decoded, else what the reader says. Kept until the file changes."""
+    try:
+        height, width = read_image(path).shape[:2]
+    except (ValueError, OSError) as error:
+        return str(error) if isinstance(error, ValueError) else f"{path}: must be readable, got: {error.strerror}"
+    return width, height
+
+
+def own_file(path: Path) -> Path:
+    """The file that the user knows, where a path is a link that drgs may have made to it."""
+    return path.resolve() if path.is_symlink() and path.exists() else path
 
 
 def readable_photos(folder: Path, names: list[str], target: Path, progress: Callable[[str, int, int], None]) -> Path:

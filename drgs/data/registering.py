@@ -20,7 +20,7 @@ from drgs.data.checks import IMAGE_SUFFIXES, image_size
 from drgs.data.gathering import FRAMES, joined_frames, recorded_frames, write_frames
 from drgs.data.mapping import PhotoGroups, map_photos
 from drgs.data.pairing import choose_new_pairs
-from drgs.data.photo_files import check_names, link_or_copy, readable_photos
+from drgs.data.photo_files import link_or_copy, photo_fault, readable_photos
 from drgs.data.sfm import SfmSummary
 from drgs.guards.outputs import claim
 from drgs.guards.unfinished import temporary_folder
@@ -81,7 +81,7 @@ def register(
             data set already, or none of the photographs connects to those that are there; then nothing has changed.
     """
     scene, files = Path(scene), [Path(path) for path in photographs]
-    _check(scene, files)
+    _check(scene, files, max_image_size)
     with claim(scene, "sfm", inputs=files) as output:
         output.check(["sparse", "database.db"])
         names = _new_names(output.path / "images", files)
@@ -100,7 +100,7 @@ def register(
     return found
 
 
-def _check(scene: Path, files: list[Path]) -> None:
+def _check(scene: Path, files: list[Path], max_image_size: int) -> None:
     """Refuse what is no data set of ours, and files that are no photographs, before any work."""
     missing = [
         name for name in ("database.db", *(f"sparse/0/{name}" for name in _MODEL)) if not (scene / name).is_file()
@@ -127,7 +127,8 @@ def _check(scene: Path, files: list[Path]) -> None:
         if file.resolve() in there or file.resolve() in seen:
             raise ValueError(f"{file}: must be a new photograph, is in {scene} already or named twice; leave it out")
         seen.add(file.resolve())
-        check_names(file.parent, [file.name])
+        if fault := photo_fault(file, max_image_size):
+            raise ValueError(fault)
 
 
 def _new_names(images: Path, files: list[Path]) -> list[str]:

@@ -18,7 +18,7 @@ from drgs.data.gathering import fill, named_files, recorded_frames
 from drgs.data.mapping import PhotoGroups, map_photos
 from drgs.data.masks import ALPHA_MASKS, feature_mask, masked_photo, masks_of
 from drgs.data.pairing import choose_pairs
-from drgs.data.photo_files import check_names, readable_photos
+from drgs.data.photo_files import check_names, readable_photos, usable_photos
 from drgs.data.videos import list_videos
 from drgs.guards.outputs import claim
 from drgs.guards.unfinished import temporary_folder
@@ -115,9 +115,9 @@ def run_sfm(
         frames: Largest number of frames of all videos together (`pick_frames`).
     Raises:
         FileNotFoundError: No such folder or file, or no mask of a photo.
-        ValueError: Fewer than 2 photos, an unknown option, a video that cannot be decoded, photos that do not connect,
-            or an `out_dir` that holds a COLMAP project or photos that were not made here; a mask of another shape, one
-            that keeps nothing, or a photo without alpha.
+        ValueError: Fewer than 2 photos that can be used (the log names those that are left out), an unknown option, a
+            video that cannot be decoded, photos that do not connect, or an `out_dir` that holds a COLMAP project or
+            photos that were not made here; a mask of another shape, one that keeps nothing, or a photo without alpha.
     """
     out_dir = Path(out_dir)
     paths = [Path(photos)] if isinstance(photos, str | os.PathLike) else [Path(path) for path in photos]
@@ -128,9 +128,7 @@ def run_sfm(
     report = progress or (lambda stage, done, total: None)
     image_dir = _one_folder(paths)
     photographs, videos = ([], []) if image_dir else named_files(paths)
-    if image_dir:
-        _checked(image_dir, masks)
-    elif not videos and len(photographs) < 2:
+    if not image_dir and not videos and len(photographs) < 2:
         raise ValueError(f"{paths[0]}: must be at least 2 photos, got {len(photographs)}; add overlapping photos")
     linked = {} if image_dir is None else {"images": image_dir}
     linked |= {} if masks in (None, ALPHA_MASKS) else {"masks": Path(masks)}
@@ -142,11 +140,12 @@ def run_sfm(
             (partial / "models").mkdir()
             gathered = None
             if image_dir is None:
+                photographs = usable_photos(photographs, paths[0], 0 if videos else 2, max_image_size)
                 gathered = fill(partial / "images", photographs, videos, "sfm", frames, report)
                 marks.append(time.perf_counter())
             folder = image_dir or partial / "images"
             try:
-                names, mask_files = _checked(folder, masks)
+                names, mask_files = _checked(folder, masks, max_image_size)
                 if mask_files is not None:
                     _write_masked(folder, names, mask_files, partial, report)
                 summary = _reconstruct(
@@ -188,13 +187,14 @@ def _one_folder(paths: list[Path]) -> Path | None:
     return None if list_videos(folder) else folder
 
 
-def _checked(folder: Path, masks: str | os.PathLike | None) -> tuple[list[str], list[Path] | None]:
-    """Names of the photos in a folder, which must be enough and such that COLMAP can hold them, and their masks."""
-    names = [path.name for path in list_images(folder)]
+def _checked(folder: Path, masks: str | os.PathLike | None, max_image_size: int) -> tuple[list[str], list[Path] | None]:
+    """Names of the photos in a folder that can be used, which must be enough, and their masks."""
+    photos = usable_photos(list_images(folder), folder, 2, max_image_size)
+    names = [path.name for path in photos]
     check_names(folder, names, masked=masks is not None)
     if len(names) < 2:
         raise ValueError(f"{folder}: must hold at least 2 photos, got {len(names)}; add overlapping photos")
-    return names, None if masks is None else masks_of([folder / name for name in names], masks)
+    return names, None if masks is None else masks_of(photos, masks)
 
 
 def _write_masked(image_dir: Path, names: list[str], masks: list[Path], partial: Path, report: Progress) -> None:
@@ -259,15 +259,18 @@ def _reconstruct(
     marks = [time.perf_counter()]
     with quiet():
         readable = readable_photos(image_dir, names, partial / "readable", report)
-        _extract(
-            database,
-            partial / "photos" if is_masked else readable,
-            _lenses(image_dir, readable, names, report),
-            camera_model,
-            max_image_size,
-            partial / "masks" if is_masked else None,
-            report,
-        )
+        lenses = _lenses(image_dir, readable, names, report)
+    _extract(
+        database,
+        partial / "photos" if is_masked else readable,
+        lenses,
+        camera_model,
+        max_image_size,
+        partial / "masks" if is_masked else None,
+        report,
+        image_dir,
+    )
+    with quiet():
         if is_masked:
             state_focal_lengths(database, readable)
         marks.append(time.perf_counter())
@@ -343,6 +346,7 @@ def _extract(
     max_image_size: int,
     masks: Path | None,
     report: Progress,
+    originals: Path,
 ) -> None:
     """Features of all photos, those of each lens with a camera of theirs; those that share it with no other at once."""
     from drgs.data.matching import extract
@@ -361,6 +365,7 @@ def _extract(
             wide_baseline=True,
             masks=masks,
             progress=lambda stage, done, _, before=before: report(stage, before + done, total),
+            originals=originals,
         )
         before += len(names)
 

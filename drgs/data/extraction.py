@@ -1,0 +1,64 @@
+"""SIFT features with COLMAP, in a process of its own (reader_process.py): the detector crashes over some photos."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+from typing import Any
+
+from drgs.data.colmap_bindings import pycolmap
+from drgs.data.reader_process import serve
+
+__all__ = ["features"]
+
+_MASKED_CONTRAST = 0.002  # a third of COLMAP's: an object alone has few features, and weak ones match as well
+# of which COLMAP's own handlers print a stack on stderr
+_CRASHES = (signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGABRT)
+
+
+def features(path: Path, names: list[str], options: dict[str, Any], tell: Any) -> int | None:
+    """SIFT features of some images into a COLMAP database.
+
+    Args:
+        path: The images, as messages name them; not read.
+        names: Names of the images in their folder.
+        options: `database`, `folder`, `camera_model`, `shared_camera`, `max_image_size`, `wide_baseline`, `masks`,
+            `camera` and `threads`, as `drgs.data.matching.extract` takes them.
+    Returns:
+        Number of the camera that the images share; None where each has one of its own.
+    """
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.use_gpu = False
+    extraction.num_threads = options["threads"]
+    if options["max_image_size"]:
+        extraction.max_image_size = options["max_image_size"]
+    extraction.sift.estimate_affine_shape = options["wide_baseline"]
+    extraction.sift.domain_size_pooling = options["wide_baseline"]
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = options["camera_model"]
+    if options["masks"] is not None:
+        reader.mask_path = options["masks"]
+        extraction.sift.peak_threshold = _MASKED_CONTRAST
+    if options["camera"] is not None:
+        reader.existing_camera_id = options["camera"]
+    is_shared = options["shared_camera"]
+    pycolmap.extract_features(
+        options["database"],
+        options["folder"],
+        image_names=names,
+        camera_mode=pycolmap.CameraMode.SINGLE if is_shared else pycolmap.CameraMode.PER_IMAGE,
+        reader_options=reader,
+        extraction_options=extraction,
+        device=pycolmap.Device.cpu,
+    )
+    if not is_shared or options["camera"] is not None:
+        return options["camera"]
+    with pycolmap.Database.open(options["database"]) as handle:  # the one that this call made is the newest
+        return max(found.camera_id for found in handle.read_all_cameras())
+
+
+if __name__ == "__main__":
+    pycolmap.logging.minloglevel = 3  # errors included: they arrive as exceptions
+    for crash in _CRASHES:
+        signal.signal(crash, signal.SIG_DFL)
+    serve({"features": features})
