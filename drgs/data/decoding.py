@@ -9,6 +9,7 @@ start.
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -19,6 +20,7 @@ import cv2
 import numpy as np
 
 from drgs.data.checks import native_stderr
+from drgs.data.hdr_video import HdrReader, hdr_transfer
 from drgs.data.reader_process import serve
 from drgs.guards import memory
 
@@ -59,7 +61,7 @@ def walk(path: Path, version: Sequence[int], is_mp4: bool, tell: Callable[[int],
 
 
 def frame(path: Path, version: Sequence[int], is_mp4: bool, index: int, tell: Callable[[int], None]) -> np.ndarray:
-    """(H, W, 3) uint8, RGB, of a frame; of the videos read last, some stay open.
+    """(H, W, 3) uint8, sRGB, of a frame, also of an HDR video.
 
     Args:
         path, version, is_mp4, tell: The arguments of `walk`.
@@ -67,20 +69,25 @@ def frame(path: Path, version: Sequence[int], is_mp4: bool, index: int, tell: Ca
     Raises:
         ValueError: It cannot be decoded.
     """
+    return _reader(path, version, is_mp4, tell).frame(index)
+
+
+def _reader(path: Path, version: Sequence[int], is_mp4: bool, tell: Callable[[int], None]) -> _Reader:
+    """An open video; of those read last, some stay open."""
     key = (path, *version)
     if key not in _readers:
         while len(_readers) >= _OPEN:
             _readers.popitem(last=False)
         video = walk(path, version, is_mp4, tell)
-        _readers[key] = _Reader(path, video["stamps"], video["count"])
+        _readers[key] = _Reader(path, video["stamps"], video["count"], is_mp4)
     _readers.move_to_end(key)
-    return _readers[key].frame(index)
+    return _readers[key]
 
 
 def gray(
     path: Path, version: Sequence[int], is_mp4: bool, index: int, longest: int, tell: Callable[[int], None]
 ) -> np.ndarray:
-    """(h, w) uint8 of a frame, reduced.
+    """(h, w) uint8 of a frame, reduced; of an HDR video its coded luma, which is as sharp.
 
     Args:
         path, version, is_mp4, index, tell: The arguments of `frame`.
@@ -88,7 +95,7 @@ def gray(
     Raises:
         ValueError: It cannot be decoded.
     """
-    found = cv2.cvtColor(frame(path, version, is_mp4, index, tell), cv2.COLOR_RGB2GRAY)
+    found = _reader(path, version, is_mp4, tell).frame(index, is_gray=True)
     scale = longest / max(found.shape)
     return found if scale >= 1 else cv2.resize(found, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
 
@@ -176,7 +183,7 @@ def _decoded(path: Path, packets: int, tell: Callable[[int], None]) -> list[floa
 class _Reader:
     """An open video and the place where it is."""
 
-    def __init__(self, path: Path, stamps: list[float], count: int) -> None:
+    def __init__(self, path: Path, stamps: list[float], count: int, is_mp4: bool) -> None:
         self._path = path
         self._stamps = stamps
         self._count = count
@@ -184,19 +191,40 @@ class _Reader:
         self._told = False
         self._sought = False
         self._capture = _opened(path, [])
+        self._hdr: HdrReader | None = None
+        transfer = hdr_transfer(path, is_mp4)
+        if transfer and importlib.util.find_spec("av") is not None:
+            self._hdr = HdrReader(path, stamps)
+        elif transfer:
+            _log.warning(
+                "%s: is HDR video (%s), whose colors come out wrong without the package av; pip install 'drgs[video]', "
+                "or convert it to SDR",
+                path,
+                transfer,
+            )
 
-    def frame(self, index: int) -> np.ndarray:
-        """(H, W, 3) uint8, RGB, of the frame that is shown as number `index`; ValueError if it cannot be decoded."""
+    def frame(self, index: int, is_gray: bool = False) -> np.ndarray:
+        """(H, W, 3) uint8, RGB, or (H, W), of the frame that is shown as number `index`; ValueError if it cannot be
+        decoded.
+        """
+        if self._hdr is not None:
+            found = self._hdr.frame(index, is_gray)
+            if found is None:
+                raise self._undecoded(index)
+            return found
         with native_stderr() as complaints:
             data = self._at(index)
         if data is None:
-            raise ValueError(f"{self._path}: frame {index} of {self._count} must be decoded, could not be; {_COPY}")
+            raise self._undecoded(index)
         # After a seek, decoders complain about frames before it that others refer to, and leave these out.
         if complaints and not self._told and not self._sought:
             self._told = True
             text = complaints[0].strip()
             _log.warning("%s: is damaged, frames may be wrong (%s); copy it again", self._path, text)
-        return cv2.cvtColor(data, cv2.COLOR_BGR2RGB)
+        return cv2.cvtColor(data, cv2.COLOR_BGR2GRAY if is_gray else cv2.COLOR_BGR2RGB)
+
+    def _undecoded(self, index: int) -> ValueError:
+        return ValueError(f"{self._path}: frame {index} of {self._count} must be decoded, could not be; {_COPY}")
 
     def _at(self, index: int) -> np.ndarray | None:
         """The pixels of a frame (BGR), or None: going on from where the video is, by seeking, or from the start."""
