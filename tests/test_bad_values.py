@@ -125,8 +125,9 @@ def test_lens_that_does_not_belong_to_its_photo(tmp_path, caplog):
 def test_poses_that_tell_no_depth(tmp_path, caplog):
     """One pose for all views is refused by `fit`; one place for all, and some poses twice, are warned about."""
     data = write_transforms(tmp_path, count=4)
-    for frame in data["frames"]:
+    for shade, frame in enumerate(data["frames"]):
         frame["transform_matrix"] = c2w_to_opengl(np.linalg.inv(poses(1)[0])).tolist()
+        write_image(tmp_path / frame["file_path"], gradient() // (1 + shade))  # four photographs, not one
     save(tmp_path, data)
     assert cli.main(["fit", str(tmp_path), "-o", str(tmp_path / "run"), "--quiet"]) == 2
     assert not (tmp_path / "run").exists()

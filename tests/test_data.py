@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -215,8 +216,8 @@ def test_transforms_depth_units(tmp_path):
 def test_transforms_blender_split_without_suffix(tmp_path):
     """Blender's files: three splits, no suffix, an angle for a focal length."""
     angle = 2 * np.arctan(0.5 * WIDTH / 20)
-    for split in ("train", "test", "val"):
-        write_image(tmp_path / split / "r_0.png", gradient())
+    for shade, split in enumerate(("train", "test", "val")):
+        write_image(tmp_path / split / "r_0.png", gradient() // (1 + shade))
         frame = {"file_path": f"./{split}/r_0", "transform_matrix": np.eye(4).tolist()}
         data = {"camera_angle_x": angle, "frames": [frame]}
         save(tmp_path, data, f"transforms_{split}.json")
@@ -459,3 +460,87 @@ def test_views_of_one_name_are_told_apart(tmp_path):
     images.write_bytes(images.read_bytes().replace(b"im1.png\0", b"im0.jpg\0"))
     (tmp_path / "colmap" / "images" / "im1.png").rename(tmp_path / "colmap" / "images" / "im0.jpg")
     assert sorted(view.name for view in load(tmp_path / "colmap").views) == ["im0", "im0_2"]
+
+
+def test_depth_by_nerfcapture_keys(tmp_path):
+    """`depth_path` and `integer_depth_scale` (NeRFCapture, SplaTAM, instant-ngp): 19660 of 65535 units of 10 m are 3 m,
+    under either key of the file; nerfstudio's unit may say the same, not another.
+    """
+    write_image(tmp_path / "d.png", np.full((HEIGHT, WIDTH), 19660, np.uint16))
+    np.save(tmp_path / "d.npy", np.full((HEIGHT, WIDTH), 3.0))
+    scale = {"integer_depth_scale": 10 / 65535}
+    for key, name in (("depth_path", "d.png"), ("depth_file_path", "d.png"), ("depth_path", "d.npy")):
+        write_transforms(tmp_path, extra={key: name}, **scale)
+        assert load(tmp_path).views[0].depth()[3, 4] == pytest.approx(3.0, abs=1e-3)
+    write_transforms(tmp_path, extra={"depth_path": "d.png"}, depth_unit_scale_factor=1e-3, **scale)
+    with pytest.raises(ValueError, match=r"unit of depth maps must be stated once, got depth_unit.* 0.001 and integer"):
+        load(tmp_path)
+    write_transforms(tmp_path, extra={"depth_path": "d.png"}, integer_depth_scale=0)
+    with pytest.raises(ValueError, match=r"integer_depth_scale must be in \(0, 1e\+09\), got 0"):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize("lazy", [False, True])
+@pytest.mark.parametrize("twin", ["listed again", "link", "bytes", "suffix", "format"])
+def test_a_photograph_counts_once(tmp_path, caplog, twin, lazy):
+    """Listed twice, or under two names, by a link or a copy, in one format or two: one view, held out or trained on."""
+    data = write_transforms(tmp_path, count=5)
+    photo = tmp_path / "images" / "2.png"
+    name = {"listed again": "2.png", "suffix": "2.jpg", "format": "z.jpg"}.get(twin, "z.png")
+    if twin == "link":
+        (photo.parent / name).symlink_to(photo)
+    elif twin == "bytes":
+        (photo.parent / name).write_bytes(photo.read_bytes())
+    elif name.endswith(".jpg"):
+        write_image(photo.parent / name, gradient())
+    data["frames"].append({**data["frames"][2], "file_path": f"images/{name}"})
+    save(tmp_path, data)
+    dataset = load(tmp_path, test_every=2, lazy=lazy)
+    assert [view.name for view in dataset.views] == ["0", "1", "2", "3", "4"]
+    assert f"1 of the 6 photographs are listed again ({Path(name).stem if 'z' in name else '2_2'} is 2)" in caplog.text
+
+
+def test_a_photograph_of_two_splits_is_held_out(tmp_path):
+    """Unless nothing were left to train on: then it is trained on. What is only in `val` beside `test` stays where it
+    was.
+    """
+    data = write_transforms(tmp_path, count=4)
+    names = [frame["file_path"] for frame in data["frames"]]
+    (tmp_path / "transforms.json").unlink()
+    for train, val, test, expected in (
+        (names, names[:1], names[2:], (["0", "1"], ["2", "3"])),
+        (names, names[:1], [], (["1", "2", "3"], ["0"])),
+        (names, [], names, (["0", "1", "2", "3"], [])),
+    ):
+        for split, chosen in (("train", train), ("val", val), ("test", test)):
+            path = tmp_path / f"transforms_{split}.json"
+            path.unlink(missing_ok=True)
+            if chosen:
+                save(tmp_path, {**data, "frames": [f for f in data["frames"] if f["file_path"] in chosen]}, path.name)
+        assert tuple([view.name for view in part] for part in load(tmp_path).split()) == expected
+
+
+@pytest.mark.parametrize("write", [write_colmap, write_llff])
+def test_copies_in_other_formats_count_once(tmp_path, write):
+    """COLMAP gives two copies of one photograph nearly the same pose, LLFF's rows may have the same one."""
+    if write is write_colmap:
+        images = write(tmp_path) / "images.txt"
+        pytest.importorskip("pycolmap").Reconstruction(images.parent).write_text(images.parent)
+        for file in images.parent.glob("*.bin"):
+            file.unlink()
+        (images.parent / "rigs.txt").unlink()
+        (images.parent / "frames.txt").unlink()
+        lines = [line for line in images.read_text().splitlines() if not line.startswith("#")]
+        words = lines[0].split()
+        words[0], words[5], words[9] = "9", f"{float(words[5]) + 1e-3:.9f}", "z.png"
+        images.write_text("\n".join([*lines, " ".join(words), ""]) + "\n")
+        first = "im0"
+    else:
+        rows = write(tmp_path)
+        np.save(tmp_path / "poses_bounds.npy", np.concatenate([rows, rows[:1]]))
+        first = "0"
+    source = tmp_path / "images" / f"{first}.png"
+    (tmp_path / "images" / "z.png").write_bytes(source.read_bytes())
+    names = [view.name for view in load(tmp_path).views]
+    assert first in names
+    assert "z" not in names

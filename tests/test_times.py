@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from scenes_random import assert_same_sums
-from test_data import write_transforms
+from test_data import gradient, write_image, write_transforms
 
 from drgs.cameras import Camera, orbit
 from drgs.data import load
@@ -125,6 +125,7 @@ def test_views_of_one_pose_at_several_times_are_not_duplicates(tmp_path, caplog)
     """Two photographs from one place at two times are two views; without times they are told of."""
     data = write_transforms(tmp_path)
     data["frames"][1]["transform_matrix"] = data["frames"][0]["transform_matrix"]
+    write_image(tmp_path / data["frames"][1]["file_path"], gradient() // 2)
     for times, told in (((0.0, 1.0, 0.0), False), ((None, None, None), True)):
         for frame, time in zip(data["frames"], times, strict=True):
             frame["time"] = time

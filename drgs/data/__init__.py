@@ -18,7 +18,7 @@ from drgs.data.replica import POSES
 from drgs.data.semantics import Semantics
 from drgs.data.sidecars import attach
 from drgs.data.videos import list_videos
-from drgs.data.view_checks import check_times
+from drgs.data.view_checks import check_times, count_once
 from drgs.data.views import View
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.registry import Registry
@@ -96,9 +96,10 @@ def load(
         test_every: Every how many views `Dataset.split` holds one out; 0 for none.
         test_offset: index, by name, of the first view that is held out, below `test_every`.
         background: Color in [0,1] that images with an alpha channel are composited on.
-        lazy: Open no image, mask or depth file at all: cameras have the size that the camera file states, until
-            `View.checked` compares it with the image. Where intrinsics are angles and no size is stated (Blender), all
-            views get the size of the first training image, the only one opened.
+        lazy: Open no image, mask or depth file at all, but photographs of nearly one pose, which may be one: cameras
+            have the size that the camera file states, until `View.checked` compares it with the image. Where intrinsics
+            are angles and no size is stated (Blender), all views get the size of the first training image, the only one
+            opened.
         points: False reads no points and no observations of images: those of a COLMAP model, or of a named PLY, come
             from all its images; of a model of synchronous cameras, those are read that two cameras show which are not
             held out.
@@ -139,6 +140,7 @@ def load(
     if test_cameras is not None:
         dataset.test_cameras = tuple(test_cameras)
     apply_held_out(dataset)
+    count_once(dataset)
     dataset.split()  # refuses numbers that cannot be
     check_times(dataset)
     if semantics:

@@ -35,6 +35,7 @@ _LENSES = {
     "OPENCV_FISHEYE": "opencv_fisheye",
     "EQUIRECTANGULAR": "equirectangular",
 }
+_DEPTHS = ("depth_file_path", "depth_path")  # nerfstudio's key, and NeRFCapture's, SplaTAM's and instant-ngp's
 _MILLIMETER = 1e-3
 _DEPTH_SCALE_MAX = 1e9
 
@@ -62,8 +63,8 @@ def load_transforms(
 
     Intrinsics come from each frame or from the file: fl_x, fl_y, cx, cy, w, h, or camera_angle_x; lens from
     camera_model and k1, k2, k3, k4, p1, p2. Frames may state their `time`, and name `mask_path` and
-    `depth_file_path` (z-depth; unit from `depth_unit_scale_factor`, else millimeters for images and scene units for
-    `.npy`).
+    `depth_file_path`, or `depth_path` (z-depth; unit from `depth_unit_scale_factor`, else, for images,
+    `integer_depth_scale`, else millimeters for images and scene units for `.npy`).
 
     Args:
         path: The folder, or one JSON file.
@@ -214,20 +215,31 @@ def _fill(
     shared = {key: value for key, value in data.items() if key not in ("frames", "time")}
     merged = {**shared, **frame}
     camera = _camera(where, merged, _pose(where, frame.get("transform_matrix")), view.image_path, first)
-    depth = _optional_file(folder, where, frame, "depth_file_path")
-    unit = 1.0 if depth is not None and depth.suffix == ".npy" else _MILLIMETER
+    depth = next((path for key in _DEPTHS if (path := _optional_file(folder, where, frame, key))), None)
     view.camera = fit_to_image(camera, view.image_path, where, lazy=first is not None)
     view.mask_path = _optional_file(folder, where, frame, "mask_path")
     view.depth_path = depth
-    view.depth_scale = _number(where, merged, "depth_unit_scale_factor", unit)
-    if not 0 < view.depth_scale < _DEPTH_SCALE_MAX:
-        raise ValueError(
-            f"{where}: depth_unit_scale_factor must be in (0, {_DEPTH_SCALE_MAX:g}), "
-            f"got {view.depth_scale:g}; correct it"
-        )
+    view.depth_scale = _depth_scale(where, merged, depth)
     view.background = background
     view.is_checked = first is None
     return own
+
+
+def _depth_scale(where: str, values: dict, depth: Path | None) -> float:
+    """Scene units in one unit of a depth map: what nerfstudio's key states, else NeRFCapture's, which is of images."""
+    is_image = depth is None or depth.suffix != ".npy"
+    scales = {
+        key: _number(where, values, key)
+        for key in ("depth_unit_scale_factor", *(["integer_depth_scale"] if is_image else []))
+        if key in values
+    }
+    for key, scale in scales.items():
+        if not 0 < scale < _DEPTH_SCALE_MAX:
+            raise ValueError(f"{where}: {key} must be in (0, {_DEPTH_SCALE_MAX:g}), got {scale:g}; correct it")
+    if depth is not None and len(scales) == 2 and not math.isclose(*scales.values(), rel_tol=1e-3):
+        stated = " and ".join(f"{key} {scale:g}" for key, scale in scales.items())
+        raise ValueError(f"{where}: the unit of depth maps must be stated once, got {stated}; remove the wrong one")
+    return next(iter(scales.values()), _MILLIMETER if is_image else 1.0)
 
 
 def _view_name(file_path: str) -> str:

@@ -4,17 +4,22 @@ names of their own, from several places.
 
 from __future__ import annotations
 
+import filecmp
 import logging
+from collections import defaultdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.data.checks import read_image, unit_range
+from drgs.data.resizing import resize_area
+
 if TYPE_CHECKING:
     from drgs.data.dataset import Dataset
     from drgs.data.views import View
 
-__all__ = ["check_cameras", "check_parallax", "check_times", "go_on_without", "make_unique"]
+__all__ = ["check_cameras", "check_parallax", "check_times", "count_once", "go_on_without", "make_unique"]
 
 # of cameras that film what moves (docs/dynamic-data.md, Layouts)
 _FEW_PLACES = 4
@@ -23,6 +28,11 @@ _FEWEST = 3  # images that a data set must have where others are missing
 _SHOWN = 5  # of those are named at once
 _ALSO = 50  # more of them at most, by the names of their files
 _LONGEST = 400  # characters of a path in messages
+# Copies of one photograph have nearly one pose: structure from motion places each by itself, by the same features.
+_NEAR = 1e-2  # of the spread of the cameras' centers; also the largest difference of entries of their rotations
+_EXACT = 1e-9  # of the spread and of 1: the same numbers, but for rounding
+_THUMBNAIL = 32  # pixels across the small pictures by which copies in two formats are compared
+_ALIKE = 0.05  # largest difference of these, white being 1: compression stays below 0.01, a passer-by is above
 
 _log = logging.getLogger(__name__)
 
@@ -157,3 +167,88 @@ def make_unique(views: list[View]) -> None:
             number += 1
             view.name = f"{name}_{number}"
         seen.add(view.name)
+
+
+def count_once(dataset: Dataset) -> None:
+    """Leave out photographs that are listed again, under the same name or another one, and say so.
+
+    Two views are of one photograph if they have one file (or links to it), nearly one pose and files of the same bytes
+    or names that differ in the suffix alone, or exactly one pose and pictures that look the same; of different times or
+    cameras they never are. The first that is listed is kept. It is held out if any of them is, unless that would leave
+    no photograph to train on. No file is opened but those of nearly one pose.
+    """
+    listed = [*dataset.views, *dataset.absent]
+    copies = _copies(listed)
+    if not copies:
+        return
+    splits = [view.split for view in listed]
+    kept = [view for index, view in enumerate(listed) if index not in copies]
+    held_out, unused = ("test", "val") if "test" in splits else ("val", "test")
+    for order in ((held_out, "train", "", unused), ("train", "", held_out, unused)):
+        for first in set(copies.values()):
+            named = [splits[index] for index, of in copies.items() if of == first]
+            listed[first].split = min((splits[first], *named), key=order.index)
+        if any(view.split not in ("val", "test") for view in kept):
+            break
+    shown = [f"{listed[index].name} is {listed[first].name}" for index, first in copies.items()][:_SHOWN]
+    _log.warning(
+        "%s: %d of the %d photographs are listed again (%s); each one counts once, in one split",
+        dataset.path,
+        len(copies),
+        len(listed),
+        ", ".join(shown) + (", ..." if len(copies) > _SHOWN else ""),
+    )
+    there = {id(view) for view in kept}
+    dataset.views = [view for view in dataset.views if id(view) in there]
+    dataset.absent = [view for view in dataset.absent if id(view) in there]
+
+
+def _copies(views: list[View]) -> dict[int, int]:
+    """Index of each view that is of the same photograph as an earlier one -> index of the first such view."""
+    poses = np.full((len(views), 3, 4), np.nan)  # of what is absent: near nothing
+    for index, view in enumerate(views):
+        if view.camera is not None:
+            poses[index] = view.camera.c2w[:3]
+    if np.isnan(poses).all():
+        return {}
+    centers = poses[..., 3]
+    poses[..., 3] /= max(np.ptp(centers[~np.isnan(centers[:, 0])], axis=0).max(), _EXACT)
+    alike: dict[tuple, list[int]] = defaultdict(list)
+    for index, view in enumerate(views):
+        path = view.image_path
+        if path is None:
+            continue
+        about = view.camera_name, view.camera.time if view.camera else None
+        alike["name", path.with_suffix(""), *about].append(index)
+        if view.camera is None:
+            continue
+        file = path.stat()
+        alike["file", file.st_dev, file.st_ino, *about].append(index)
+        alike["size", file.st_size, *about].append(index)
+        alike["pose", (np.round(poses[index] / _EXACT) + 0.0).tobytes(), *about].append(index)  # -0.0 is 0.0
+    found: dict[int, int] = {}
+    for (kind, *_), members in alike.items():
+        for n, index in enumerate(members):
+            path = Path(views[index].image_path or "")
+            near = np.abs(poses[members[:n]] - poses[index]).max(axis=(1, 2)) <= _NEAR
+            for other, is_near in zip(members[:n], near, strict=True):
+                before = Path(views[other].image_path or "")
+                same = kind == "file" or path == before
+                same = same or bool(is_near and (kind == "name" or filecmp.cmp(path, before, shallow=False)))
+                if same or (kind == "pose" and _look_alike(path, before)):
+                    found[index] = min(found.get(index, index), other)
+                    break
+    for index in sorted(found):  # a copy of a copy is one of the first
+        found[index] = found.get(found[index], found[index])
+    return found
+
+
+def _look_alike(one: Path, other: Path) -> bool:
+    """Whether two image files show the same picture, perhaps in two formats or sizes."""
+    try:
+        pictures = [unit_range(read_image(path), path) for path in (one, other)]
+    except ValueError:  # what cannot be read is said where it is read
+        return False
+    gray = [picture[..., :3].mean(axis=-1) if picture.ndim == 3 else picture for picture in pictures]
+    small = [resize_area(picture, _THUMBNAIL, _THUMBNAIL) for picture in gray]
+    return bool(np.abs(small[0] - small[1]).max() <= _ALIKE)
