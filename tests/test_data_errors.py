@@ -119,7 +119,9 @@ def test_colmap_bad_poses_and_missing_files(tmp_path):
         load(tmp_path)
     one_line(error)
     frames.write_bytes(whole)
-    (tmp_path / "images").rename(tmp_path / "photos")
+    for file in (tmp_path / "images").iterdir():
+        file.unlink()
+    (tmp_path / "images").rmdir()
     with pytest.raises(FileNotFoundError, match="must lie in a folder named images"):
         load(tmp_path)
     (target / "points3D.bin").unlink()
@@ -411,3 +413,214 @@ def test_a_left_handed_llff_pose_is_named_by_its_own_axes(tmp_path):
     with pytest.raises(ValueError, match=r"reflection .*\(down, right, backward\).* column 3 of its 3x5") as error:
         load(tmp_path)
     one_line(error)
+
+
+# --------------------------------------------------------------------------- what other programs leave
+
+
+def text_model(folder):
+    """Folder of a COLMAP model in text as programs of before rigs write it."""
+    target = write_colmap(folder, text=True)
+    for name in ("rigs", "frames"):
+        (target / f"{name}.txt").unlink()
+    return target
+
+
+@pytest.mark.parametrize("points", [True, False])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda lines: lines[:-1],  # ends after the last pose
+        lambda lines: lines[::2],  # poses alone
+        lambda lines: [x for row in zip(lines[::2], lines[1::2], strict=True) for x in (row[0], "# seen", row[1])],
+        lambda lines: ["\ufeff# caf\xe9", *lines],
+    ],
+)
+def test_colmap_text_as_other_programs_write_it(tmp_path, change, points):
+    """Missing lines of observations, comments anywhere and in any encoding, a byte order mark, sizes as 24.0."""
+    target = text_model(tmp_path)
+    images, cameras = target / "images.txt", target / "cameras.txt"
+    lines = [line for line in images.read_text().splitlines() if not line.startswith("#")]
+    images.write_bytes("\n".join([*change(lines), ""]).encode("utf-8" if "\ufeff" in change(lines)[0] else "latin-1"))
+    cameras.write_bytes("# caf\xe9\n".encode("latin-1") + cameras.read_bytes().replace(b" 24 16 ", b" 24.0 16.0 "))
+    dataset = load(tmp_path, points=points)
+    assert [view.name for view in dataset.views] == ["im0", "im1", "im2", "im3"]
+    np.testing.assert_allclose(dataset.views[3].camera.w2c, poses(4)[3], atol=1e-9)
+    assert (dataset.points is not None) == points
+    assert not points or len(dataset.points) == 5
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize(
+    ("name", "old", "new", "told"),
+    [
+        ("cameras", 20.0, np.nan, "must (have|hold) finite .*, got nan"),
+        ("cameras", 20.0, np.inf, "must (have|hold) finite .*, got inf"),
+        ("cameras", "twice", "", "cameras....: must be as COLMAP writes it, each ID once"),
+        ("images", "twice", "", "images....: must be as COLMAP writes it and fit to cameras...., each ID once"),
+        ("points3D", "twice", "", "points3D....: must be as COLMAP writes it and fit to cameras.... and images"),
+    ],
+)
+def test_colmap_says_which_file_is_wrong(tmp_path, text, name, old, new, told):
+    """Never in the words of its C++ library."""
+    target = text_model(tmp_path) if text else write_colmap(tmp_path)
+    file = target / f"{name}{'.txt' if text else '.bin'}"
+    data = file.read_bytes()
+    if old == "twice" and text:
+        rows = [line for line in data.splitlines() if not line.startswith(b"#")]
+        data = b"\n".join([*rows, *rows[-2 if name == "images" else -1 :], b""])
+    elif old == "twice":
+        (count,) = struct.unpack("<Q", data[:8])
+        size = (len(data) - 8) // count
+        data = struct.pack("<Q", count + 1) + data[8:] + data[8 : 8 + size]
+    else:
+        ends = (b" 20 ", f" {new} ".encode()) if text else (struct.pack("<d", old), struct.pack("<d", new))
+        assert ends[0] in data
+        data = data.replace(*ends)
+    file.write_bytes(data)
+    with pytest.raises(ValueError, match=told) as error:
+        load(tmp_path)
+    one_line(error)
+    assert file.name in str(error.value)
+    assert not re.search(r"\.cc:|Check failed|range_check|::", str(error.value))
+
+
+def test_colmap_rigs_that_fit_to_nothing(tmp_path, caplog):
+    """Both are named; one alone is left out, as poses are in images.txt, too."""
+    target = write_colmap(tmp_path, text=True)
+    rigs = target / "rigs.txt"
+    rigs.write_text(rigs.read_text().replace("CAMERA", "LIDAR"))
+    with pytest.raises(ValueError, match=r"rigs.txt and frames.txt must be of one model .*remove both") as error:
+        load(tmp_path)
+    one_line(error)
+    rigs.unlink()
+    assert len(load(tmp_path).views) == 4
+    assert "has one of rigs.txt and frames.txt alone" in caplog.text
+
+
+def test_colmap_points_as_a_ply(tmp_path):
+    """`points3D.ply`, as 3DGS's code writes it, or the only PLY there; of several, which one to rename."""
+    target = write_colmap(tmp_path)
+    (target / "points3D.bin").unlink()
+    header = "ply\nformat ascii 1.0\nelement vertex 1\n" + "".join(f"property float {x}\n" for x in "xyz")
+    (target / "pc.ply").write_text(f"{header}end_header\n1 2 3\n")
+    (target / "other.ply").write_text(f"{header}end_header\n4 5 6\n")
+    with pytest.raises(FileNotFoundError, match=r"of PLY files other.ply, pc.ply: rename the one .* points3D.ply"):
+        load(tmp_path)
+    (target / "other.ply").unlink()
+    assert load(tmp_path).points.tolist() == [[1, 2, 3]]
+    (target / "pc.ply").rename(target / "points3D.ply")
+    assert load(tmp_path).points.tolist() == [[1, 2, 3]]
+    assert load(tmp_path).point_source == "points3D.ply, 1 points"
+
+
+@pytest.mark.parametrize("place", ["colmap", "colmap_sparse/0", "reconstruction/text/3", "scene/sparse/0"])
+@pytest.mark.parametrize("photos", ["images", "input", ""])
+def test_colmap_parts_in_other_places(tmp_path, place, photos):
+    """The model where other programs put it, and photographs in another folder beside it."""
+    target = write_colmap(tmp_path)
+    (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+    target.rename(tmp_path / place)
+    if photos != "images":
+        (tmp_path / "images").rename(tmp_path / "input")
+    if not photos:
+        for file in (tmp_path / "input").iterdir():
+            file.rename(tmp_path / file.name)
+    if photos == "images" or place.startswith("colmap"):
+        views = load(tmp_path).views
+        assert (len(views), views[0].image().shape) == (4, (HEIGHT, WIDTH, 3))
+        return
+    with pytest.raises(FileNotFoundError, match="must lie in a folder named images, found none"):
+        load(tmp_path)  # a folder that nothing says is one of COLMAP's
+
+
+def test_photographs_in_several_folders(tmp_path):
+    """Without `images`, those of two sizes: which one to rename. Under other names: where they are."""
+    write_colmap(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "images_2")
+    (tmp_path / "images_4").mkdir()
+    for file in (tmp_path / "images_2").iterdir():
+        (tmp_path / "images_4" / file.name).write_bytes(file.read_bytes())
+    with pytest.raises(
+        FileNotFoundError, match=r"found them in .*images_2, .*images_4; rename the one to use to images"
+    ):
+        load(tmp_path)
+    for folder in ("images_2", "images_4"):
+        for file in (tmp_path / folder).iterdir():
+            file.rename(file.with_name(f"x{file.name}"))
+    with pytest.raises(
+        FileNotFoundError, match=r"images of other names than 'im0.png' are in .*images_2; move or link"
+    ):
+        load(tmp_path)
+
+
+def test_an_incomplete_model_beside_llff(tmp_path, caplog):
+    """COLMAP's model without images.bin is none: the poses of LLFF are taken; alone it is said what is missing."""
+    write_llff(tmp_path)
+    target = write_colmap(tmp_path)
+    (target / "images.bin").unlink()
+    (tmp_path / "images" / "im3.png").unlink()
+    for name in ("0", "1", "2"):
+        (tmp_path / "images" / f"{name}.png").unlink()
+    dataset = load(tmp_path)
+    assert (dataset.format, len(dataset.views)) == ("llff", 3)
+    assert "sparse/0: is no whole COLMAP model, the poses are those of" in caplog.text
+    (tmp_path / "poses_bounds.npy").unlink()
+    with pytest.raises(
+        FileNotFoundError, match=r"must hold images.bin, found none \(only cameras.bin, rigs.bin"
+    ) as error:
+        load(tmp_path)
+    one_line(error)
+
+
+@pytest.mark.parametrize("prefix", ["/home/somebody/scenes/x/", "C:\\Users\\x\\", "/", ".\\"])
+def test_absolute_names_of_another_machine(tmp_path, prefix):
+    """Files that lie here under the end of their names are taken, with their masks and the split."""
+    data = write_transforms(tmp_path, extra={"mask_path": f"{prefix}m.png"})
+    write_image(tmp_path / "m.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+    slash = "\\" if "\\" in prefix else "/"
+    for frame in data["frames"]:
+        frame["file_path"] = prefix + frame["file_path"].replace("/", slash)
+    data["test_filenames"] = [data["frames"][1]["file_path"]]
+    save(tmp_path, data)
+    train, test = load(tmp_path).split()
+    assert [view.name for view in train] == ["0", "2"]
+    assert [view.name for view in test] == ["1"]
+    assert train[0].mask().all()
+
+
+def test_what_can_be_read_beside_is_named(tmp_path):
+    """Names of another machine, of files that are not here, and a COLMAP model: the command that takes it."""
+    write_colmap(tmp_path)
+    data = write_transforms(tmp_path)
+    for frame in data["frames"]:
+        frame["file_path"] = f"/home/somebody/frame_{frame['file_path'][-5:]}"
+    save(tmp_path, data)
+    with pytest.raises(
+        ValueError, match=r"must name a file in .*/home/somebody.*sparse/0 \(colmap\) can be read and has 4 .*`drgs fit"
+    ) as error:
+        load(tmp_path)
+    one_line(error)
+    (tmp_path / "sparse" / "0" / "cameras.bin").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"must name a file in .*; move or link the file there and name it so$"):
+        load(tmp_path)
+
+
+def test_several_data_sets_in_a_folder(tmp_path):
+    """One is taken, as archives unpack; of several one must be named."""
+    write_transforms(tmp_path / "lego" / "lego")
+    assert len(load(tmp_path).views) == 3
+    write_transforms(tmp_path / "lego" / "chair")
+    with pytest.raises(FileNotFoundError, match=r"found several in it \(.*chair, .*lego\); name one of them") as error:
+        load(tmp_path)
+    one_line(error)
+
+
+def test_masks_of_colmap_as_jpeg(tmp_path):
+    """`NAME.jpg` in masks/, whose grays near black and white are what compression left."""
+    write_colmap(tmp_path)
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[4:12, 5:19] = 255
+    write_image(tmp_path / "masks" / "im0.jpg", mask)
+    assert (load(tmp_path).views[0].mask() == mask / 255).mean() > 0.95
+    assert set(np.unique(load(tmp_path).views[0].mask())) == {0, 1}

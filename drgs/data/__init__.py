@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import os
 import shlex
 from pathlib import Path
+from typing import Any
 
 from drgs.data.checks import list_images
+from drgs.data.colmap_files import find_model
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
 from drgs.data.guesses import scene_extent
@@ -37,6 +41,11 @@ __all__ = [
     "triangulated_count",
     "triangulated_points",
 ]
+
+_DEPTH = 3  # folders below the one that is named, down to which a data set is looked for
+_MOST_FOLDERS = 1000  # of each depth that are looked at
+_SHOWN = 3  # data sets that a message names
+_log = logging.getLogger(__name__)
 
 LOADERS: Registry[Format] = Registry(
     "data set format",
@@ -117,7 +126,7 @@ def load(
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: must be a data set, found no such file or folder; check the path")
-    name = _format_of(path)
+    name, path = _located(path)
     if isinstance(times, bool) or not isinstance(times, int) or times < 1:
         raise ValueError(f"load: times must be a whole number >= 1, got {times!r}; correct it")
     if isinstance(test_cameras, str):
@@ -134,7 +143,13 @@ def load(
         "times": times,
         "test_cameras": test_cameras,
     }
-    dataset = LOADERS[name].read(name, path, options)
+    try:
+        dataset = LOADERS[name].read(name, path, options)
+    except (FileNotFoundError, ValueError) as error:
+        if not (beside := _beside(name, path, options)):
+            raise
+        kind = FileNotFoundError if isinstance(error, FileNotFoundError) else ValueError
+        raise kind(f"{error}; {beside}") from error
     dataset.test_every = test_every
     dataset.test_offset = test_offset
     if test_cameras is not None:
@@ -148,23 +163,64 @@ def load(
     return dataset
 
 
-def _format_of(path: Path) -> str:
-    """Name of the first format that recognizes a folder or file.
+def _located(path: Path) -> tuple[str, Path]:
+    """Name of the first format that recognizes a folder or file, and what it is to read: the path, or the only folder
+    below it that any format recognizes.
 
     Raises:
-        FileNotFoundError: If none does, for a folder.
+        FileNotFoundError: If none does, for a folder, or several data sets are in it.
         ValueError: If none does, for a file.
     """
-    for name, form in LOADERS.items():
-        if form.recognizes(path):
-            return name
-    if not path.is_file():
+    lacking = find_model(path, whole=False)
+    if name := _format_of(path):
+        if lacking and name == "llff":
+            _log.warning("%s: is no whole COLMAP model, the poses are those of %s", lacking, path / POSES_BOUNDS)
+        return name, path
+    if path.is_file():
+        for name, form in LOADERS.items():
+            if form.suffix and form.suffix == path.suffix:
+                return name, path
+        refuse_foreign(path, "a data set")
+        raise ValueError(f"{path}: must be a folder, a transforms .json or an LLFF .npy; name one of these")
+    if lacking:
+        return "colmap", path  # whose loader says what is missing
+    below = [] if any(path.glob(f"*/{POSES}")) else _data_sets_below(path)
+    if not below:
         raise _nothing_found(path)
-    for name, form in LOADERS.items():
-        if form.suffix and form.suffix == path.suffix:
-            return name
-    refuse_foreign(path, "a data set")
-    raise ValueError(f"{path}: must be a folder, a transforms .json or an LLFF .npy; name one of these")
+    if len(below) > 1:
+        raise FileNotFoundError(
+            f"{path}: must be one data set, found several in it ({', '.join(str(x) for _, x in below[:_SHOWN])}"
+            f"{', ...' if len(below) > _SHOWN else ''}); name one of them"
+        )
+    _log.warning("%s: the data set in it is %s", path, below[0][1])
+    return below[0]
+
+
+def _format_of(path: Path) -> str | None:
+    return next((name for name, form in LOADERS.items() if form.recognizes(path)), None)
+
+
+def _data_sets_below(path: Path) -> list[tuple[str, Path]]:
+    """Formats and folders of the data sets nearest below a folder, where archives and other programs put them."""
+    for depth in range(1, _DEPTH + 1):
+        folders = sorted(x for x in path.glob("/".join("*" * depth)) if x.is_dir() and not x.name.startswith("."))
+        if found := [(name, x) for x in folders[:_MOST_FOLDERS] if (name := _format_of(x))]:
+            return found
+    return []
+
+
+def _beside(name: str, path: Path, options: dict[str, Any]) -> str:
+    """What to say about a data set of another format in the same folder, if it can be read where the first cannot."""
+    for other, form in LOADERS.items():
+        named = {"colmap": find_model(path), "llff": path / POSES_BOUNDS, "transforms": path / "transforms.json"}
+        file = named.get(other)
+        if other == name or file is None or not file.exists():
+            continue
+        with contextlib.suppress(FileNotFoundError, ValueError):
+            count = len(form.read(other, file, options | {"lazy": True, "points": False}).views)
+            command = f"drgs fit {shlex.quote(str(file))} -o RUN"
+            return f"{file} ({other}) can be read and has {count} photographs: name it, as in `{command}`"
+    return ""
 
 
 def _nothing_found(path: Path) -> FileNotFoundError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import struct
 from collections.abc import Iterator
@@ -12,18 +13,19 @@ import numpy as np
 
 from drgs.cameras import Camera, intrinsics
 from drgs.data.checks import file_inside
+from drgs.data.colmap_files import MODEL_FILES, MODEL_FOLDERS, find_model, image_folder, model_suffix, point_ply
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
 from drgs.data.masks import mask_file
+from drgs.data.points import read_point_ply
 from drgs.data.resizing import fit_to_image
 from drgs.data.view_checks import go_on_without, make_unique
 from drgs.data.views import View
 from drgs.guards.foreign import is_file, refuse_foreign
 from drgs.guards.unfinished import temporary_folder
 
-__all__ = ["COLMAP", "MODEL_FOLDERS", "find_model", "load_colmap", "model_camera", "model_points", "read_model"]
+__all__ = ["COLMAP", "load_colmap", "model_camera", "model_points", "read_model"]
 
-MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 # COLMAP's model numbers and parameter counts, for the camera models that drgs renders.
 _MODELS = {
     "SIMPLE_PINHOLE": (0, 3),
@@ -40,15 +42,7 @@ _MODELS = {
     "EQUIRECTANGULAR": (17, 2),
 }
 _ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE")
-_REQUIRED = ("cameras", "images", "points3D")
-
-
-def find_model(path: Path) -> Path | None:
-    """The folder of a COLMAP model at or below `path`, or None."""
-    for folder in (path, *(path / name for name in MODEL_FOLDERS)):
-        if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
-            return folder
-    return None
+_log = logging.getLogger(__name__)
 
 
 def load_colmap(
@@ -69,14 +63,14 @@ def load_colmap(
         FileNotFoundError: No model, no `images` folder, or too few of the images that the model lists.
         ValueError: a damaged or lying file, an unsupported camera model, a pose that is not one.
     """
-    model = find_model(path)
+    model = find_model(path) or find_model(path, whole=False)
     if model is None:
         raise FileNotFoundError(
             f"{path}: must hold a COLMAP model, found no cameras.bin or cameras.txt in . or "
             f"{', '.join(MODEL_FOLDERS)}; run `drgs sfm`"
         )
-    reconstruction = read_model(model, points)
-    folder = _image_folder(path, model)
+    ply = None if not points or (model / f"points3D{model_suffix(model)}").is_file() else point_ply(model)
+    reconstruction = read_model(model, points and ply is None)
     views = []
     absent = []
     listed = []
@@ -84,6 +78,7 @@ def load_colmap(
     registered = sorted(reconstruction.reg_image_ids(), key=lambda image_id: reconstruction.images[image_id].name)
     if not registered:
         raise ValueError(f"{model}: must hold at least one registered image, got none; run `drgs sfm` again")
+    folder = image_folder(path, model, [reconstruction.images[image_id].name for image_id in registered])
     for index, image_id in enumerate(registered):
         image = reconstruction.images[image_id]
         file = file_inside(folder, image.name, f"{model}: image {index}")
@@ -95,14 +90,14 @@ def load_colmap(
             continue
         camera = model_camera(reconstruction, image, where)
         view.camera = fit_to_image(camera, view.image_path, where, lazy)
-        view.mask_path = mask_file(folder.parent / "masks", image.name)
+        view.mask_path = mask_file((path if folder == path else folder.parent) / "masks", image.name)
         view.background = background
         view.is_checked = not lazy
         views.append(view)
     make_unique(listed)
     go_on_without(model, [view.image_path for view in absent], len(views), strict)
-    xyz, colors = model_points(reconstruction, model)
-    source = f"COLMAP model {model.name}, {len(xyz)} points" if len(xyz) else ""
+    xyz, colors = read_point_ply(ply) if ply else model_points(reconstruction, model)
+    source = f"{ply.name if ply else f'COLMAP model {model.name}'}, {len(xyz)} points" if len(xyz) else ""
     return Dataset(
         path=path,
         format="colmap",
@@ -128,20 +123,6 @@ def _reprojection(reconstruction: Any) -> float | None:
     # At the middle of a panorama: pixels a radian.
     focal = [c.width / (2 * math.pi) if c.model_name == "EQUIRECTANGULAR" else c.mean_focal_length() for c in cameras]
     return float(np.median(errors) / np.median(focal))
-
-
-def _image_folder(path: Path, model: Path) -> Path:
-    """`images` beside the model or above it."""
-    tried = []
-    for base in (path, model, *model.parents[:3]):
-        folder = base / "images"
-        if folder.is_dir():
-            return folder
-        tried.append(str(folder))
-    raise FileNotFoundError(
-        f"{path}: the photos must lie in a folder named images, found none (looked at "
-        f"{', '.join(dict.fromkeys(tried))}); move or link them there"
-    )
 
 
 def model_camera(reconstruction: Any, image: Any, where: str) -> Camera:
@@ -203,31 +184,59 @@ def read_model(model: Path, points: bool = True) -> object:
         FileNotFoundError: If a file of the model is missing.
         ValueError: If one is damaged, or has a camera model that drgs does not render.
     """
-    suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
-    for name in _REQUIRED:
-        if not (model / f"{name}{suffix}").is_file():
-            raise FileNotFoundError(f"{model}: must hold {name}{suffix}, found none; copy the whole model")
+    suffix = model_suffix(model)
+    if points and not (model / f"points3D{suffix}").is_file():
+        raise FileNotFoundError(f"{model}: must hold points3D{suffix}, found none; copy the whole model")
+    read = [name for name in MODEL_FILES if (model / f"{name}{suffix}").is_file() and (points or name != "points3D")]
+    if ("rigs" in read) != ("frames" in read):
+        _log.warning("%s: has one of rigs%s and frames%s alone, which is left out", model, suffix, suffix)
+        read = [name for name in read if name not in ("rigs", "frames")]
     check = _check_binary if suffix == ".bin" else _check_text
-    read = [name for name in (*_REQUIRED, "rigs", "frames") if points or name != "points3D"]
-    read = [name for name in read if (model / f"{name}{suffix}").is_file()]
     for name in read:
         refuse_foreign(model / f"{name}{suffix}", "part of a COLMAP model")
         check(model / f"{name}{suffix}", name)
-    if points:
-        return _reconstruction(model, model, suffix)
-    with temporary_folder("poses") as folder:
-        for name in read:
-            file = model / f"{name}{suffix}"
-            data = file.read_bytes()
-            if name == "images":
-                data = _without_observations(file, data) if suffix == ".bin" else _poses_only(data)
-            (folder / file.name).write_bytes(data)
-        (folder / f"points3D{suffix}").write_bytes(_COUNT.pack(0) if suffix == ".bin" else b"")
-        return _reconstruction(folder, model, suffix)
+    for tracks in (True, False) if points else (False,):
+        with temporary_folder("model") as folder:
+            for name in read:
+                _write_plain(folder, model / f"{name}{suffix}", name, tracks)
+            reconstruction = _read(folder, read, suffix)
+            if reconstruction is None and not tracks:
+                raise ValueError(_refusal(folder, model, read, suffix))
+        if reconstruction is not None:
+            break
+    if points and not tracks:
+        _log.warning(
+            "%s: the observations of images%s and the tracks of points3D%s contradict each other; poses and points are "
+            "read without them",
+            model,
+            suffix,
+            suffix,
+        )
+    if suffix == ".txt":
+        given = _names(model / "images.txt")
+        for image_id, image in reconstruction.images.items():
+            image.name = given[image_id]  # pycolmap ends a name at its first space
+    return reconstruction
 
 
-def _reconstruction(folder: Path, model: Path, suffix: str) -> object:
-    """What pycolmap reads in a folder; errors name the model."""
+def _write_plain(folder: Path, file: Path, name: str, tracks: bool) -> None:
+    """Put a checked file of a model into a folder as COLMAP writes it, with observations and tracks or without."""
+    if file.suffix == ".txt" and name == "cameras":
+        data = _plain_cameras(file)
+    elif file.suffix == ".txt" and name == "images":
+        data = _plain_images(file, tracks)
+    elif name == "images" and not tracks:
+        data = _without_observations(file)
+    elif name == "points3D" and not tracks:
+        data = _without_tracks(file)
+    else:
+        (folder / file.name).symlink_to(file.resolve())
+        return
+    (folder / file.name).write_bytes(data)
+
+
+def _read(folder: Path, names: list[str], suffix: str) -> Any:
+    """What pycolmap reads of these files, the others being empty; None where it refuses them, with words of its own."""
     from drgs.data.colmap_bindings import pycolmap
 
     reconstruction = pycolmap.Reconstruction()
@@ -235,29 +244,43 @@ def _reconstruction(folder: Path, model: Path, suffix: str) -> object:
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = 3
     try:
-        read(str(folder))
-    except (RuntimeError, ValueError, IndexError, KeyError, OSError, MemoryError) as error:
-        text = str(error).strip().splitlines()
-        raise ValueError(
-            f"{model}: must be a COLMAP model that pycolmap reads, got "
-            f"{text[-1][:160] if text else type(error).__name__}; "
-            "export it again"
-        ) from None
+        with temporary_folder("model") as whole:
+            for name in names:
+                (whole / f"{name}{suffix}").symlink_to((folder / f"{name}{suffix}").resolve())
+            for name in {"cameras", "images", "points3D"} - set(names):
+                (whole / f"{name}{suffix}").write_bytes(_COUNT.pack(0) if suffix == ".bin" else b"")
+            read(str(whole))
+    except MemoryError:
+        raise
+    except Exception as error:  # of the library: checks of its own code, and whatever its containers throw
+        _log.debug("pycolmap: %s", error)
+        return None
     finally:
         pycolmap.logging.minloglevel = level
-    if suffix == ".txt":
-        names = _names(model / "images.txt")
-        for image_id, image in reconstruction.images.items():
-            image.name = names[image_id]  # pycolmap ends a name at its first space
     return reconstruction
+
+
+def _refusal(folder: Path, model: Path, names: list[str], suffix: str) -> str:
+    """Which file of a model pycolmap refuses: the first that does not fit to those before it."""
+    for *others, name in (("cameras",), ("cameras", "images"), ("cameras", "images", "points3D")):
+        if name in names and _read(folder, [*others, name], suffix) is None:
+            beside = f" and fit to {' and '.join(f'{x}{suffix}' for x in others)}" if others else ""
+            return (
+                f"{model / f'{name}{suffix}'}: must be as COLMAP writes it{beside}, each ID once and no ID that is not "
+                "there, COLMAP's reader refuses it; export the model again"
+            )
+    return (
+        f"{model}: rigs{suffix} and frames{suffix} must be of one model with images{suffix}, COLMAP's reader refuses "
+        f"them; export the model again, or remove both to use the poses of images{suffix}"
+    )
 
 
 class _Walk:
     """A cursor over a binary file that never passes its end."""
 
-    def __init__(self, path: Path, data: bytes | None = None) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
-        self.data = path.read_bytes() if data is None else data
+        self.data = path.read_bytes()
         self.at = 0
 
     def need(self, size: int, what: str) -> None:
@@ -290,6 +313,7 @@ class _Walk:
             ) from None
 
 
+_AGAIN = "it is truncated or damaged, export it again"
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")
 _IMAGE = struct.Struct("<I7dI")
@@ -310,7 +334,9 @@ def _check_binary(path: Path, kind: str) -> None:
         what = f"{kind} record {index} of {count}"
         if kind == "cameras":
             _, number, _, _ = walk.take(_CAMERA, what)
-            walk.skip(8 * _parameter_count(path, number), what)
+            for value in walk.take(struct.Struct(f"<{_parameter_count(path, number)}d"), what):
+                if not math.isfinite(value):
+                    raise ValueError(f"{path}: {what} must have finite parameters, got {value}; {_AGAIN}")
         elif kind == "images":
             walk.take(_IMAGE, what)
             walk.name(f"the name of {what}")
@@ -330,31 +356,50 @@ def _check_binary(path: Path, kind: str) -> None:
             walk.skip(16 * entries, f"the {entries} entries of {what}")
 
 
-def _without_observations(path: Path, data: bytes) -> bytes:
+def _without_observations(path: Path) -> bytes:
     """images.bin, already checked, with no observation in any image."""
-    walk = _Walk(path, data)
+    walk = _Walk(path)
     (count,) = walk.take(_COUNT, "a count")
     kept = [_COUNT.pack(count)]
     for _ in range(count):
         start = walk.at
         walk.take(_IMAGE, "an image")
         walk.name("a name")
-        kept += [data[start : walk.at], _COUNT.pack(0)]
+        kept += [walk.data[start : walk.at], _COUNT.pack(0)]
         (observations,) = walk.take(_COUNT, "a count")
         walk.skip(24 * observations, "observations")
     return b"".join(kept)
 
 
-def _poses_only(data: bytes) -> bytes:
-    """images.txt, already checked, with an empty line for the observations of every image."""
-    kept = []
-    wants_pose = True
-    for line in data.splitlines():
-        if line.lstrip().startswith(b"#") or (wants_pose and not line.strip()):
-            continue
-        kept.append(line if wants_pose else b"")
-        wants_pose = not wants_pose
-    return b"\n".join([*kept, b""]) + b"\n"
+def _without_tracks(path: Path) -> bytes:
+    """points3D.bin or points3D.txt, already checked, with no image in any track."""
+    if path.suffix == ".txt":
+        return "\n".join([*(" ".join(line.split()[:8]) for _, line in _text_lines(path)), ""]).encode()
+    walk = _Walk(path)
+    (count,) = walk.take(_COUNT, "a count")
+    kept = [_COUNT.pack(count)]
+    for _ in range(count):
+        *point, length = walk.take(_POINT, "a point")
+        walk.skip(8 * length, "a track")
+        kept.append(_POINT.pack(*point, 0))
+    return b"".join(kept)
+
+
+def _plain_images(path: Path, observations: bool) -> bytes:
+    """images.txt, already checked, as COLMAP writes it: two lines an image, of which the second may be empty."""
+    rows = []
+    for _, words, observed in _image_lines(_text_lines(path)):
+        rows += [" ".join(words), observed[1] if observations and observed else ""]
+    return "\n".join([*rows, ""]).encode()
+
+
+def _plain_cameras(path: Path) -> bytes:
+    """cameras.txt, already checked, with sizes without a fraction."""
+    rows = []
+    for _, line in _text_lines(path):
+        if words := line.split():
+            rows.append(" ".join([*words[:2], *(f"{float(word):.0f}" for word in words[2:4]), *words[4:]]))
+    return "\n".join([*rows, ""]).encode()
 
 
 def _parameter_count(path: Path, number: int) -> int:
@@ -392,7 +437,11 @@ def _check_text(path: Path, kind: str) -> None:
             name = words[1] if len(words) > 1 else ""
             if name not in _MODELS:
                 raise _unsupported(path, name or "none")
-            _numbers(path, number, [words[0], *words[2:]], 3 + _MODELS[name][1], exact=True)
+            values = _numbers(path, number, [words[0], *words[2:]], 3 + _MODELS[name][1], exact=True)
+            if not np.isfinite(values).all():
+                raise _bad_line(path, number, "finite numbers", words[2:][int(np.isfinite(values[1:]).argmin())][:40])
+            if (values[1:3] % 1).any():
+                raise _bad_line(path, number, "a width and height in whole pixels", f"{words[2]} x {words[3]}"[:80])
         elif kind == "points3D":
             _numbers(path, number, words, 8)
             if len(words) % 2:
@@ -407,7 +456,9 @@ def _check_image_lines(path: Path, lines: list[tuple[int, str]]) -> None:
             raise _bad_line(path, number, "ID, pose (7), CAMERA_ID and NAME", f"{len(words)} words")
         if not words[0].isdecimal():
             raise _bad_line(path, number, "a whole number as its ID", words[0][:40])
-        _numbers(path, number, words[:9], 9)
+        pose = _numbers(path, number, words[:9], 9)
+        if not np.isfinite(pose).all() or not pose[1:5].any():
+            raise _bad_line(path, number, "a finite pose, a quaternion and a position", " ".join(words[1:8])[:80])
         if observed:
             observations = observed[1].split()
             if len(observations) % 3:
@@ -417,7 +468,7 @@ def _check_image_lines(path: Path, lines: list[tuple[int, str]]) -> None:
 
 def _image_lines(lines: list[tuple[int, str]]) -> Iterator[tuple[int, list[str], tuple[int, str] | None]]:
     """The number of the first line of each image of images.txt, the 10 words of this line, of which the last is the
-    name, and its line of observations; None where the file ends before.
+    name, and its line of observations; None where there is none: at the end of the file, or before another image.
 
     Args:
         lines: Numbers and texts of the file's lines, without comments.
@@ -429,8 +480,25 @@ def _image_lines(lines: list[tuple[int, str]]) -> Iterator[tuple[int, list[str],
         if not words:
             index += 1
             continue
-        yield number, words, lines[index + 1] if index + 1 < len(lines) else None
-        index += 2
+        following = lines[index + 1] if index + 1 < len(lines) else None
+        # Some programs write no lines of observations at all.
+        has_observations = following is not None and not _is_pose(following[1])
+        yield number, words, following if has_observations else None
+        index += 1 + has_observations
+
+
+def _is_pose(line: str) -> bool:
+    """Whether a line of images.txt is of an image: nine numbers, and a name that is none."""
+    words = line.split()
+    return len(words) >= 10 and all(map(_is_number, words[:9])) and not all(map(_is_number, words[9:]))
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _names(path: Path) -> dict[int, str]:
@@ -439,22 +507,23 @@ def _names(path: Path) -> dict[int, str]:
 
 
 def _text_lines(path: Path) -> list[tuple[int, str]]:
-    """Numbers and texts of the lines of a file, without comments."""
+    """Numbers and texts of the lines of a file, without comments, which may be in any encoding."""
+    lines = path.read_bytes().removeprefix(b"\xef\xbb\xbf").splitlines()
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        return [(number, line.decode()) for number, line in enumerate(lines, 1) if not line.lstrip().startswith(b"#")]
     except UnicodeDecodeError:
         raise ValueError(f"{path}: must be a text file, got binary data; export the model again") from None
-    return [(number, line) for number, line in enumerate(lines, 1) if not line.lstrip().startswith("#")]
 
 
-def _numbers(path: Path, line: int, words: list[str], least: int, exact: bool = False) -> None:
+def _numbers(path: Path, line: int, words: list[str], least: int, exact: bool = False) -> np.ndarray:
+    """The words of a line as (N,) float64."""
     if len(words) < least or (exact and len(words) != least):
         raise _bad_line(path, line, f"{least} numbers", f"{len(words)}")
     try:
-        np.array(words, dtype=np.float64)
+        return np.array(words, dtype=np.float64)
     except ValueError:
         raise _bad_line(path, line, "numbers", "other words") from None
 
 
 def _bad_line(path: Path, line: int, needs: str, got: str) -> ValueError:
-    return ValueError(f"{path}: line {line} must hold {needs}, got {got}; it is truncated or damaged, export it again")
+    return ValueError(f"{path}: line {line} must hold {needs}, got {got}; {_AGAIN}")

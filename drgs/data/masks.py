@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.data.checks import image_size, read_image, unit_range
+from drgs.data.checks import IMAGE_SUFFIXES, image_size, read_image, unit_range
 from drgs.data.resizing import nearest_resized
 from drgs.guards.foreign import is_file
 
@@ -22,18 +22,25 @@ _SHOWN = 3  # photographs without a mask that a message names
 
 
 def mask_file(masks: Path, name: str) -> Path | None:
-    """The mask of an image in a folder: COLMAP's own `NAME.EXT.png`, or `NAME.png`; None without one."""
-    for candidate in (masks / f"{name}.png", (masks / name).with_suffix(".png")):
-        if is_file(candidate):
-            return candidate
+    """The mask of an image in a folder: COLMAP's own `NAME.EXT.png`, or `NAME.png`, else of another suffix of images,
+    as `NAME.jpg`; None without one.
+    """
+    for suffix in IMAGE_SUFFIXES:
+        for candidate in (masks / f"{name}{suffix}", (masks / name).with_suffix(suffix)):
+            if is_file(candidate):
+                return candidate
     return None
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """(H,W) float32 in [0,1] of a mask as stored: the last of four channels, else the first."""
+    """(H,W) float32 in [0,1] of a mask as stored: the last of four channels, else the first; of a JPEG 0 or 1, whose
+    compression leaves neither black nor white.
+    """
     raw = read_image(path)
     if raw.ndim == 3:
         raw = raw[..., 3] if raw.shape[2] == 4 else raw[..., 0]
+    if path.suffix.lower() in (".jpg", ".jpeg"):
+        return (raw >= _KEPT * np.iinfo(raw.dtype).max).astype(np.float32)
     # Masks stored as 0 and 1 in 8 bits would otherwise be nearly black.
     return raw.astype(np.float32) if raw.max() <= 1 else unit_range(raw, path)
 

@@ -17,7 +17,8 @@ import numpy as np
 
 from drgs.cameras import Camera
 from drgs.data.checks import list_images
-from drgs.data.colmap import find_model, model_camera, model_points, read_model
+from drgs.data.colmap import model_camera, model_points, read_model
+from drgs.data.colmap_files import find_model
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
 from drgs.data.synchronous import CAMERA_NAME, Recording, evenly_spaced, synchronous

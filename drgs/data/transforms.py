@@ -4,7 +4,10 @@
 
 from __future__ import annotations
 
+import logging
 import math
+import os
+import re
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -36,8 +39,10 @@ _LENSES = {
     "EQUIRECTANGULAR": "equirectangular",
 }
 _DEPTHS = ("depth_file_path", "depth_path")  # nerfstudio's key, and NeRFCapture's, SplaTAM's and instant-ngp's
+_FILE_KEYS = ("file_path", "mask_path", *_DEPTHS)
 _MILLIMETER = 1e-3
 _DEPTH_SCALE_MAX = 1e9
+_log = logging.getLogger(__name__)
 
 
 def _files(path: Path) -> list[Path]:
@@ -167,7 +172,43 @@ def _frames(file: Path) -> dict:
         raise ValueError(f"{file}: must be an object with a list `frames` of at least one frame; check the file")
     for index, frame in enumerate(frames):
         check_json(f"{file}: frame {index}", frame, {"file_path": str}, "correct it")
-    return data
+    return _with_names_of_here(file, data)
+
+
+def _with_names_of_here(file: Path, data: dict) -> dict:
+    """The same with names of files of another machine or of Windows made relative to the file's folder.
+
+    Of absolute names the beginning is dropped without which the first one that can be found is a file of this folder;
+    names that begin otherwise stay, and are refused.
+    """
+    names = [frame["file_path"] for frame in data["frames"]]
+    is_windows = any("\\" in name and not is_file(file.parent / name) for name in names)
+    slashed = [name.replace("\\", "/") if is_windows else name for name in names]
+    prefix = next((found for name in slashed if (found := _foreign_prefix(file.parent, name))), "")
+    if not prefix and not is_windows:
+        return data
+    if prefix:
+        _log.warning("%s: names files in %s, which are taken from %s", file, prefix, file.parent)
+
+    def of_here(value: Any) -> Any:
+        if isinstance(value, list):
+            return [of_here(item) for item in value]
+        if not isinstance(value, str):
+            return value
+        return (value.replace("\\", "/") if is_windows else value).removeprefix(prefix)
+
+    frames = [frame | {key: of_here(frame[key]) for key in _FILE_KEYS if key in frame} for frame in data["frames"]]
+    lists = ("ply_file_path", *(f"{split}_filenames" for split in _SPLITS))
+    return data | {key: of_here(data[key]) for key in lists if key in data} | {"frames": frames}
+
+
+def _foreign_prefix(folder: Path, name: str) -> str:
+    """How an absolute name begins whose end names an image in a folder; empty if it is none, or there is no such."""
+    if not re.match(r"/|[A-Za-z]:/", name) or Path(os.path.abspath(name)).is_relative_to(os.path.abspath(folder)):
+        return ""
+    places = [match.end() for match in re.finditer("/", name)]
+    ends = (name[at:] for at in places if ".." not in name[at:].split("/"))
+    return next((name[: -len(end)] for end in ends if end and _image_file(folder / end)), "")
 
 
 def _splits(file: Path, data: dict) -> list[str]:
