@@ -54,6 +54,7 @@ _log = logging.getLogger(__name__)
 
 _NORMALS = ("nx", "ny", "nz")
 _FEATURE = "semantic_"
+_HIGHER = 15  # SH coefficients a color channel above degree 0, up to degree 3
 _SHOWN = 200  # characters of a reader's own message
 
 
@@ -63,10 +64,10 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
         g = drgs.load_ply("point_cloud.ply")
 
     Args:
-        path: A file with vertex columns x y z, f_dc_0..2, f_rest_* (0, 9, 24 or 45 of them, channel by channel),
-            opacity (logit), scale_0..2 (log) and rot_0..3 (wxyz), and semantic_0, ... (features) as Feature 3DGS
-            writes them. Normals and features may be missing. What `save_ply` added (uncertainty_*, label) is left out;
-            any other column, too, with a warning in the log.
+        path: A file with vertex columns x y z, f_dc_0..2, f_rest_* (0, 9, 24, 45 or 72 of them, channel by channel; of
+            72, SH of degree 4, those up to degree 3 are kept, with a warning), opacity (logit), scale_0..2 (log) and
+            rot_0..3 (wxyz), and semantic_0, ... (features) as Feature 3DGS writes them. Normals and features may be
+            missing. What `save_ply` added (uncertainty_*, label) is left out; any other column, too, with a warning.
     Returns:
         float32 `Gaussians` with the file's bits; an infinite logit becomes one of `ellipsoids.LOGIT_ENDS`, and the log
         says how many did.
@@ -117,7 +118,8 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
     sh = arrays.pop("dc")[:, None, :]
     if rest:
         # f_rest is stored channel by channel; ours are coefficient by coefficient.
-        sh = torch.cat([sh, higher.reshape(len(vertex), 3, len(rest) // 3).transpose(1, 2)], dim=1)
+        higher = higher.reshape(len(vertex), 3, len(rest) // 3)[..., :_HIGHER].transpose(1, 2)
+        sh = torch.cat([sh, higher], dim=1)
     if features:
         arrays["features"] = described
     arrays["logit_opacities"] = _finite_logits(path, arrays["logit_opacities"][:, 0])
@@ -236,11 +238,13 @@ def _check_ply(path: Path) -> list[str]:
 def _rest_columns(path: Path, names: list[str]) -> tuple[str, ...]:
     count = sum(name.startswith("f_rest_") for name in names)
     rest = tuple(f"f_rest_{i}" for i in range(count))
-    if count not in (0, 9, 24, 45) or not set(rest) <= set(names):
+    if count not in (0, 9, 24, 45, 72) or not set(rest) <= set(names):
         raise ValueError(
-            f"{path}: must have 0, 9, 24 or 45 columns f_rest_0, f_rest_1, ... (SH degree 0 to 3), got {count}; "
+            f"{path}: must have 0, 9, 24, 45 or 72 columns f_rest_0, f_rest_1, ... (SH degree 0 to 4), got {count}; "
             "export it again"
         )
+    if count // 3 > _HIGHER:
+        _log.warning("%s: left out the SH coefficients of degree 4, there is no such color here", path)
     return rest
 
 

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from drgs import files
+from drgs.data.points import read_point_ply
 from drgs.ellipsoids import Gaussians
 from drgs.files import Run, load_ply, load_state, save_ply, save_state
 
@@ -144,6 +145,29 @@ def test_ascii_and_big_endian_files_load(tmp_path):
     assert a.quats[0].tolist() == [11, 12, 13, 14]
 
 
+@pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_comments_are_not_decoded(tmp_path, form, encoding):
+    """Nor is anything else of a header that nobody needs, of Gaussians and of points."""
+    names = [*BASE, "größe"]
+    text = header(names, 1, form=form).replace("element", "comment café\nelement", 1).encode(encoding)
+    values = np.ones(len(names), "<f4")
+    body = b"1 " * len(names) if form == "ascii" else values.tobytes()
+    path = write(tmp_path / "x.ply", "", text + body + b"\n" * (form == "ascii"))
+    assert load_ply(path).means.tolist() == [[1, 1, 1]]
+    assert read_point_ply(path)[0].tolist() == [[1, 1, 1]]
+
+
+def test_harmonics_of_degree_4_are_cut(tmp_path, caplog):
+    """Channel by channel: 24 a channel, of which the first 15 are kept."""
+    names = [*BASE, *(f"f_rest_{i}" for i in range(72))]
+    values = np.r_[np.ones(len(BASE)), np.arange(72)].astype("<f4")
+    g = load_ply(write(tmp_path / "x.ply", header(names), values.tobytes()))
+    assert g.sh_degree == 3
+    np.testing.assert_array_equal(g.sh[0, 1:].T, np.arange(72).reshape(3, 24)[:, :15])
+    assert "left out the SH coefficients of degree 4" in caplog.text
+
+
 def test_origin_is_added_on_saving(tmp_path):
     """Means relative to an origin are stored in the world."""
     g = gaussians(2).replace(origin=np.array([100.0, 0, -5]))
@@ -187,7 +211,7 @@ def test_bad_files_are_refused_in_one_line(tmp_path, rng):
         "points": (point_cloud[0].encode() + point_cloud[1], r"plain point cloud, fit Gaussians with `drgs fit`"),
         "packed": (packed[0].encode() + packed[1], r"PlayCanvas' compressed layout"),
         "no vertex": (header(BASE, element="face").encode() + b"\0" * 56, r"must have an element `vertex`"),
-        "f_rest": (header([*BASE, "f_rest_0"]).encode() + b"\0" * 60, r"0, 9, 24 or 45 columns .*, got 1;"),
+        "f_rest": (header([*BASE, "f_rest_0"]).encode() + b"\0" * 60, r"0, 9, 24, 45 or 72 columns .*, got 1;"),
         "header": (b"ply\nformat binary_little_endian 1.0\nelement vertex -3\nend_header\n", r"well-formed, got 'ele"),
         "NaN": (header(BASE).encode() + nan.tobytes(), r"log_scales must be finite, got .* at index 0"),
         "quaternion": (header(BASE).encode() + b"\0" * 56, r"quats must not be 0"),

@@ -98,6 +98,8 @@ def load_glb(path: Path) -> Gaussians:
         raise ValueError(
             f"{path}: SH must be whole up to a degree of 0 to 3, got {len(orders)} coefficients; {_ADVICE}"
         )
+    if f"{_NAME}:SH_DEGREE_4_COEF_0" in names:
+        _log.warning("%s: left out the SH coefficients of degree 4, there is no such color here", path)
     for name, index in names.items():
         if (name == "POSITION" or name.startswith(f"{_NAME}:")) and reader.count(index) != count:
             raise ValueError(f"{path}: {name} must have {count} values as POSITION has; {_ADVICE}")

@@ -24,7 +24,7 @@ def find_model(path: Path, whole: bool = True) -> Path | None:
 
     Args:
         path: The data set.
-        whole: Only a folder with cameras and images; else one that lacks its images, too.
+        whole: Whether it must have cameras and images; if not, cameras are enough.
     """
     for folder in (path, *(path / name for name in MODEL_FOLDERS)):
         for suffix in _SUFFIXES:

@@ -250,7 +250,7 @@ def _check_ply_size(path: Path) -> None:
     count = 0
     columns = 1
     text = False
-    for words in (line.split() for line in head[:end].decode("ascii").splitlines()):
+    for words in (line.split() for line in head[:end].decode("ascii", "replace").splitlines()):
         if words[:1] == ["format"]:
             text = words[1:2] == ["ascii"]
         elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal():

@@ -131,10 +131,17 @@ def extra_kind(name: str, values: np.ndarray, count: int) -> str:
 
 
 def ply_source(path: Path) -> BinaryIO | str:
-    """What plyfile is to read: the path, which it maps; or the whole file, where it has lists.
+    """What plyfile is to read: the path, which it maps; or the whole file, where it has lists or other characters than
+    ASCII in its header, as a comment may.
 
-    plyfile asks the file for as many bytes as a list claims, and a file makes room for them before it reads.
+    plyfile asks the file for as many bytes as a list claims, and a file makes room for them before it reads. It decodes
+    the header, of which nobody needs such characters: they become question marks.
     """
     with path.open("rb") as file:
-        has_lists = re.search(rb"property\s+list", file.read(_MAX_HEADER))
-    return io.BytesIO(path.read_bytes()) if has_lists else str(path)
+        head = file.read(_MAX_HEADER)
+    last = re.search(rb"[\r\n]end_header", head)
+    head = head[: last.start()] if last else head
+    if head.isascii() and not re.search(rb"property\s+list", head):
+        return str(path)
+    data = path.read_bytes()
+    return io.BytesIO(re.sub(rb"[\x80-\xff]", b"?", head) + data[len(head) :])
