@@ -196,6 +196,17 @@ def test_resized_scales_k_exactly_and_undistorted_drops_the_lens():
     assert (plain.width, plain.height) == (camera.width, camera.height)
 
 
+@pytest.mark.parametrize("kind", ["bfloat16", "float16", "float8_e5m2"])
+def test_tensors_of_types_that_numpy_has_not(kind):
+    """A pose and intrinsics of any floating type of torch, as mixed precision leaves them."""
+    torch = pytest.importorskip("torch")
+    dtype = getattr(torch, kind)
+    w2c = torch.eye(4).to(dtype)
+    camera = Camera(K=torch.tensor([[16.0, 0, 8], [0, 16, 8], [0, 0, 1]]).to(dtype), w2c=w2c, width=16, height=16)
+    np.testing.assert_array_equal(camera.c2w, np.eye(4))
+    assert camera.K[0].tolist() == [16, 0, 8]
+
+
 def test_keeps_a_torch_pose_with_its_gradient():
     """The very tensor is kept, through a resize too."""
     torch = pytest.importorskip("torch")

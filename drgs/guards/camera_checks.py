@@ -51,7 +51,11 @@ def as_numpy(value: Any) -> np.ndarray:
         return np.asarray(value)
     from drgs.runtime import unwrapped
 
-    return unwrapped(value, lambda values: values.cpu().numpy())
+    def array(x: Any) -> np.ndarray:
+        # NumPy has no bfloat16, nor torch's floats of 8 bits; float32 has all of their values.
+        return (x.float() if x.is_floating_point() and x.element_size() < 4 else x).cpu().numpy()
+
+    return unwrapped(value, array)
 
 
 def read_only(array: np.ndarray) -> np.ndarray:
