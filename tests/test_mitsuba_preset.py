@@ -118,3 +118,17 @@ def test_a_camera_inside_of_huge_gaussians(seed, spread):
     assert wanted.alpha.max() > 0.7
     assert (found.rgb - wanted.rgb)[good].abs().max() < 1e-5
     assert (found.alpha - wanted.alpha)[good].abs().max() < 1e-5
+
+
+def test_three_gaussians_print_nothing(capfd):
+    """Of arrays of three rows `mi.load_dict` tries to make a color, and nanobind prints that it failed."""
+    g = drgs.Gaussians.from_arrays(
+        means=[[0.0, 0.0, 4.0], [0.3, 0.1, 4.0], [-0.3, 0.2, 5.0]],
+        quats=[[1.0, 0.0, 0.0, 0.0]] * 3,
+        scales=[[0.2, 0.1, 0.3]] * 3,
+        opacities=[0.5] * 3,
+        sh=[[1.0, 0.0, 0.5]] * 3,
+    )
+    camera = drgs.Camera(K=[[8.0, 0.0, 4.0], [0.0, 8.0, 4.0], [0.0, 0.0, 1.0]], w2c=np.eye(4), width=8, height=8)
+    assert drgs.render(g, camera, drgs.RenderSettings.preset("mitsuba")).alpha.max() > 0.1
+    assert capfd.readouterr() == ("", "")

@@ -223,13 +223,10 @@ def proxy_scene(
     if means.shape[1] == 0:
         return Proxies(lib, None, members, first, np.zeros((2, 3)), 0, 1)
     proxies = _grown(radii, means, distance + back)
-    shape = {
-        "type": "ellipsoids",
-        "centers": mi.TensorXf(means.T.astype(np.float32, order="C")),
-        "scales": mi.TensorXf(proxies.T.astype(np.float32, order="C")),
-        "quaternions": mi.TensorXf(quats[[1, 2, 3, 0]].T.astype(np.float32, order="C")),
-        "extent": 1.0,
-    }
+    # One flat array: of three centers, or anything else in three rows, `load_dict` tries to make a color, and nanobind
+    # prints that it failed.
+    data = np.concatenate([means, proxies, quats[[1, 2, 3, 0]]]).T
+    shape = {"type": "ellipsoids", "data": mi.TensorXf(data.astype(np.float32).ravel()), "extent": 1.0}
     scene = mi.load_dict({"type": "scene", "gaussians": shape})
     # A sphere around each, and a margin for rounding.
     widest = 1.001 * proxies.max(0)
