@@ -31,8 +31,9 @@ if TYPE_CHECKING:
 __all__ = [
     "METRICS",
     "MOVING",
+    "OBJECT",
     "DEFINITIONS",
-    "RENDERERS_VIEWS",
+    "TRAIN_VIEWS",
     "VIEW_PICTURES",
     "Lpips",
     "cc_psnr",
@@ -49,22 +50,29 @@ __all__ = [
 ]
 
 DEFINITIONS = {
-    "psnr": "dB, peak 1, one MSE over pixels and channels, inside the mask where there is one, at most 100",
-    "cc_psnr": "as psnr, after the rendering's colors were corrected to the photograph (multinerf's color_correct): "
-    "each channel by a least-squares fit of the products of two channels, the channels and 1, made five times, each "
-    "time to pixels inside the mask that are not saturated (within 0.5/255 of 0 or 1) in either image, clipped to "
-    "[0, 1]; a channel without such a pixel stays as it is",
+    "psnr": "dB, peak 1, one MSE over pixels and channels, inside the mask where there is one (where an alpha "
+    "channel says what is empty, of the whole frame), at most 100",
+    "cc_psnr": "as psnr, after the rendering's colors were corrected to the photograph: each channel by a least-squares"
+    " fit of the products of two channels, the channels and 1, made five times and clipped to [0, 1], once to the "
+    "pixels that are not saturated (within 0.5/255 of 0 or 1) in either image (multinerf's color_correct), and once to "
+    "all pixels inside the mask, so that a plain background counts; the best of the two and of no correction",
     "ssim": "11x11 Gaussian window, sigma 1.5, no padding; both images black outside the mask",
     "ssim_padded": "as the training loss: 11x11, sigma 1.5, zero padding (INRIA); black outside the mask",
     "flip": "mean LDR-FLIP, 67 pixels a degree (flip-evaluator), lower is better; black outside the mask",
     "lpips": "LPIPS 0.1, images scaled to [-1, 1], lower is better; black outside the mask",
-    "uncovered": "share of the pixels with an opacity below 0.5, of those inside the mask, lower is better",
+    "uncovered": "share of the pixels with an opacity below 0.5, of those that masks or alpha say show something; "
+    "lower is better",
 }
 METRICS = tuple(DEFINITIONS)
+OBJECT = {
+    "psnr_object": "as psnr, of the pixels that show the object, by masks or alpha; of views that show it",
+    "psnr_frame": "as psnr, of the whole frame: the photograph is the background where masks or alpha say nothing is",
+}
+"""What is measured beside `METRICS` where masks or alpha say what is empty: that is easy to show, and may be most."""
 MOVING = {"psnr_moving": "as psnr, of the pixels whose label is a class that moves; of views that show one"}
 """What is measured beside `METRICS` where labels say what moves: a background that stands still hides the rest."""
-RENDERERS_VIEWS = 8
-"""Views, at most, that a fit is measured with in every renderer at its end: `drgs eval` takes all."""
+TRAIN_VIEWS = 8
+"""Training photographs, at most, that a fit looks at again at its end where it holds out none."""
 VIEW_PICTURES = ("png", "semantics.png")
 """Of a view: that of its colors and, of a run with features, that of its labels; what follows the view's file name."""
 _NO_LPIPS = "needs the package lpips: pip install 'drgs[lpips]', and the weights that docs/install.md names"
@@ -96,6 +104,8 @@ def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = 
 def cc_psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float:
     """`psnr` of the color-corrected image in dB: what is left of the error once exposure, white balance and tone agree.
 
+    It is never below `psnr`: a correction that makes a view worse is not applied.
+
     Args:
         image, target: (H, W, 3) in [0, 1].
         mask: (H, W) weights in [0, 1], or None.
@@ -105,6 +115,11 @@ def cc_psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None
 
 def color_corrected(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
     """An image with the colors of another, as far as one quadratic function of the color brings them there.
+
+    Two fits are made. That to the pixels which neither image has saturated is right for photographs whose highlights
+    are clipped; but a plain white or black background is saturated, too, and a correction that was not fitted to it may
+    recolor it. So another fit is made to all pixels that count, and what has the least squared error is returned, the
+    image itself among them.
 
     Args:
         image, target: (H, W, 3) in [0, 1].
@@ -118,21 +133,35 @@ def color_corrected(image: torch.Tensor, target: torch.Tensor, mask: torch.Tenso
     wanted = target.detach().double().reshape(-1, 3).numpy()
     # A weighted least squares is one of rows that are scaled by the roots of the weights.
     scale = np.ones(len(colors)) if mask is None else mask.double().reshape(-1).sqrt().numpy()
-    is_fitted = _unsaturated(colors) & _unsaturated(wanted) & (scale > 0)[:, None]
+    found = [colors, *(_corrected(colors, wanted, scale, saturated) for saturated in (False, True))]
+    errors = [float(np.square((x - wanted) * scale[:, None]).sum()) for x in found]
+    return torch.from_numpy(found[int(np.argmin(errors))]).reshape(image.shape)
+
+
+def _corrected(colors: np.ndarray, wanted: np.ndarray, scale: np.ndarray, saturated: bool) -> np.ndarray:
+    """(P, 3) colors after the fits of `color_corrected`.
+
+    Args:
+        colors, wanted: (P, 3) of the rendering and of the photograph.
+        scale: (P,) roots of the weights.
+        saturated: Whether saturated values are fitted, too.
+    """
+    usable = np.broadcast_to((scale > 0)[:, None], colors.shape)
+    is_fitted = usable if saturated else usable & _unsaturated(colors) & _unsaturated(wanted)
     for _ in range(_CORRECTIONS):
         products = [colors[:, i] * colors[:, j] for i in range(3) for j in range(i, 3)]
         terms = np.stack([*products, *colors.T, np.ones(len(colors))], axis=1)
-        usable = is_fitted & _unsaturated(colors)
+        chosen = is_fitted if saturated else is_fitted & _unsaturated(colors)
         corrected = colors.copy()
         for channel in range(3):
-            rows = usable[:, channel]
+            rows = chosen[:, channel]
             if rows.any():
                 weights = scale[rows]
                 # The solution of least norm, where there are fewer colors than terms.
                 fitted = np.linalg.lstsq(terms[rows] * weights[:, None], wanted[rows, channel] * weights)[0]
                 corrected[:, channel] = terms @ fitted
         colors = corrected.clip(0, 1)
-    return torch.from_numpy(colors).reshape(image.shape)
+    return colors
 
 
 def _unsaturated(colors: np.ndarray) -> np.ndarray:
@@ -291,6 +320,7 @@ def _evaluated(
     if lpips is None:
         reasons["lpips"] = _NO_WEIGHTS if importlib.util.find_spec("lpips") else _NO_LPIPS
     measured = None if isinstance(segmentation, str) else segmentation
+    is_cut_out, background = any(frame.empty() is not None for frame in frames), settings.background
     for frame, file_name in zip(frames, file_names([frame.name for frame in frames]), strict=True):
         seen = g if measured else colors_only(g, frame.camera.time)
         with torch.no_grad():  # pictures of whatever an optimizer may hold
@@ -300,10 +330,12 @@ def _evaluated(
         shown = image if frame.mask is None else image * frame.mask[..., None]
         height, width = target.shape[:2]
         row: dict[str, Any] = {"name": frame.name, "width": width, "height": height, **dict.fromkeys(METRICS)}
-        row |= _photometric(image, frame)
+        row |= _photometric(image, frame, background if is_cut_out else None)
         if moving:
             row["psnr_moving"] = _moving_psnr(image, frame, moving)
-        row["uncovered"] = uncovered(out.alpha.cpu(), frame.mask)
+        weights = frame.object_weights()
+        counted = frame.mask if weights is None or not bool((weights > 0).any()) else weights
+        row["uncovered"] = uncovered(out.alpha.cpu(), counted)
         row["ssim_padded"] = float(_ssim_map(shown, target).mean())
         row["flip"] = flip(shown, target)
         if min(height, width) >= _SSIM_MIN_SIDE:
@@ -323,13 +355,13 @@ def _evaluated(
             error = (4 * (shown - target).abs()).clamp(0, 1)
             write_png(pictures / f"{file_name}.png", torch.cat([target, shown, error], dim=1).numpy())
         bar.advance()
-    variants = DEFINITIONS | (MOVING if moving else {})
+    variants = DEFINITIONS | (OBJECT if is_cut_out else {}) | (MOVING if moving else {})
     mean: dict[str, float | None] = {}
     median: dict[str, float | None] = {}
     for name in variants:
         values = [row[name] for row in views if row[name] is not None]
-        # Not every view shows what moves; else a number that one view lacks has no average.
-        there = values and (name in MOVING or len(values) == len(views))
+        # Not every view shows the object or what moves; else a number that one view lacks has no average.
+        there = values and (name in OBJECT | MOVING or len(values) == len(views))
         mean[name], median[name] = (sum(values) / len(values), float(np.median(values))) if there else (None, None)
         if not views and name in DEFINITIONS:
             reasons[name] = "no view is held out"
@@ -364,14 +396,17 @@ def through_renderers(
         split: Split of the frames, to be recorded.
         limit: Largest number of views, which are evenly spaced; None takes all.
     Returns:
-        JSON-serializable: `split`, `width` and `height` of the first view, and `rows`, for each renderer its `name`,
-        `mean` of each metric over the views, `worst` (the view of the lowest PSNR) and `views`; None without frames.
+        JSON-serializable: `split`, `width` and `height` of the first view, `of` how many views these were taken, and
+        `rows`, for each renderer its `name`, `mean` of each metric over the views, `worst` (the view of the lowest
+        PSNR, of the object where masks or alpha say where it is) and `views`; None without frames.
     """
     if not frames:
         return None
+    count = len(frames)
     if limit is not None:
-        frames = frames[:: -(-len(frames) // limit)]
+        frames = frames[:: -(-count // limit)]
     rows = []
+    is_cut_out = any(frame.empty() is not None for frame in frames)
     with Bar("views as each renderer draws them", len(renderers) * len(frames)) as bar:
         for name, settings in renderers.items():
             views: list[dict[str, Any]] = []
@@ -379,24 +414,45 @@ def through_renderers(
                 with torch.no_grad():  # pictures of whatever an optimizer may hold
                     seen = colors_only(g, frame.camera.time)
                     image = render(seen, frame.camera, settings, outputs=()).rgb.cpu().clamp(0, 1)
-                views.append({"name": frame.name, **_photometric(image, frame)})
+                background = settings.background if is_cut_out else None
+                views.append({"name": frame.name, **_photometric(image, frame, background)})
                 bar.advance()
-            mean = {key: float(np.mean([row[key] for row in views])) for key in views[0] if key != "name"}
-            worst = min(views, key=lambda row: row["psnr"])
+            shown = {key: [row[key] for row in views if row[key] is not None] for key in views[0] if key != "name"}
+            mean = {key: float(np.mean(values)) for key, values in shown.items() if values}
+            by = "psnr_object" if "psnr_object" in mean else "psnr"
+            worst = min((row for row in views if row[by] is not None), key=lambda row: row[by])
             rows.append({"name": name, "mean": mean, "worst": worst, "views": views})
-    return {"split": split, "width": frames[0].camera.width, "height": frames[0].camera.height, "rows": rows}
+    camera = frames[0].camera
+    return {"split": split, "width": camera.width, "height": camera.height, "of": count, "rows": rows}
 
 
-def _photometric(image: torch.Tensor, frame: Frame) -> dict[str, float]:
+def _photometric(
+    image: torch.Tensor, frame: Frame, background: tuple[float, float, float] | None
+) -> dict[str, float | None]:
     """What every rendered view is measured by, whatever renderer drew it: those of `DEFINITIONS` that need colors
     alone and take no time.
 
     Args:
         image: (H, W, 3) in [0, 1].
         frame: The photograph of the view.
+        background: RGB behind an object that masks or alpha cut out, for those of `OBJECT`, too; None without.
     """
     target = frame.image()
-    return {"psnr": psnr(image, target, frame.mask), "cc_psnr": cc_psnr(image, target, frame.mask)}
+    row: dict[str, float | None] = {
+        "psnr": psnr(image, target, frame.mask),
+        "cc_psnr": cc_psnr(image, target, frame.mask),
+    }
+    if background is None:
+        return row
+    weights = frame.object_weights()
+    counted = frame.mask if weights is None else weights  # no alpha channel: the object fills the frame
+    row["psnr_object"] = psnr(image, target, counted) if counted is None or bool((counted > 0).any()) else None
+    if frame.is_object and frame.mask is not None:
+        mask = frame.mask[..., None]
+        row["psnr_frame"] = psnr(image, target * mask + (1 - mask) * torch.tensor(background))
+    else:
+        row["psnr_frame"] = row["psnr"]
+    return row
 
 
 def renderers_table(metrics: Mapping[str, Any]) -> tuple[str, tuple[str, ...], list[tuple[str, ...]]]:
@@ -405,21 +461,37 @@ def renderers_table(metrics: Mapping[str, Any]) -> tuple[str, tuple[str, ...], l
     Args:
         metrics: Content of metrics.json; older versions measured one renderer more than the run's own, as `viewers`.
     """
-    head = ("renderer", "PSNR", "color-corrected", "worst\nPSNR", "worst view")
+    keys = {"psnr": "PSNR", "cc_psnr": "color-corrected"}
+    worst, by = "worst\nPSNR", "psnr"
     rows: list[tuple[str, ...]] = []
     if (found := metrics.get("renderers")) and found["rows"]:
-        for row in found["rows"]:
-            means = (f"{row['mean'][key]:.2f}" if key in row["mean"] else "-" for key in ("psnr", "cc_psnr"))
-            rows.append((row["name"], *means, f"{row['worst']['psnr']:.2f}", row["worst"]["name"]))
         count = len(found["rows"][0]["views"])
+        # Older versions measured a part of the test views without saying so.
+        total = found.get("of", metrics.get("count") if found["split"] == metrics.get("split") else None) or count
+        if "psnr_object" in found["rows"][0]["mean"]:
+            keys = {"psnr_object": "PSNR of\nthe object", "psnr_frame": "PSNR of\nthe frame"} | keys
+            del keys["psnr"]  # one of these two, by what says where the object is
+            worst, by = "worst PSNR of\nthe object", "psnr_object"
+        for row in found["rows"]:
+            means = (_decibels(row["mean"].get(key)) for key in keys)
+            # The worst of some views may be far better than the worst of all.
+            last = (_decibels(row["worst"].get(by)), row["worst"]["name"]) if count == total else ()
+            rows.append((row["name"], *means, *last))
+        head = ("renderer", *keys.values(), *((worst, "worst view") if count == total else ()))
+        several = f"{count}" if count == total else f"{count} of {total}"
     elif found := metrics.get("viewers"):
         values = {"the run's own": found["own_psnr"], found["preset"]: found["psnr"]}
-        rows = [(name, f"{value:.2f}", "-", "-", "-") for name, value in values.items()]
-        count = len(found["views"])
+        rows = [(name, f"{value:.2f}") for name, value in values.items()]
+        head = ("renderer", "PSNR")
+        several = f"{len(found['views'])}"
     else:
-        return "", head, rows
-    shown = f"{count} {found['split']} views of {found['width']}x{found['height']}"
+        return "", (), rows
+    shown = f"{several} {found['split']} views of {found['width']}x{found['height']}"
     return f"The same Gaussians in several renderers, {shown}", head, rows
+
+
+def _decibels(value: Any) -> str:
+    return f"{value:.2f}" if isinstance(value, float | int) else "-"
 
 
 def refined_scores(scene: Scene, frames: list[Frame], settings: RenderSettings) -> dict:

@@ -301,7 +301,7 @@ def _fit(
             held_out or trainer.photographs(),
             renderers_to_measure(config.renderers, config.settings, lenses=config.data.undistort == "off"),
             "test" if held_out else "train",
-            metrics.RENDERERS_VIEWS,
+            None if held_out else metrics.TRAIN_VIEWS,
         ),
         **({"fitted": plan.names, "pool_leak": plan.pool_leak} if plan else {}),
         **({"motion": moved} if moved else {}),
@@ -320,7 +320,7 @@ def _skybox_summary(trainer: Trainer) -> dict[str, Any]:
     if not count:
         return {}
     frames = trainer.photographs()
-    frames = frames[:: -(-len(frames) // metrics.RENDERERS_VIEWS)]
+    frames = frames[:: -(-len(frames) // metrics.TRAIN_VIEWS)]
     share = visible_share(trainer.gaussians(), count, frames, trainer.config.settings)
     return {"skybox": {"gaussians": count, "visible": share}}
 

@@ -1,5 +1,6 @@
 """Claims of drgs.metrics: values against their definitions, masks, and what is missing is null with a reason."""
 
+import dataclasses
 import importlib.util
 import math
 from types import SimpleNamespace
@@ -172,6 +173,42 @@ def test_masked_evaluation_ignores_what_is_outside(rng, monkeypatch):
     assert row["flip"] == pytest.approx(0, abs=1e-4)
 
 
+@pytest.mark.parametrize("kind", ["alpha", "mask"])
+def test_cut_out_objects_have_a_number_for_the_object_and_one_for_the_frame(rng, monkeypatch, capsys, kind):
+    """Of a photograph nine tenths of which are empty, by its alpha channel or by an object's mask: the error of the
+    object is not thinned by empty pixels, what is drawn where nothing is counts in the frame, and a view that the
+    object fills has the same number twice. `uncovered` is of the object; tables name both.
+    """
+    a, b = images(rng)
+    shown = torch.zeros(40, 50)
+    shown[:10, :20] = 1
+    told = {"alpha": shown} if kind == "alpha" else {"mask": shown, "is_object": True}
+    photo = a * shown[..., None] if kind == "alpha" else a  # composited on the background, black
+    cut = dataclasses.replace(frame(photo), **told)
+    image = torch.where(shown[..., None] > 0, b, torch.zeros(3))
+    image[30:32] = 0.5  # a floater
+    result = evaluate(monkeypatch, image, [cut, frame(image, name="c")], alpha=0.4 + 0 * shown)
+    row, full = result["views"]
+    assert row["psnr_object"] == pytest.approx(metrics.psnr(b[:10, :20], a[:10, :20]))
+    assert row["psnr_frame"] == pytest.approx(metrics.psnr(image, a * shown[..., None]))
+    assert row["psnr"] == row["psnr_frame" if kind == "alpha" else "psnr_object"]
+    assert row["uncovered"] == 1
+    assert full["psnr_object"] == full["psnr_frame"] == full["psnr"]
+    assert result["mean"]["psnr_object"] == pytest.approx((row["psnr_object"] + 100) / 2)
+    monkeypatch.setattr("drgs.metrics.render", lambda g, camera, settings, outputs: Rendered(image, shown))
+    monkeypatch.setattr("drgs.metrics.colors_only", lambda g, time: g)
+    found = metrics.through_renderers(None, [cut], {"fast": RenderSettings.preset("fast")}, "test")
+    assert found["rows"][0]["worst"] == {
+        "name": "a/b 1",
+        **{key: pytest.approx(row[key]) for key in ("psnr", "cc_psnr", "psnr_object", "psnr_frame")},
+    }
+    print_table({**result, "split": "test", "count": 2, "renderers": found})
+    said = capsys.readouterr().out
+    assert all(name in said for name in ("psnr_object  psnr_frame  cc_psnr", "the object", "the frame"))
+    blank = dataclasses.replace(frame(0 * a), alpha=0 * shown)  # nothing of the object is in this view
+    assert evaluate(monkeypatch, image, [blank])["views"][0]["psnr_object"] is None
+
+
 def test_missing_metrics_say_why(rng, monkeypatch):
     """No held-out view, or images smaller than a window: None and a reason, never a number."""
     empty = evaluate(monkeypatch, None, [])
@@ -267,7 +304,7 @@ def test_color_correction_undoes_an_affine_change_of_color():
 @pytest.mark.parametrize("value", [None, 0.0, 0.4, 1.0])
 def test_color_correction_of_little_or_constant_color_is_finite(height, width, value):
     """Identical images stay identical, be they tiny, of one color or saturated; of different constants one is made the
-    other, unless saturation hides how: then the image stays as it is.
+    other.
     """
     image = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(0)) * 0.8 + 0.1
     image = image if value is None else torch.full_like(image, value)
@@ -275,7 +312,19 @@ def test_color_correction_of_little_or_constant_color_is_finite(height, width, v
     other = torch.full_like(image, 0.7)
     corrected = metrics.color_corrected(image, other)
     assert torch.isfinite(corrected).all()
-    if value in (0.0, 1.0):
-        assert torch.equal(corrected, image.double())
-    else:
-        assert metrics.cc_psnr(image, other) > 99
+    assert metrics.cc_psnr(image, other) > 99
+
+
+@pytest.mark.parametrize("ground", [0.0, 0.99, 1.0])
+def test_color_correction_leaves_a_plain_ground_alone(ground):
+    """An object of a twelfth of the view that is rendered too dark, on a ground that is right: the correction of the
+    object alone would recolor the ground. The corrected view is never worse than the plain one.
+    """
+    generator = torch.Generator().manual_seed(3)
+    target = torch.full((24, 24, 3), 0.0 if ground == 0 else 1.0)
+    image = torch.full((24, 24, 3), ground)
+    target[8:15, 8:15] = 0.3 + 0.2 * torch.rand(7, 7, 3, generator=generator)
+    image[8:15, 8:15] = target[8:15, 8:15] * 0.8 + 0.05 * torch.randn(7, 7, 3, generator=generator)
+    image = image.clamp(0, 1)
+    plain, corrected = metrics.psnr(image, target), metrics.cc_psnr(image, target)
+    assert 30 < plain <= corrected

@@ -228,6 +228,7 @@ def test_a_fit_without_held_out_views_is_measured_in_some(dataset, tmp_path):  #
     found = fit(dataset, tmp_path / "run", config(max_steps=1, test_every=0), progress=False).metrics["renderers"]
     assert found["split"] == "train"
     assert [len(row["views"]) for row in found["rows"]] == [5, 5]  # every second of nine, `fast` and what viewers show
+    assert found["of"] == 9
     assert metrics.through_renderers(None, [], {}, "test") is None
 
 
@@ -240,12 +241,19 @@ def test_own_settings_have_a_row_of_their_own():
 
 
 def test_what_older_versions_measured_is_shown():
-    """One renderer beside the run's own, without views."""
+    """One renderer beside the run's own, without views; a part of the views, whose worst is not that of all."""
     viewers = {"preset": "gsplat", "psnr": 20.0, "own_psnr": 24.5, "split": "test", "views": ["a"]}
     title, head, rows = renderers_table({"viewers": viewers | {"width": 4, "height": 3}})
-    assert rows == [("the run's own", "24.50", "-", "-", "-"), ("gsplat", "20.00", "-", "-", "-")]
+    assert rows == [("the run's own", "24.50"), ("gsplat", "20.00")]
     assert "1 test views of 4x3" in title
-    assert len(head) == 5
+    assert head == ("renderer", "PSNR")
+    view = {"name": "a", "psnr": 20.0, "cc_psnr": 21.0}
+    row = {"name": "fast", "mean": {"psnr": 20.0, "cc_psnr": 21.0}, "worst": view, "views": [view]}
+    some = {"split": "test", "width": 4, "height": 3, "rows": [row]}
+    for count, title, last in ((1, "1 test views", ("20.00", "a")), (10, "1 of 10 test views", ())):
+        found = renderers_table({"renderers": some, "split": "test", "count": count})
+        assert title in found[0]
+        assert found[2] == [("fast", "20.00", "21.00", *last)]
     assert renderers_table({"viewers": None})[2] == renderers_table({"renderers": None})[2] == []
 
 

@@ -9,7 +9,7 @@ from drgs.evaluation import evaluate_run
 from drgs.files import Run
 from drgs.fitting.records import fit_record
 from drgs.fitting.resume import claim_run
-from drgs.metrics import METRICS, MOVING, Lpips, renderers_table
+from drgs.metrics import METRICS, MOVING, OBJECT, Lpips, renderers_table
 
 if TYPE_CHECKING:
     from drgs.commands.options import Eval
@@ -35,8 +35,10 @@ def print_table(metrics: dict, *, lpips: bool = False) -> None:
         metrics: Content of metrics.json.
         lpips: Whether LPIPS was asked for; otherwise nothing is said of it, as it is null for a reason that is known.
     """
-    digits = {"psnr": ".2f", "cc_psnr": ".2f", "psnr_moving": ".2f"}
-    names = [name for name in (*METRICS, *MOVING) if metrics["mean"].get(name) is not None]
+    digits = dict.fromkeys(("psnr", "cc_psnr", *OBJECT, *MOVING), ".2f")
+    names = [name for name in (*OBJECT, *METRICS, *MOVING) if metrics["mean"].get(name) is not None]
+    if "psnr_object" in names:
+        names.remove("psnr")  # one of these two, by what says where the object is
     scale = metrics.get("scale")
     rows = [*metrics["views"], {"name": "mean", **metrics["mean"]}]
     tables.show(

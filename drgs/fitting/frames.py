@@ -71,6 +71,13 @@ class Frame:
             shown = alpha if shown is None else shown * alpha
         return None if shown is None else 1 - shown
 
+    def object_weights(self) -> torch.Tensor | None:
+        """(H, W) float32 in [0, 1], how much of each pixel shows the object; None if nothing tells where it is."""
+        empty = self.empty()
+        if empty is None:
+            return None
+        return 1 - empty if self.mask is None or self.is_object else (1 - empty) * self.mask
+
 
 def load_dataset(path: str | os.PathLike, config: FitConfig, **options: Any) -> Dataset:
     """The data set of a fit: its frames, split and background are those that the fit is told.

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drgs.fitting.config import FitConfig, SelectionConfig
-from drgs.metrics import renderers_table
+from drgs.metrics import MOVING, OBJECT, renderers_table
 from drgs.report.pictures import Picture
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ GENERATOR = "drgs report"
 """What the page says of itself: a file that does is one that may be replaced."""
 
 _HERE = Path(__file__).parent
-_DIGITS = {"psnr": 2, "cc_psnr": 2, "psnr_moving": 2}
+_DIGITS = dict.fromkeys(("psnr", "cc_psnr", *OBJECT, *MOVING), 2)
 _NO_CHARTS = "Charts are left out: they need matplotlib, pip install 'drgs[report]'."
 
 
@@ -138,8 +138,9 @@ def _tiles(account: Account) -> list[tuple[str, str]]:
     metrics = account.metrics
     tiles = []
     if metrics is not None:
-        units = {"psnr": " dB", "cc_psnr": " dB", "psnr_moving": " dB"}
         names = {
+            "psnr_object": "PSNR of the object",
+            "psnr_frame": "PSNR of the frame",
             "psnr": "PSNR",
             "cc_psnr": "color-corrected PSNR",
             "ssim": "SSIM",
@@ -147,10 +148,12 @@ def _tiles(account: Account) -> list[tuple[str, str]]:
             "lpips": "LPIPS",
             "psnr_moving": "PSNR of what moves",
         }
+        if metrics["mean"].get("psnr_object") is not None:
+            del names["psnr"]  # one of these two, by what says where the object is
         for name, text in names.items():
             if (value := metrics["mean"].get(name)) is not None:
                 what = f"{text}, {metrics['count']} {metrics['split']} views"
-                tiles.append((_shown(name, value) + units.get(name, ""), what))
+                tiles.append((_shown(name, value) + " dB" * (name in _DIGITS), what))
         labels = (metrics.get("segmentation") or {}).get("run") or {}
         if isinstance(labels.get("miou"), float):
             tiles.append((f"{labels['miou']:.3f}", "mIoU"))
