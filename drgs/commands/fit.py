@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING
 
 from drgs.commands.clustered import workers_of
 from drgs.commands.eval import print_table
 from drgs.commands.report import report_of
+from drgs.data.backgrounds import default_background
 from drgs.files import Run
 from drgs.fitting.frames import load_dataset
-from drgs.fitting.records import fit_record
+from drgs.fitting.records import fit_record, is_run
 from drgs.fitting.resume import claim_run
 from drgs.report.write import FILE
 from drgs.train import fit
 
 if TYPE_CHECKING:
     from drgs.commands.options import Fit
+    from drgs.data import Dataset
+    from drgs.fitting.config import FitConfig
 
 __all__ = ["run"]
+
+_log = logging.getLogger(__name__)
 
 
 def run(args: Fit) -> None:
@@ -34,6 +40,8 @@ def run(args: Fit) -> None:
         strict=args.strict,
         semantics=config.features.semantics != "ignore",
     )
+    if args.background is None:
+        config = _on_background(dataset, config, args, is_active)
     with workers_of(args) as workers:
         result = fit(dataset, args.output, config, resume=args.resume, progress=not args.quiet, workers=workers)
     page = result.run.path / FILE
@@ -45,3 +53,19 @@ def run(args: Fit) -> None:
     print(f"{len(result.gaussians)} Gaussians in {result.seconds:.0f} s: {result.run.point_cloud}")
     if args.report:
         print(f"report: {page}")
+
+
+def _on_background(dataset: Dataset, config: FitConfig, args: Fit, lazy: bool) -> FitConfig:
+    """The configuration with the background that the photographs are put on where --background does not say: that of
+    the run that goes on, else `default_background`, which is said.
+    """
+    run = Run(args.output)
+    if args.resume and is_run(run.path):
+        color, reason = fit_record(run).config.settings.background, ""
+    else:
+        color, reason = default_background(dataset, lazy)
+    if reason:
+        _log.info("background of photographs with an alpha channel: %s (--background says another one)", reason)
+    for view in (*dataset.views, *dataset.absent):
+        view.background = color
+    return config.replace(settings=config.settings.replace(background=color))

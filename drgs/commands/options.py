@@ -121,8 +121,8 @@ class Fit(_Fitted, _Selecting, Choosing, Clustered, Data):
     """Fit for the renderer of this name alone; with several renderers in --for, render previews and views by it."""
     resume: bool = False
     """Continue from the last checkpoint in the run folder."""
-    background: tuple[float, float, float] = RenderSettings.background
-    """Background color: RGB in [0, 1]."""
+    background: tuple[float, float, float] | None = None
+    """Background color: RGB in [0, 1]; default black, or for photographs with transparency as docs/datasets.md says."""
     views: Literal["all", "active"] = "all"
     """Fit to all training views, or start with a few and choose more during the fit (active; options below)."""
     report: bool = True
@@ -134,9 +134,10 @@ class Fit(_Fitted, _Selecting, Choosing, Clustered, Data):
         """
         if any(text.startswith("background=") for text in self.overrides):
             raise ValueError("--set background: must be --background here, which photographs are composited on as well")
-        check_color("--background", self.background)
+        background = RenderSettings.background if self.background is None else self.background
+        check_color("--background", background)
         preset = self.preset or own_preset(self.renderers)
-        return RenderSettings.preset(preset, **self.replaced()).replace(background=self.background)
+        return RenderSettings.preset(preset, **self.replaced()).replace(background=background)
 
     def fit_config(self) -> FitConfig:
         """What these options say of the fit, its selection with --views active.

@@ -54,7 +54,7 @@ def _settings(settings: RenderSettings, renderers: tuple[str, ...]) -> list[str]
     for name, value in differences.items():
         words += ["--set", override(name, value)]
     words = [*([] if renderers == AUTO else ["--for", ",".join(renderers)]), *words]
-    return words + _option("background", settings.background, RenderSettings.background)
+    return [*words, *_option("background", settings.background, None)]  # photographs may suggest another one
 
 
 def _option(name: str, value: Any, default: Any) -> list[str]:

@@ -16,6 +16,7 @@ from drgs.data.formats import Format
 from drgs.data.guesses import scene_extent
 from drgs.data.held_out import apply_held_out
 from drgs.data.llff import POSES_BOUNDS
+from drgs.data.masks import note_partial_masks
 from drgs.data.multicamera import frame_folders
 from drgs.data.points import added_points, initial_points, matched_points, triangulated_count, triangulated_points
 from drgs.data.replica import POSES
@@ -158,6 +159,7 @@ def load(
     count_once(dataset)
     dataset.split()  # refuses numbers that cannot be
     check_times(dataset)
+    note_partial_masks(dataset.views, lazy)
     if semantics:
         attach(dataset, lazy)
     return dataset

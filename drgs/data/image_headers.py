@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
-__all__ = ["can_hold", "is_whole", "stated_size"]
+__all__ = ["can_hold", "is_whole", "png_has_alpha", "stated_size"]
 
 _PIXELS_A_BYTE = 8_256  # deflate makes one byte of at most 1,032, each of at most 8 pixels of one bit
 _WEBP_SIDE = 1 << 14  # pixels: 14 bits
@@ -30,6 +30,13 @@ def stated_size(path: Path) -> tuple[int, int] | None:
                 except struct.error:  # it ends in the middle
                     return None
     return None
+
+
+def png_has_alpha(path: Path) -> bool:
+    """Whether a file is a PNG whose header states an alpha channel (color types 4 and 6)."""
+    with path.open("rb") as file:
+        head = file.read(26)
+    return head.startswith(_PNG) and len(head) == 26 and head[25] in (4, 6)
 
 
 def can_hold(path: Path, width: int, height: int) -> bool:

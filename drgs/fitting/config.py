@@ -95,9 +95,9 @@ class DataConfig(Record):
             both.
         test_cameras: Synchronous cameras to hold out at all times, e.g. cam00,cam07; none: hold out by --test-every.
         times: Number of frames of each synchronous camera, evenly spaced in its video, the first and the last included.
-        mask: Outside of masks the scene is empty (object), or unknown (valid); auto: object for views with a mask file,
-            valid for empty corners of undistorted photographs; ignore: no masks. With object and auto, transparent
-            pixels of an alpha channel are empty, too.
+        mask: Outside of masks the scene is empty (object), or unknown (valid); auto: object if all photographs have a
+            mask file, valid if only some have one, and for empty corners of undistorted photographs; ignore: no masks.
+            With object, and as with masks with auto, transparent pixels of an alpha channel are empty, too.
         undistort: Undistort photographs (on), or fit them as they were taken (off), with renderers along rays (--for
             drgs, exact, fast or 3dgut); auto: off for these renderers if undistorting would crop more than a fifth of
             the picture.

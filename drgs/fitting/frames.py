@@ -137,14 +137,17 @@ def _frames(views: list[View], max_pixels: int, mask: str, bar: Bar) -> list[Fra
         image, alpha = view.image_and_alpha(width, height)
         store = _as_stored if is_float else _as_bytes
         weights = None if mask == "ignore" else view.mask(width, height)
+        is_empty = mask == "object" or (mask == "auto" and view.empty_outside)  # outside of a mask or by alpha
+        if alpha is not None and mask == "auto" and not is_empty:
+            weights = alpha if weights is None else weights * alpha
         frames.append(
             Frame(
                 name=view.name,
                 camera=dataclasses.replace(view.shown_camera.resized(width, height), name=view.name),
                 pixels=store(image),
                 mask=None if weights is None else torch.from_numpy(np.ascontiguousarray(weights)),
-                is_object=mask == "object" or (mask == "auto" and view.mask_path is not None),
-                alpha=store(alpha) if alpha is not None and mask in ("auto", "object") else None,
+                is_object=mask == "object" or (is_empty and view.mask_path is not None),
+                alpha=store(alpha) if alpha is not None and is_empty else None,
                 teacher=cast("_Map | None", None if view.teacher_path is None else view.teacher),
                 labels=cast("_Labels | None", view.label_path and functools.partial(view.labels, width, height)),
             )

@@ -143,6 +143,18 @@ def start(
         torch.from_numpy(points), torch.from_numpy(colors), *config.density.start_of(dense), features=width
     )
     _log.info("%d initial points: %s", len(points), source)
+    partial = {view.name for view in dataset.views if not view.empty_outside}
+    masked = sum(frame.name in partial and (frame.mask is not None or frame.alpha is not None) for frame in frames)
+    if masked and config.data.mask in ("auto", "object"):
+        is_object = config.data.mask == "object"
+        _log.warning(
+            "%d of %d training photographs have a mask or an alpha channel, and the others show what is outside: %s",
+            masked,
+            len(frames),
+            "--mask object says nevertheless that nothing is there; leave it out, or mask all of them"
+            if is_object
+            else "it is taken as unknown (--mask valid); mask all of them, or say --mask ignore to use all pixels",
+        )
     if empty := [x for x in (frame.empty() for frame in frames) if x is not None]:
         share = float(sum(x.sum() for x in empty)) / sum(frame.pixels[..., 0].numel() for frame in frames)
         color = " ".join(f"{x:g}" for x in config.settings.background)
