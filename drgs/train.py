@@ -40,7 +40,7 @@ from drgs.fitting.config import (
     SelectionConfig,
 )
 from drgs.fitting.exposure import NETWORK as EXPOSURE
-from drgs.fitting.frames import Frame, frames_for
+from drgs.fitting.frames import Frame, frames_for, warn_of_late_cameras
 from drgs.fitting.lenses import lens_choice
 from drgs.fitting.parts import parts_of, with_exposure, with_poses
 from drgs.fitting.photographs import check_photographs, estimated_of, join, photographs_record
@@ -215,6 +215,8 @@ def _fit(
     tensors, header = _checkpoint(run, plan, taught) if resume else (None, None)
     frames = plan.frames() if plan else frames_for(train, config.data)
     held_out = frames_for(test, config.data)
+    if plan is None and tensors is None:
+        warn_of_late_cameras(dataset, [*frames, *held_out])
     if begin is not None and taught is not None:
         raise ValueError("fit: begin must be None where features are fitted, too; ignore semantics, or fit anew")
     if taught and taught.embeddings:

@@ -17,6 +17,7 @@ from drgs.cameras import Camera, c2w_to_opengl, intrinsics, look_at
 from drgs.data import decoding, initial_points, load, transforms
 from drgs.data.videos import VideoFrame, read_video
 from drgs.fitting.config import FitConfig
+from drgs.fitting.frames import load_frames, warn_of_late_cameras
 
 WIDTH, HEIGHT, FRAMES = 32, 24, 6
 FOCAL = 30.0
@@ -900,3 +901,32 @@ def test_fit_refuses(copied, spoil, options, told, capsys):
     assert told in text
     assert text.count("\n") == 1
     assert sorted(copied.parent.rglob("*")) == before
+
+
+@pytest.mark.parametrize("late", [0, 10, -6])
+def test_a_camera_that_is_out_of_step_is_named(tmp_path, caplog, late):
+    """Something that moves at changing speed, seen by four cameras, one of which starts ten frames late or six early:
+    a fit warns of that one with the shift, to a frame, and of none where all are in step.
+    """
+    speed = np.convolve(np.random.default_rng(0).uniform(0, 1, 80), np.ones(5) / 5, "same") ** 3
+    angle = 12 * np.cumsum(speed)
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    for k in range(4):
+        places = angle[np.arange(20, 60) + (late if k == 2 else 0)] + k
+        shown = [np.hypot(x - 16 - 9 * np.sin(a), y - 12 - 7 * np.cos(a)) < 4 for a in places]
+        write_video(tmp_path / f"data/cam{k:02d}.mp4", [np.repeat(200 * np.uint8(d)[..., None], 3, 2) for d in shown])
+    write_poses(tmp_path / "data", cameras())
+    if late == 10:
+        words = ["fit", str(tmp_path / "data"), "-o", str(tmp_path / "run"), "--max-steps", "1", "--no-report"]
+        assert cli.main([*words, "--for", "fast", "--max-gaussians", "500", "--quiet"]) == 0
+    else:
+        dataset = load(tmp_path / "data")
+        warn_of_late_cameras(dataset, load_frames(dataset.views, WIDTH * HEIGHT))
+    said = [line for line in caplog.messages if "seems to start" in line]
+    if not late:
+        assert not said
+        return
+    (line,) = said
+    count = int(re.search(r"camera cam02 seems to start (\d+) frames ", line)[1])
+    assert abs(count - abs(late)) <= 1
+    assert ("late:" in line and "of the other cameras, or" in line) == (late > 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import logging
 import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, cast
@@ -12,6 +13,8 @@ import numpy as np
 import torch
 
 from drgs import data
+from drgs.data.clocks import late_cameras
+from drgs.data.resizing import resize_area
 from drgs.display.progress import Bar
 from drgs.sizes import reduced_size
 
@@ -20,11 +23,14 @@ if TYPE_CHECKING:
     from drgs.data import Dataset, View
     from drgs.fitting.config import DataConfig, FitConfig, MaskUse, UndistortUse
 
-__all__ = ["Frame", "frames_for", "load_dataset", "load_frames"]
+__all__ = ["Frame", "frames_for", "load_dataset", "load_frames", "warn_of_late_cameras"]
+
+_log = logging.getLogger(__name__)
 
 _Map = Callable[[], torch.Tensor]
 _Labels = Callable[[], np.ndarray]
 
+_CHANGES_AT = 160  # pixels of the longer side at which changes from one time to the next are measured
 _FLOAT_CACHE = 2 << 30  # bytes of images kept as float32; beyond it they are kept as 8 bits
 
 
@@ -109,6 +115,34 @@ def frames_for(views: list[View], data: DataConfig, max_pixels: int | None = Non
         max_pixels: Pixels of one image at most, if others than those of the fit.
     """
     return load_frames(views, max_pixels or data.max_pixels, data.mask, data.undistort)
+
+
+def warn_of_late_cameras(dataset: Dataset, frames: list[Frame]) -> None:
+    """Warn, by name, of synchronous cameras that seem to have started later or earlier than the others.
+
+    Args:
+        dataset: The data set of the frames; without named cameras nothing is done.
+        frames: Its photographs, held-out ones included. Cameras that lack some of the times are left out.
+    """
+    if len(dataset.camera_names) < 2 or len(dataset.times) < 2:
+        return
+    names = {view.name: view.camera_name for view in dataset.views}
+    found: dict[str, dict[float, np.ndarray]] = {name: {} for name in dataset.camera_names}
+    for frame in frames:
+        scale = min(1.0, _CHANGES_AT / max(frame.camera.width, frame.camera.height))
+        size = (max(1, round(scale * side)) for side in (frame.camera.width, frame.camera.height))
+        if frame.camera.time is not None and frame.name in names:
+            gray = frame.image().mean(dim=2).numpy()
+            found[names[frame.name]][frame.camera.time] = resize_area(gray, *size)
+    whole = {
+        name: np.stack([pictures[time] for time in dataset.times])
+        for name, pictures in found.items()
+        if len(pictures) == len(dataset.times)
+    }
+    numbers = dataset.frames
+    spacing = (numbers[-1] - numbers[0]) / (len(numbers) - 1) if len(numbers) > 1 else 1.0
+    for camera in late_cameras(whole):
+        _log.warning("%s: %s", dataset.path, camera.words(spacing))
 
 
 def load_frames(
