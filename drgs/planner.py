@@ -22,6 +22,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import numbers
 import os
 import statistics
 import threading
@@ -231,7 +232,12 @@ class Planner:
         Args:
             steps: Number of steps, at most; default 20 where no time is given either.
             seconds: Wall time after which no further step begins.
+        Raises:
+            ValueError: If one is not a number >= 0.
         """
+        if steps is not None and not (isinstance(steps, numbers.Integral) and steps >= 0):
+            raise ArgumentError(f"Planner.fit: steps must be a whole number >= 0, got {steps!r}; correct it")
+        _check_seconds("Planner.fit", seconds)
         begun = time.monotonic()
         most = 20 if steps is None and seconds is None else math.inf if steps is None else steps
         done = 0
@@ -255,15 +261,23 @@ class Planner:
             seconds: Wall time for the answer; None: all is asked that has changed.
         Returns:
             A plan without picks.
+        Raises:
+            ValueError: If there are no candidates, costs or `seconds` are not numbers >= 0, or there is no model yet;
+                then `next` picks from the candidates before.
         """
+        _check_seconds("Planner.scores", seconds)
         pool = camera_list("Planner.scores", "candidates", candidates)
         if not pool:
             raise ValueError("Planner.scores: there must be at least one candidate, got none; give poses")
         with self._asking:
-            self._pool = [at_most(camera, self.info_pixels) for camera in pool]
-            self._cost = cost
-            self._costs(list(range(len(pool))), self._here)  # refuses what is no cost
-            return self._plan(0, seconds)
+            before = self._pool, self._cost
+            self._pool, self._cost = [at_most(camera, self.info_pixels) for camera in pool], cost
+            try:
+                self._costs(list(range(len(pool))), self._here)  # refuses what is no cost
+                return self._plan(0, seconds)
+            except BaseException:
+                self._pool, self._cost = before
+                raise
 
     def next(self, k: int = 1, *, seconds: float | None = None) -> ViewPlan:
         """The k places to go to next, of those that `scores` was given.
@@ -274,7 +288,10 @@ class Planner:
         Args:
             k: How many.
             seconds: Wall time for the answer; what has changed, or was never asked, is asked as far as it lasts.
+        Raises:
+            ValueError: If there are fewer candidates than k, or `seconds` is not a number >= 0.
         """
+        _check_seconds("Planner.next", seconds)
         with self._asking:
             if not (type(k) is int and 1 <= k <= len(self._pool)):
                 raise ValueError(
@@ -570,6 +587,12 @@ class _Duration:
 def _forgotten(here: Camera, there: Camera) -> float:
     """What is in the place of costs that were a function when a planner was saved."""
     raise ValueError("Planner.next: costs were a function, which no file holds; give it to Planner.scores again")
+
+
+def _check_seconds(where: str, seconds: float | None) -> None:
+    """Refuse what is no limit of time; NaN would be none."""
+    if seconds is not None and not (isinstance(seconds, numbers.Real) and seconds >= 0):
+        raise ArgumentError(f"{where}: seconds must be a number >= 0, got {seconds!r}; leave it out for no limit")
 
 
 def _checked_image(image: np.ndarray | None, camera: Camera) -> np.ndarray:

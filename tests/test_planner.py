@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import threading
 import time
 
@@ -263,6 +264,12 @@ def test_what_no_planner_can_be(make, told):
         (lambda p, c: p.scores([]), "Planner.scores: there must be at least one candidate, got none; give poses"),
         (lambda p, c: p.scores(c, cost=[1.0]), "Planner: costs must be 5, one a candidate, got 1; give the missing"),
         (lambda p, c: p.scores(c, cost=[-1.0] * 5), "Planner: costs must be finite and >= 0, got -1.0; leave out"),
+        (lambda p, c: p.scores(c, seconds=math.nan), "Planner.scores: seconds must be a number >= 0, got nan; leave"),
+        (lambda p, c: p.scores(c, seconds=-1), "Planner.scores: seconds must be a number >= 0, got -1; leave it out"),
+        (lambda p, c: p.next(seconds="1"), "Planner.next: seconds must be a number >= 0, got '1'; leave it out"),
+        (lambda p, c: p.fit(seconds=-1), "Planner.fit: seconds must be a number >= 0, got -1; leave it out"),
+        (lambda p, c: p.fit(steps=-3), "Planner.fit: steps must be a whole number >= 0, got -3; correct it"),
+        (lambda p, c: p.fit(steps=2.5), "Planner.fit: steps must be a whole number >= 0, got 2.5; correct it"),
         (lambda p, c: p.next(), r"Planner.next: k must be a whole number in 1..0 candidates, got 1; give candidates"),
         (lambda p, c: p.observe(None, c[0].resized(5, 5)), None),
         (lambda p, c: p.observe(None, dataclasses.replace(c[0], name="c1")), "names must be different, got 'c1' again"),
@@ -277,6 +284,23 @@ def test_what_cannot_be_asked(world, ask, told):
     with pytest.raises((ValueError, TypeError), match=told) as error:
         ask(planner, world[2])
     assert "\n" not in str(error.value)
+
+
+def test_candidates_of_scores_that_fail_are_not_installed(world):
+    """`next` goes on picking from those before; without a model there is nothing to pick from."""
+    planner = planner_of(world)
+    candidates = world[2]
+    before = planner.scores(candidates[:3], cost=[1.0, 2.0, 3.0])
+    with pytest.raises(ValueError, match="costs must be 5, one a candidate, got 1"):
+        planner.scores(candidates, cost=[1.0])
+    plan = planner.next(3)
+    assert plan.scores == before.scores
+    assert sorted(pick.cost for pick in plan.picks) == [1.0, 2.0, 3.0]
+    empty = Planner(config())
+    with pytest.raises(ValueError, match="there must be a model to ask"):
+        empty.scores(candidates)
+    with pytest.raises(ValueError, match=r"k must be a whole number in 1..0 candidates"):
+        empty.next()
 
 
 @pytest.mark.parametrize(
