@@ -6,11 +6,14 @@ tests the CPU unless asked otherwise). Nothing heavy is imported until a test do
 
 from __future__ import annotations
 
+import atexit
 import gc
 import os
 import random
+import shutil
 import signal
 import sys
+import tempfile
 import zlib
 from pathlib import Path
 
@@ -24,6 +27,15 @@ prepare()  # tests may import drjit before drgs
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "DRGS_THREADS"), "1")
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # OpenMP threads that spin take cores from Dr.Jit's
 os.environ.setdefault("DRGS_VARIANT", "llvm_ad_rgb")
+
+# Matches that fits keep are those of this run of the suite, and leave nothing behind; the viewer's code is the user's.
+_cache = Path(tempfile.mkdtemp(prefix="drgs-cache-"))
+atexit.register(shutil.rmtree, _cache, ignore_errors=True)
+(_cache / "drgs").mkdir()
+_npm = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "drgs" / "npm"
+if _npm.is_dir():
+    (_cache / "drgs" / "npm").symlink_to(_npm)
+os.environ["XDG_CACHE_HOME"] = str(_cache)
 
 ROOT = Path(__file__).resolve().parent.parent
 

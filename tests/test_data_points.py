@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import os
 import re
 
 import numpy as np
@@ -9,7 +11,7 @@ import pytest
 
 import drgs
 from drgs.cameras import Camera, intrinsics, look_at
-from drgs.data import Dataset, View, added_points, initial_points, load
+from drgs.data import Dataset, View, added_points, initial_points, kept_matches, load
 from drgs.data.guesses import points_beside
 from drgs.data.guided import Matches
 from drgs.data.matching import nearby_pairs, sequential_pairs
@@ -131,6 +133,89 @@ def test_triangulates_with_the_given_poses(tmp_path, rng):
     assert (colors <= 1).all()
     assert ("features", 5, 5) in stages
     assert ("matching", 10, 10) in stages
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """Where matches are kept; nothing yet."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "drgs" / "matches"
+
+
+def matched(views) -> tuple[bool, list[np.ndarray]]:
+    """Whether features were looked for, and the points."""
+    stages = []
+    points, colors, _ = initial_points(views, progress=lambda stage, *_: stages.append(stage))
+    return "features" in stages, [points, colors]
+
+
+def test_matches_are_kept(tmp_path, rng, cache):
+    """The same photographs are matched once, with the same bits; other pixels, poses and masks are matched anew."""
+    views = plane_views(tmp_path, rng, count=3)
+    is_new, first = matched(views)
+    assert is_new
+    (file,) = cache.iterdir()
+    is_new, again = matched(views)
+    assert not is_new
+    for a, b in zip(first, again, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert matched(views[:2])[0]
+    mask = tmp_path / "mask.png"
+    assert cv2.imwrite(str(mask), np.full((HEIGHT, WIDTH), 255, np.uint8))
+    assert matched([dataclasses.replace(views[0], mask_path=mask), *views[1:]])[0]
+    moved = look_at((0.1, -0.6, 4), (0, 0, 0), (0, 1, 0))
+    assert matched([dataclasses.replace(views[0], camera=dataclasses.replace(views[0].camera, w2c=moved)), *views[1:]])[
+        0
+    ]
+    image, status = cv2.imread(str(views[0].image_path)), views[0].image_path.stat()
+    assert cv2.imwrite(str(views[0].image_path), 255 - image)
+    os.utime(views[0].image_path, ns=(status.st_atime_ns, status.st_mtime_ns))
+    assert matched(views)[0]
+    assert len(list(cache.iterdir())) == 5
+    assert file.is_file()
+
+
+@pytest.mark.parametrize("damage", ["cut", "text", "foreign", "shape", "pipe"])
+def test_kept_matches_that_are_damaged_are_not_used(tmp_path, rng, cache, damage):
+    """They are found anew, without a word, and others' files beside them stay."""
+    views = plane_views(tmp_path, rng, count=3)
+    _, first = matched(views)
+    (file,) = cache.iterdir()
+    if damage == "cut":
+        file.write_bytes(file.read_bytes()[:-200])
+    elif damage == "text":
+        file.write_text("mine")
+    elif damage == "foreign":
+        np.savez(file, numbers=np.zeros(3))
+    elif damage == "shape":
+        np.savez(file, points=np.zeros((2, 3)), colors=np.zeros((2, 3), np.float32), shown=np.zeros((9, 1), np.uint8))
+    else:
+        file.unlink()
+        os.mkfifo(file)
+    (cache / "notes.txt").write_text("mine")
+    is_new, again = matched(views)
+    assert is_new
+    np.testing.assert_array_equal(first[0], again[0])
+    assert not matched(views)[0]
+    assert (cache / "notes.txt").read_text() == "mine"
+
+
+def test_kept_matches_are_bounded(tmp_path, rng, cache, monkeypatch):
+    """Those used longest ago give way, and files of others do not; where nothing can be kept, a fit goes on."""
+    views = plane_views(tmp_path, rng, count=2)
+    assert matched(views)[0]
+    (used,) = cache.iterdir()
+    others = [cache / f"{number:040x}.npz" for number in range(3)]
+    for age, path in enumerate([*others, cache / "notes.npz"]):
+        path.write_bytes(bytes(1000))
+        os.utime(path, (1000 - age, 1000 - age))
+    os.utime(used, (1, 1))
+    assert not matched(views)[0]  # used last now
+    monkeypatch.setattr(kept_matches, "_LARGEST", used.stat().st_size + 2000)
+    kept_matches._bound(cache)
+    assert sorted(cache.iterdir()) == sorted([used, *others[:2], cache / "notes.npz"])
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "0.png"))  # a file
+    assert matched(views)[0]
 
 
 def test_triangulates_views_far_apart(tmp_path, rng):

@@ -19,6 +19,7 @@ from drgs.data.guesses import (
 )
 from drgs.data.guided import Matches, detect
 from drgs.data.hull import Hull
+from drgs.data.kept_matches import found_once
 from drgs.data.matching import nearby_pairs
 from drgs.data.views import View
 from drgs.display.progress import Bar
@@ -87,7 +88,8 @@ def initial_points(
             return points, colors, f"back-projected from {used} depth maps, holes filled, {len(points)} points"
     tried = ""
     if len(views) >= 2 and all(view.has_image for view in views):
-        points, colors, found = triangulated_points(views, seed, max_points, Matches(), progress)
+        triangulated = found_once(views, lambda: _triangulated(views, Matches(), progress))
+        points, colors, found = _with_guesses(views, seed, max_points, *triangulated, progress)
         if len(points):
             source = f"triangulated from {len(views)} given poses, {found} points"
             return points, colors, f"{source}; {len(points)} with guesses where there are none"
@@ -120,8 +122,20 @@ def triangulated_points(
         as far away as those beside; no point at all, if fewer than 50 are triangulated. Third, how many are, before any
         is left out.
     """
+    return _with_guesses(views, seed, max_points, *_triangulated(views, matches, progress), progress)
+
+
+def _with_guesses(
+    views: list[View],
+    seed: int,
+    max_points: int,
+    points: np.ndarray,
+    colors: np.ndarray,
+    shown: np.ndarray,
+    progress: Callable[[str, int, int], None] | None,
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """`triangulated_points` of what `_triangulated` has found."""
     rng = np.random.default_rng(seed)
-    points, colors, shown = _triangulated(views, matches, progress)
     found = len(points)
     if found < _MIN_TRIANGULATED:
         return points[:0], colors[:0], found
