@@ -93,8 +93,8 @@ def test_without_pyav_it_is_said(tmp_path, monkeypatch, caplog, kind, suffix):
     assert hdr_transfer(path, suffix != "mkv") == kind
     decoding._Reader(path, [], 4, suffix != "mkv")
     assert caplog.messages == [
-        f"{path}: is HDR video ({kind}), whose colors come out wrong without the package av; pip install 'drgs[video]', "
-        "or convert it to SDR"
+        f"{path}: is HDR video ({kind}), whose colors come out wrong without the package av; pip install "
+        "'drgs[video]', or convert it to SDR"
     ]
 
 

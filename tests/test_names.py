@@ -118,10 +118,10 @@ def test_transforms(named, tmp_path):
 
 @pytest.mark.parametrize("name", ["two\nlines.png", "tab\there.png", os.fsdecode(b"latin \xe9.png")])
 def test_names_that_no_model_can_hold(corner, tmp_path, name, capsys):  # noqa: F811
-    """One line, before any work."""
+    """One line, before any work, where too few others are left; else they are left out (test_sfm.py)."""
     photos = tmp_path / "photos"
     photos.mkdir()
-    for path in list_images(corner[0])[:3]:
+    for path in list_images(corner[0])[:1]:
         shutil.copy(path, photos)
     try:
         shutil.copy(path, os.path.join(photos, name))

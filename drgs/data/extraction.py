@@ -9,14 +9,14 @@ from typing import Any
 from drgs.data.colmap_bindings import pycolmap
 from drgs.data.reader_process import serve
 
-__all__ = ["features"]
+__all__ = ["extract_features"]
 
 _MASKED_CONTRAST = 0.002  # a third of COLMAP's: an object alone has few features, and weak ones match as well
 # of which COLMAP's own handlers print a stack on stderr
 _CRASHES = (signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGABRT)
 
 
-def features(path: Path, names: list[str], options: dict[str, Any], tell: Any) -> int | None:
+def extract_features(path: Path, names: list[str], options: dict[str, Any], tell: Any) -> int | None:
     """SIFT features of some images into a COLMAP database.
 
     Args:
@@ -61,4 +61,4 @@ if __name__ == "__main__":
     pycolmap.logging.minloglevel = 3  # errors included: they arrive as exceptions
     for crash in _CRASHES:
         signal.signal(crash, signal.SIG_DFL)
-    serve({"features": features})
+    serve({"extract_features": extract_features})

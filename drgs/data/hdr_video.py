@@ -91,7 +91,7 @@ class HdrReader:
         """(H, W, 3) uint8, sRGB, of the frame that is shown as number `index`; None where it cannot be decoded.
 
         Args:
-            index: From 0.
+            index: Number of the frame as it is shown, from 0.
             is_gray: Its coded luma (H, W) instead.
         """
         found = self._decoded(index)

@@ -9,12 +9,16 @@ import numpy as np
 
 from drgs.data.reader_process import Child
 
-__all__ = ["HEIF_SUFFIXES", "heif_size", "is_heif", "heif_as_jpeg", "read_heif"]
+__all__ = ["HEIF_SUFFIXES", "MissingReader", "heif_size", "is_heif", "heif_as_jpeg", "read_heif"]
 
 HEIF_SUFFIXES = (".heic", ".heif", ".hif", ".avif")
 _BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1", b"avif", b"avis")
 
 _decoder = Child("drgs.data.heif_decoding", "a photograph that can be decoded", "convert it to JPEG, or leave it out")
+
+
+class MissingReader(ValueError):
+    """The package that reads a photograph is missing: nothing is wrong with the photograph."""
 
 
 def is_heif(path: Path) -> bool:
@@ -61,7 +65,7 @@ def heif_as_jpeg(path: Path, quality: int) -> bytes:
 def _need_library(path: Path) -> None:
     """Raise ValueError without pillow-heif."""
     if importlib.util.find_spec("pillow_heif") is None:
-        raise ValueError(
+        raise MissingReader(
             f"{path}: HEIC and AVIF photographs need the package pillow-heif, which is missing; "
             "pip install 'drgs[heic]', or convert them to JPEG"
         )

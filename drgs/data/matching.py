@@ -89,7 +89,7 @@ def extract(
         }
         shown = " or ".join(str(own_file((originals or folder) / name)) for name in some)
         # Every call would otherwise open a camera of its own.
-        camera = _extractor.ask("features", Path(shown), some, options)
+        camera = _extractor.ask("extract_features", Path(shown), some, options)
     if progress:
         progress("features", len(names), len(names))
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from drgs.data.checks import IMAGE_SUFFIXES, read_image
-from drgs.data.heif import heif_as_jpeg, is_heif
+from drgs.data.heif import MissingReader, heif_as_jpeg, is_heif
 
 __all__ = [
     "check_names",
@@ -68,7 +68,7 @@ def usable_photos(photos: Sequence[Path], where: Path, fewest: int = 0, max_imag
         fewest: How many there must be.
         max_image_size: Pixels on the longer side that features are found at; 0 for the photographs' own.
     Raises:
-        ValueError: Fewer are left; the message says what is wrong with the first other one.
+        ValueError: The package that reads one is missing, or fewer are left; then the message says what is wrong with the first other one.
     """
     return leave_out(photos, lambda photo: photo_fault(photo, max_image_size), where, fewest)
 
@@ -118,6 +118,8 @@ def photo_fault(path: Path, max_image_size: int = 1600) -> str:
     Args:
         path: The photograph.
         max_image_size: Pixels on the longer side that features are found at; 0 for its own.
+    Raises:
+        MissingReader: The package that reads it is missing.
     """
     if fault := entry_fault(path):
         return fault
@@ -140,6 +142,8 @@ def _decoded(path: Path, size: int, changed: int) -> tuple[int, int] | str:
     """(width, height) of a photograph that can be decoded, else what the reader says. Kept until the file changes."""
     try:
         height, width = read_image(path).shape[:2]
+    except MissingReader:
+        raise
     except (ValueError, OSError) as error:
         return str(error) if isinstance(error, ValueError) else f"{path}: must be readable, got: {error.strerror}"
     return width, height
