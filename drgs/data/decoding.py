@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from drgs.data.checks import native_stderr
-from drgs.data.hdr_video import HdrReader, hdr_transfer
+from drgs.data.hdr import HdrReader, hdr_transfer
 from drgs.data.reader_process import serve
 from drgs.guards import memory
 

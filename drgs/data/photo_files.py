@@ -68,7 +68,8 @@ def usable_photos(photos: Sequence[Path], where: Path, fewest: int = 0, max_imag
         fewest: How many there must be.
         max_image_size: Pixels on the longer side that features are found at; 0 for the photographs' own.
     Raises:
-        ValueError: The package that reads one is missing, or fewer are left; then the message says what is wrong with the first other one.
+        ValueError: The package that reads one is missing, or fewer are left; the message then says what is wrong with
+            the first of the others.
     """
     return leave_out(photos, lambda photo: photo_fault(photo, max_image_size), where, fewest)
 

@@ -1,15 +1,19 @@
-"""Frames of HDR videos: patches of known colors come out as sRGB has them, whatever the file says them in."""
+"""HDR videos and photographs: patches of known colors come out as sRGB has them, whatever the file says them in."""
 
 from __future__ import annotations
 
 import importlib.util
+import io
 import struct
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from drgs.data import decoding, hdr_video
-from drgs.data.hdr_video import hdr_transfer
+from drgs.data import decoding
+from drgs.data.checks import read_image
+from drgs.data.hdr import hdr_transfer
+from drgs.data.heif import heif_as_jpeg
 from drgs.data.videos import VideoFrame
 
 av = pytest.importorskip("av")
@@ -111,8 +115,8 @@ def test_headers_that_say_nothing(tmp_path, monkeypatch):
         b"\xff" * 30,
     ):
         path.write_bytes(data)
-        assert hdr_video.hdr_transfer(path, True) == ""
-        assert hdr_video.hdr_transfer(path, False) == ""
+        assert hdr_transfer(path, True) == ""
+        assert hdr_transfer(path, False) == ""
 
 
 def test_a_video_that_is_turned(tmp_path):
@@ -126,3 +130,21 @@ def test_a_video_that_is_turned(tmp_path):
     assert image.shape == (PATCH * len(PATCHES), PATCH, 3)
     np.testing.assert_allclose(image[PATCH // 2 :: PATCH, PATCH // 2] / 255, PATCHES, atol=2.5 / 255)
     assert VideoFrame(path, 0).read_gray(1000).shape == (PATCH * len(PATCHES), PATCH)
+
+
+@pytest.mark.parametrize("kind", ["HLG", "PQ"])
+def test_photographs(tmp_path, kind):
+    """HEIC as cameras make it, in 8 of its 10 bits; its EXIF stays where COLMAP gets it as JPEG."""
+    heif = pytest.importorskip("pillow_heif")
+    heif.register_heif_opener()
+    coded = np.round(255 * signal(linear(PATCHES) @ TO_2020.T, kind)).astype(np.uint8)
+    pixels = np.repeat(np.repeat(coded[None], PATCH, axis=1), PATCH, axis=0)
+    tags = {"color_primaries": 9, "transfer_characteristics": TRC[kind], "matrix_coefficients": 9, "full_range_flag": 1}
+    exif = Image.Exif()
+    exif[0x010F] = "a maker"
+    path = tmp_path / "a.heic"
+    Image.fromarray(pixels).save(path, quality=100, chroma=444, exif=exif, **tags)
+    np.testing.assert_allclose(patches_of(read_image(path)), PATCHES, atol=8 / 255)  # a number of PQ is up to 5 of sRGB
+    with Image.open(io.BytesIO(heif_as_jpeg(path, 98))) as shown:
+        assert shown.getexif()[0x010F] == "a maker"
+        np.testing.assert_allclose(patches_of(np.asarray(shown)), PATCHES, atol=12 / 255)

@@ -1,4 +1,4 @@
-"""HDR videos, as phones record them (HLG or PQ, BT.2020, 10 bits): what a file says, and its frames in sRGB.
+"""HDR videos and photographs, as phones and cameras record them (HLG or PQ, BT.2020, 10 bits), in sRGB.
 
 OpenCV takes no notice of the tags in some versions and compresses tones and saturation in others, so that frames are
 decoded with PyAV. Reference white becomes white, and what is brighter is clipped: light below it keeps its proportions.
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["HdrReader", "hdr_transfer"]
+__all__ = ["HdrReader", "hdr_transfer", "in_srgb", "is_hdr"]
 
 _NAMES = {16: "PQ", 18: "HLG"}  # by the number of the transfer characteristics, ITU-T H.273
 _HLG_WHITE = 0.75
@@ -97,7 +97,7 @@ class HdrReader:
         found = self._decoded(index)
         if found is None:
             return None
-        shown = found.to_ndarray(format="gray") if is_gray else _in_srgb(found)
+        shown = found.to_ndarray(format="gray") if is_gray else _frame_in_srgb(found)
         return np.ascontiguousarray(np.rot90(shown, round(found.rotation / 90)))
 
     def _decoded(self, index: int) -> Any:
@@ -135,16 +135,30 @@ class HdrReader:
         return None
 
 
-def _in_srgb(frame: Any) -> np.ndarray:
-    """(H, W, 3) uint8 of a decoded frame."""
+def is_hdr(transfer: int | None) -> bool:
+    """Whether a number of transfer characteristics, by ITU-T H.273, is that of HLG or PQ."""
+    return transfer in _NAMES
+
+
+def in_srgb(signal: np.ndarray, transfer: int) -> np.ndarray:
+    """(H, W, 3) uint8 of an HLG or PQ picture of BT.2020.
+
+    Args:
+        signal: (H, W, 3) uint16, RGB as it is coded, of 65535.
+        transfer: 16 of PQ, 18 of HLG.
+    """
     import cv2
 
-    linear = _linear(frame.color_trc)
+    light = cv2.transform(_linear(transfer)[signal], _TO_SRGB).clip(0, 1)
+    return _encoding()[(65535 * light + 0.5).astype(np.uint16)]
+
+
+def _frame_in_srgb(frame: Any) -> np.ndarray:
+    """(H, W, 3) uint8 of a frame that PyAV has decoded."""
+    transfer = frame.color_trc
     # FFmpeg would convert tones, too, of a frame that still says which it has.
     frame.color_trc = frame.color_primaries = 1
-    light = linear[frame.to_ndarray(format="rgb48le")]
-    light = cv2.transform(light, _TO_SRGB).clip(0, 1)
-    return _encoding()[(65535 * light + 0.5).astype(np.uint16)]
+    return in_srgb(frame.to_ndarray(format="rgb48le"), transfer)
 
 
 @functools.cache
