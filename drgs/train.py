@@ -477,24 +477,23 @@ class _Loop:
                 bar.update(done, text=f"{shown}{len(trainer.rows)} Gaussians")
                 if self._pace is not None:
                     self._follow_pace(self._pace, bar)
-                if done % preview_every == 0:
-                    self._preview(bar, is_interrupted)
                 # What a step has spoiled shows in the next one: good checkpoints stay until losses are finite again.
                 late = time.monotonic() - self._saved_at > 60 * config.saving.save_minutes
                 is_due = late or done % config.saving.save_every == 0
-                if is_due and done < trainer.config.max_steps and trainer.is_sound:
+                if done >= trainer.config.max_steps or is_due and trainer.is_sound:
                     self.save()
-            self.save()
+                if done % preview_every == 0:
+                    self._preview(bar, is_interrupted)
+            self.save()  # of a fit that went on from its last step
 
     def save(self) -> None:
-        """The PLY, then the checkpoint, unless both are there; a PLY knows no time, it holds what moves at rest."""
+        """The checkpoint, then what is made of it, for which there may be no room: cameras and the PLY, which knows no
+        time and holds what moves at rest. Nothing where all of it is there.
+        """
         now = self.trainer.step_index, len(self.trainer.frames)
         if now == self._saved:
             return
         tensors, header = self.trainer.state()
-        save_ply(self.trainer.gaussians(), self.run_folder.point_cloud)
-        if self.trainer.parts.poses is not None:
-            save_cameras_json(self.run_folder.path / CAMERAS, self.trainer.parts.poses.cameras())
         header |= {"point_source": self.source}
         header |= {"semantics": self.taught.to_json()} if self.taught else {}
         if self.plan:
@@ -503,6 +502,9 @@ class _Loop:
         keep_previous(self.run_folder)
         save_state(self.run_folder.state, tensors, header)
         self.run_folder.log("checkpoint", step=self.trainer.step_index, seconds=self.seconds)
+        if self.trainer.parts.poses is not None:
+            save_cameras_json(self.run_folder.path / CAMERAS, self.trainer.parts.poses.cameras())
+        save_ply(self.trainer.gaussians(), self.run_folder.point_cloud)
         self._saved = now
         self._saved_at = time.monotonic()
 
@@ -523,10 +525,10 @@ class _Loop:
             record["points"] = len(points)
         trainer.reserved = plan.reserved
         trainer.add_frame(frame)
-        plan.write(self.run_folder)
         shown = ("step", "number", "index", "name", "score", "parts", "margin", "seconds", "points")
         self.run_folder.log("pick", **{key: record[key] for key in shown}, candidates=len(record["candidates"]))
         self.save()
+        plan.write(self.run_folder)
         bar.note(
             f"step {trainer.step_index}: added view {frame.name} ({record['number']} of {plan.timetable.add}, chosen "
             f"by {plan.active.policy} among {len(record['candidates'])} in {record['seconds']:.1f} s)"

@@ -43,6 +43,7 @@ from drgs.fitting.records import fit_record, is_run
 from drgs.fitting.resume import FILES, claim_run, last_checkpoint
 from drgs.guards import interrupts
 from drgs.guards.outputs import claim
+from drgs.guards.writing import is_full
 from drgs.report.write import FILE
 from drgs.train import fit
 from drgs.viewing.placed_views import NEXT
@@ -291,7 +292,7 @@ class _Capture:
                 try:
                     self._step(name, work)
                 except OSError as error:  # the viewer's code is out of reach: all else is done
-                    if name != "share":
+                    if name != "share" or is_full(error):
                         raise
                     run = shlex.quote(str(self.args.output))
                     self._say(f"share: not written, {error}; then drgs share {run}")
@@ -577,8 +578,9 @@ def _links_to(folder: Path, files: list[Path]) -> list[Path]:
 
 
 def _config_of(run: Run) -> FitConfig:
-    """The configuration that a fit goes on with; of its steps the checkpoint knows, not yet config.json maybe."""
-    config = fit_record(run).config
-    if not run.state.is_file():
-        return config
-    return config.replace(max_steps=recorded_config(state_header(run.state)["config"]).max_steps)
+    """The configuration that a fit goes on with: the checkpoint's, which config.json and the files that are made of the
+    checkpoint may differ from where there was no room for them.
+    """
+    if run.state.is_file():
+        return recorded_config(state_header(run.state)["config"])
+    return fit_record(run).config

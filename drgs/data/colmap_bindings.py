@@ -1,9 +1,24 @@
 """pycolmap, imported in one place: at import it puts its own handler on SIGTERM, which prints a C++ stack."""
 
+import os
+from pathlib import Path
+from typing import Any
+
 import pycolmap
 
 from drgs.guards import interrupts
+from drgs.guards.writing import check_room
 
-__all__ = ["pycolmap"]
+__all__ = ["opened_database", "pycolmap"]
 
 interrupts.reinstall()
+
+
+def opened_database(database: str | os.PathLike) -> Any:
+    """COLMAP's database, for a `with` block; where the disk is full, even reading one ends in an error of C++.
+
+    Raises:
+        OSError: If there is no room for what SQLite writes beside a database.
+    """
+    check_room(Path(database).parent)
+    return pycolmap.Database.open(database)

@@ -18,14 +18,18 @@ from pathlib import Path
 from typing import Any
 
 from drgs.data.matching import Progress
+from drgs.guards.writing import check_room
 from drgs.runtime import thread_count
 
-__all__ = ["PhotoGroups", "map_photos", "runs"]
+__all__ = ["PhotoGroups", "map_photos", "runs", "write_model"]
 
 _EVERY = 0.25  # seconds between two looks at the log
 _FEW_FEATURES = 200  # with fewer of its own a photograph is blurred, dark or blank, or its mask is small
 _ADVISED = 3  # gaps that are named
 _STRETCHES = 12  # of names that follow each other
+# Bytes in the files of a model: of a feature its place and point (24), of that its share in a track (8) and in a point
+# of 51 bytes that two features show at least.
+_A_FEATURE = 60
 
 # What COLMAP's log says -> what that is. Lines that are not known, of another version, change nothing.
 _DOING = {
@@ -116,11 +120,13 @@ def map_photos(
     Returns:
         pycolmap's models by number; empty if no two photographs could be connected.
     """
-    from drgs.data.colmap_bindings import pycolmap
+    from drgs.data.colmap_bindings import opened_database, pycolmap
 
     options.num_threads = options.mapper.num_threads = thread_count()
     told = _Told(total, progress, doing, posed)
     told.still()
+    with opened_database(database) as handle:
+        check_room(folder, 2 * handle.num_keypoints() * _A_FEATURE)  # COLMAP writes a model, and then we do
     with _followed(folder, told):
         return pycolmap.incremental_mapping(
             database,
@@ -131,6 +137,12 @@ def map_photos(
             initial_image_pair_callback=told.begun,
             next_image_callback=told.one_more,
         )
+
+
+def write_model(model: Any, folder: Path) -> None:
+    """Write pycolmap's model as the files of a data set; COLMAP does not say where there was no room for all of it."""
+    check_room(folder, sum(image.num_points2D() for image in model.images.values()) * _A_FEATURE)
+    model.write_binary(folder)
 
 
 @contextlib.contextmanager
@@ -255,9 +267,9 @@ class PhotoGroups:
 
 def _evidence(database: Path) -> tuple[dict[str, int], dict[tuple[str, str], int]]:
     """Number of features by photograph, and of verified matches by pair."""
-    from drgs.data.colmap_bindings import pycolmap
+    from drgs.data.colmap_bindings import opened_database, pycolmap
 
-    with pycolmap.Database.open(database) as handle:
+    with opened_database(database) as handle:
         images = {image.image_id: image.name for image in handle.read_all_images()}
         features = {name: handle.num_keypoints_for_image(number) for number, name in images.items()}
         pairs, counts = handle.read_two_view_geometry_num_inliers()

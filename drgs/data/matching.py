@@ -15,12 +15,17 @@ from drgs.data.photo_files import own_file
 from drgs.data.reader_process import Child
 from drgs.guards import interrupts
 from drgs.guards.unfinished import temporary_folder
+from drgs.guards.writing import check_room
 from drgs.runtime import thread_count
 
 __all__ = ["extract", "match", "nearby_pairs", "quiet", "sequential_pairs", "state_focal_lengths"]
 
 Progress = Callable[[str, int, int], None]
 _PAIRS_A_STEP = 16  # a thread: all of them are busy, and progress is seen
+# Bytes on the disk: a feature of SIFT has 128 of its descriptor and 24 of its place, a match 8 when it is found and 8
+# when it is verified. SQLite writes everything twice, first into a log beside the database.
+_A_FEATURE, _A_MATCH = 2 * 152, 2 * 16
+_MOST_FEATURES = 8192  # of a photograph, as COLMAP has it
 
 _extractor = Child("drgs.data.extraction", "a photograph that COLMAP finds features in", "leave it out")
 
@@ -75,6 +80,7 @@ def extract(
     for start in range(0, len(names), threads):  # one a thread: all of them are busy, and progress is seen
         if progress:
             progress("features", start, len(names))
+        check_room(database.parent, min(threads, len(names) - start) * _MOST_FEATURES * _A_FEATURE)
         some = names[start : start + threads]
         options = {
             "database": str(database),
@@ -101,9 +107,9 @@ def state_focal_lengths(database: Path, folder: Path) -> None:
         database: COLMAP's database, with features of images whose names are those in the folder.
         folder: The photographs.
     """
-    from drgs.data.colmap_bindings import pycolmap
+    from drgs.data.colmap_bindings import opened_database, pycolmap
 
-    with pycolmap.Database.open(database) as handle:
+    with opened_database(database) as handle:
         first = {image.camera_id: image.name for image in reversed(handle.read_all_images())}
         for camera in handle.read_all_cameras():
             reader = pycolmap.ImageReaderOptions()
@@ -130,7 +136,7 @@ def match(
         guided: Look for more matches once the epipolar geometry of a pair is known.
         progress: Called with ("matching", done, total).
     """
-    from drgs.data.colmap_bindings import pycolmap
+    from drgs.data.colmap_bindings import opened_database, pycolmap
 
     threads = thread_count()
     options = pycolmap.FeatureMatchingOptions()
@@ -139,6 +145,9 @@ def match(
     options.guided_matching = guided
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
+    with opened_database(database) as handle:
+        most = max((handle.num_keypoints_for_image(image.image_id) for image in handle.read_all_images()), default=0)
+    needed = min(len(pairs), _PAIRS_A_STEP * threads) * most * _A_MATCH
     with temporary_folder("pairs") as folder, _numbered(database) as numbers:
         pairing = pycolmap.ImportedPairingOptions()
         pairing.match_list_path = folder / "pairs.txt"
@@ -147,6 +156,7 @@ def match(
             if progress:
                 progress("matching", start, len(pairs))
             step = pairs[start : start + at_once]
+            check_room(database.parent, needed)
             pairing.match_list_path.write_text("".join(f"{numbers[a]} {numbers[b]}\n" for a, b in step))
             pycolmap.match_image_pairs(
                 database,
@@ -162,16 +172,16 @@ def match(
 @contextlib.contextmanager
 def _numbered(database: Path) -> Iterator[dict[str, str]]:
     """Name -> number that the images of a database are called by meanwhile: COLMAP splits a list of pairs at spaces."""
-    from drgs.data.colmap_bindings import pycolmap
+    from drgs.data.colmap_bindings import opened_database
 
-    with pycolmap.Database.open(database) as handle:
+    with opened_database(database) as handle:
         images = handle.read_all_images()
         names = {image.image_id: image.name for image in images}
         for image in images:
             image.name = str(image.image_id)
             handle.update_image(image)
     yield {name: str(number) for number, name in names.items()}
-    with pycolmap.Database.open(database) as handle:
+    with opened_database(database) as handle:
         for image in handle.read_all_images():
             image.name = names[image.image_id]
             handle.update_image(image)

@@ -143,9 +143,9 @@ def global_descriptors(database: Path, names: list[str], seed: int = 0) -> np.nd
 
 def _features(database: Path, names: list[str]) -> Iterator[np.ndarray]:
     """(N, 128) float32 of length 1 of each photograph, in the order of names; one is held at a time."""
-    from drgs.data.colmap_bindings import pycolmap
+    from drgs.data.colmap_bindings import opened_database
 
-    with pycolmap.Database.open(database) as handle:
+    with opened_database(database) as handle:
         numbers = {image.name: image.image_id for image in handle.read_all_images()}
         for name in names:
             data = np.asarray(handle.read_descriptors(numbers[name]).data, np.float32).reshape(-1, 128)

@@ -18,7 +18,7 @@ import numpy as np
 
 from drgs.data.checks import IMAGE_SUFFIXES, image_size
 from drgs.data.gathering import FRAMES, joined_frames, recorded_frames, write_frames
-from drgs.data.mapping import PhotoGroups, map_photos
+from drgs.data.mapping import PhotoGroups, map_photos, write_model
 from drgs.data.pairing import choose_new_pairs
 from drgs.data.photo_files import link_or_copy, photo_fault, readable_photos
 from drgs.data.sfm import SfmSummary
@@ -156,7 +156,7 @@ def _registered(
     seed: int,
 ) -> Registration:
     """Run the three stages; leaves `database.db`, `sparse/0` and the `photos` under their new names in `partial`."""
-    from drgs.data.colmap_bindings import pycolmap
+    from drgs.data.colmap_bindings import opened_database, pycolmap
     from drgs.data.matching import extract, match, quiet
 
     for folder in ("photos", "models", "sparse/0"):
@@ -168,7 +168,7 @@ def _registered(
     database = partial / "database.db"
     shutil.copyfile(scene / "database.db", database)
     before = pycolmap.Reconstruction(str(scene / "sparse/0"))
-    with pycolmap.Database.open(database) as handle:
+    with opened_database(database) as handle:
         old = [image.name for image in handle.read_all_images()]
     marks = [time.perf_counter()]
     with quiet():
@@ -219,7 +219,7 @@ def _registered(
         )
     moved = _moved(before, model)
     model.update_point_3d_errors()
-    model.write_binary(partial / "sparse/0")
+    write_model(model, partial / "sparse/0")
     report("mapping", len(kept), total)
     summary = SfmSummary(
         registered=len(kept),
@@ -278,12 +278,20 @@ def _install(output: Claim, partial: Path, files: list[Path], names: list[str]) 
         made.mkdir()
         for path in _photographs(images):
             link_or_copy(path, made / path.name)
+    new = {f"images/{name}": partial / "photos" / name for name in names}
+    if frames is not None:
+        write_frames(partial / FRAMES, frames)
+        new[f"images/{FRAMES}"] = partial / FRAMES
+    new |= {file.name: file for file in partial.glob("database.db*")} | {"sparse": partial / "sparse"}
+    for name, path in new.items():
+        output.announce(path, name)
+    if images.is_symlink():
+        output.announce(partial / "images", "images")
         output.remove(images)
-        output.put(made, "images")
+        output.put(partial / "images", "images")
     for name in names:
         output.put(partial / "photos" / name, f"images/{name}")
     if frames is not None:
-        write_frames(partial / FRAMES, frames)
         output.remove(images / FRAMES)
         output.put(partial / FRAMES, f"images/{FRAMES}")
     for stale in output.path.glob("database.db*"):

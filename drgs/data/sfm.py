@@ -15,7 +15,7 @@ import numpy as np
 
 from drgs.data.checks import image_size, list_images
 from drgs.data.gathering import fill, named_files, recorded_frames
-from drgs.data.mapping import PhotoGroups, map_photos
+from drgs.data.mapping import PhotoGroups, map_photos, write_model
 from drgs.data.masks import ALPHA_MASKS, feature_mask, masked_photo, masks_of
 from drgs.data.pairing import choose_pairs
 from drgs.data.photo_files import check_names, readable_photos, usable_photos
@@ -294,7 +294,7 @@ def _reconstruct(
     best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
     best.update_point_3d_errors()
     (partial / "sparse/0").mkdir(parents=True)
-    best.write_binary(partial / "sparse/0")
+    write_model(best, partial / "sparse/0")
     found = {id(model): {model.images[i].name for i in model.reg_image_ids()} for model in models.values()}
     kept = found.pop(id(best))
     parts = PhotoGroups.of(database, names, kept, list(found.values()))
@@ -375,28 +375,27 @@ def _install(partial: Path, output: Claim, linked: dict[str, Path], made: list[s
     last.
     """
     _check_output(output, linked, made)  # minutes later
+    new = {name: partial / name for name in made}
+    for name, folder in linked.items():
+        if (output.path / name).resolve() == folder.resolve():
+            continue
+        new[name] = partial / f"linked_{name}"
+        try:
+            new[name].symlink_to(folder.resolve(), target_is_directory=True)
+        except OSError:
+            shutil.copytree(folder, new[name])
+    # SQLite may have left side files; they belong to the database.
+    new |= {file.name: file for file in partial.glob("database.db*")} | {"sparse": partial / "sparse"}
+    for name, path in new.items():
+        output.announce(path, name)
     output.remove(output.path / "sparse")
     masks = output.path / "masks"
     # Those of an earlier result; an empty folder is nobody's.
     is_stale = output.is_made(masks, ("sfm",)) and (masks.is_symlink() or any(masks.iterdir()))
     if is_stale and "masks" not in linked:
         output.remove(masks)
-    for name in made:
-        output.remove(output.path / name)
-        output.put(partial / name, name)
-    for name, folder in linked.items():
-        if (output.path / name).resolve() == folder.resolve():
-            continue
-        output.remove(output.path / name)
-        link = partial / f"linked_{name}"
-        try:
-            link.symlink_to(folder.resolve(), target_is_directory=True)
-        except OSError:
-            shutil.copytree(folder, link)
-        output.put(link, name)
-    # SQLite may have left side files; they belong to the database.
     for stale in output.path.glob("database.db*"):
         output.remove(stale)
-    for file in partial.glob("database.db*"):
-        output.put(file, file.name)
-    output.put(partial / "sparse", "sparse")
+    for name, path in new.items():
+        output.remove(output.path / name)
+        output.put(path, name)

@@ -201,8 +201,8 @@ def load_run(run: Run | str | os.PathLike) -> LoadedRun:
         return LoadedRun(gaussians, record, None, classes=classes)
     if run.point_cloud.is_file() and not _shows(run.point_cloud, gaussians):
         _log.warning(
-            "%s: does not hold what %s holds, was edited or written later; the checkpoint is taken, name the PLY to "
-            "take that",
+            "%s: does not hold what %s holds, was edited or written at another step; the checkpoint is taken, name the "
+            "PLY to take that",
             run.point_cloud,
             run.state.name,
         )
@@ -356,7 +356,10 @@ def _refined_poses(run: Run, config: dict, advice: str) -> dict[str, np.ndarray]
     path = run.path / CAMERAS
     if not path.is_file():
         if run.state.is_file():
-            raise FileNotFoundError(f"{path}: must hold the cameras that the fit has refined, found none; {advice}")
+            raise FileNotFoundError(
+                f"{path}: must hold the cameras that the fit has refined, found none; go on with the fit (--resume), "
+                "which writes them again"
+            )
         return {}
     poses = {camera.name: camera.w2c for camera in load_cameras_json(path)}
     # In an active fit photographs of the pool have joined those that it began with.

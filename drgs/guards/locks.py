@@ -52,8 +52,12 @@ def acquire(folder: Path, command: str) -> str | None:
                 handle = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
             except FileExistsError:  # another machine was faster
                 continue
-            with os.fdopen(handle, "w") as file:
-                file.write(text)
+            try:
+                with os.fdopen(handle, "w") as file:
+                    file.write(text)
+            except OSError:
+                path.unlink(missing_ok=True)
+                raise
             return stale
 
 

@@ -128,11 +128,15 @@ class Claim:
                 if (self.path / name).is_file():
                     self.record(name, self.path / name, command)
 
-    def put(self, path: Path, name: str) -> None:
-        """Move a finished file, link or folder into the folder, where nothing must be of that name."""
+    def announce(self, path: Path, name: str) -> None:
+        """Record what `put` will move, for which there may be no room: before what it replaces is removed."""
         for part in (path, *(path.rglob("*") if path.is_dir() and not path.is_symlink() else ())):
             if part.is_symlink() or part.is_file():
                 self.record((Path(name) / part.relative_to(path)).as_posix(), part)
+
+    def put(self, path: Path, name: str) -> None:
+        """Move a finished file, link or folder into the folder, where nothing must be of that name."""
+        self.announce(path, name)
         if os.path.lexists(self.path / name):
             raise ValueError(f"{self.path / name}: must not be replaced, it has appeared meanwhile; move it away")
         os.rename(path, self.path / name)
@@ -311,9 +315,9 @@ def replacing(path: str | os.PathLike, suffix: str = "", claimed: bool = True) -
         claimed: Refuse, in a claimed folder, to replace what drgs did not make, and record what it made.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    parent = os.path.realpath(path.parent)
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        parent = os.path.realpath(path.parent)
         with unfinished.hidden_file(parent, path.name, suffix) as name:
             yield name
             umask = os.umask(0)  # hidden files are private; what we write is to be shared as any other
@@ -413,8 +417,10 @@ def _author_of(path: Path) -> str | None:
 
 
 def _is_log(path: Path) -> bool:
-    """Whether the first line is an event of `drgs.files.Run.log`."""
+    """Whether the first line is an event of `drgs.files.Run.log`; without any, the disk was full before the first."""
     try:
+        if path.stat().st_size == 0:
+            return True
         with path.open("rb") as file:
             value = json.loads(file.readline(_MAX_JSON))
     except (OSError, ValueError, RecursionError):

@@ -11,6 +11,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from drgs.guards.writing import is_full, named
+
 __all__ = ["PATTERN", "delete", "delete_all", "hidden_file", "is_left_over", "temporary_folder"]
 
 PATTERN = re.compile(r"\.drgs\..+\.[a-z0-9_]{8}\.tmp(\.[a-z0-9]+)?")
@@ -48,12 +50,22 @@ def temporary_folder(kind: str, parent: str | os.PathLike | None = None) -> Iter
     Args:
         kind: Part of its name.
         parent: Folder that it is made in; default the system's place for such.
+    Raises:
+        OSError: Of the block: where there is no room left, in a sentence that names `parent`.
     """
-    parent = None if parent is None else os.path.realpath(parent)
-    name = tempfile.mkdtemp(prefix=f".drgs.{kind}.", suffix=".tmp", dir=parent)
+    shown = Path(tempfile.gettempdir() if parent is None else parent)
+    try:
+        name = tempfile.mkdtemp(prefix=f".drgs.{kind}.", suffix=".tmp", dir=os.path.realpath(shown))
+    except OSError as error:
+        raise named(shown, error) from None
     _made.add(name)
     try:
         yield Path(name)
+    except OSError as error:
+        # That of a write has no name; one of another folder around this one is named there.
+        if is_full(error) and str(error.filename or name).startswith(name):
+            raise named(shown, error) from None
+        raise
     finally:
         delete(Path(name))
         _made.discard(name)
