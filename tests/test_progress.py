@@ -61,6 +61,21 @@ def test_time_that_is_left(monkeypatch):
         assert bar.line() == "features: 4 of 10, 30 s"
 
 
+def test_steps_that_compile_tell_nothing(monkeypatch):
+    """The first ones of a fit, of every renderer, take many times as long: no time is told of them, now or later."""
+    now = [0.0]
+    monkeypatch.setattr(progress, "time", types.SimpleNamespace(monotonic=lambda: now[0]))
+    with Bar("fit", 400, show=False) as bar:
+        for step in range(1, 25):
+            now[0] += 30.0 if step <= 12 else 1.0
+            bar.update(step)
+            if step == 3:
+                assert bar.line() == "fit: 3 of 400, 90 s"
+        assert bar.line() == "fit: 24 of 400, 372 s, about 376 s left"
+        bar.update(2)  # as a mapping that begins anew
+        assert bar.line() == "fit: 2 of 400, 372 s"
+
+
 def test_short_stages_are_silent(monkeypatch, capsys):
     """What takes less than a second needs no line."""
     monkeypatch.setattr(progress, "FIRST", 1.0)

@@ -38,8 +38,10 @@ _RUN = 2  # turns in a row that are worth a sentence
 _WIDE = 35.0  # degrees between neighbors, seen from what they show, above which they show little in common
 _SHOWN = 3  # names, or gaps, that a finding repeats
 _EXPOSURE_PIXELS = 20_000
-_BAD = 3.0  # dB below the median of the held-out views
+_BAD = 3.0  # dB below the median of the other held-out views
 _FAR = 1.5  # times the usual angle to the nearest training view
+_ALONE = 3.0  # the same, of the only held-out view, whose PSNR nothing is there to compare with
+_LOWERED = 1.0  # dB by which a single view lowers the mean of all, that are worth telling
 
 
 def of_photographs(folder: Path, names: Sequence[str]) -> list[Finding]:
@@ -207,32 +209,45 @@ def of_exposure(dataset: Dataset, seed: int = 0) -> list[Finding]:
 
 
 def of_views(dataset: Dataset, train: Sequence[str], psnr: Mapping[str, float]) -> list[Finding]:
-    """Held-out views that are much worse than the others, and whether photographs near them are missing.
+    """Held-out views that are much worse than the others, what that does to their mean, and whether photographs near
+    them are missing.
 
     Args:
         dataset: The data set.
         train: Names of the views that were fitted to.
         psnr: Held-out view -> PSNR in dB.
     """
-    if len(psnr) < 3 or dataset.times:
+    if not psnr or dataset.times:
         return []
     by_name = {view.name: view for view in dataset.views}
     fitted = [by_name[name] for name in train if name in by_name]
     apart = {name: _apart(by_name[name], fitted) for name in psnr if name in by_name}
-    usual = float(np.median(list(apart.values()))) if apart else 0.0
-    middle = float(np.median(list(psnr.values())))
-    bad = sorted((value, name) for name, value in psnr.items() if value < middle - _BAD)
+    spacing = [_apart(view, [other for other in fitted if other is not view]) for view in fitted]
+    usual = float(np.median([*spacing, *apart.values()])) if fitted else 0.0
+    others = {name: [x for other, x in psnr.items() if other != name] for name in psnr}
+    if len(psnr) > 1:
+        bad = sorted((value, name) for name, value in psnr.items() if value < np.median(others[name]) - _BAD)
+    else:
+        bad = [(value, name) for name, value in psnr.items() if apart.get(name, 0.0) > _ALONE * usual]
     found = []
     for value, name in bad[:_SHOWN]:
         far = apart.get(name, 0.0) > _FAR * usual
+        told = f"held-out view {name} has {value:.1f} dB"
+        if others[name]:
+            told += f", the others {np.median(others[name]):.1f}"
+            mean, without = np.mean(list(psnr.values())), np.mean(others[name])
+            if without - mean >= _LOWERED:
+                told += f", and their mean is {mean:.1f} dB, without it {without:.1f}"
+        else:
+            told += ", and is the only one"
         nearest = min(fitted, key=lambda view: _apart(by_name[name], [view])).name if fitted and name in by_name else ""
-        why = f": the nearest photograph, {nearest}, looks from elsewhere" if far and nearest else ""
+        why = f": the nearest photograph, {nearest}, looks from elsewhere, maybe nothing else shows what it does"
         advice = (
             f"take two or three photographs around where {name} was taken"
             if far
             else f"look at it in the report: is {name} blurred, or is something in it that moved?"
         )
-        found.append(Finding("view", f"held-out view {name} has {value:.1f} dB, the others {middle:.1f}{why}", advice))
+        found.append(Finding("view", f"{told}{why if far and nearest else ''}", advice))
     return found
 
 

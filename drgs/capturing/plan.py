@@ -20,11 +20,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.capturing.pace import FEWEST_STEPS
 from drgs.data.checks import image_size, read_image
 from drgs.data.matching import extract, match, quiet
 from drgs.data.pairing import MAX_EXHAUSTIVE
 from drgs.data.videos import VideoFrame, read_video
-from drgs.display.progress import Bar, quietly
+from drgs.display.progress import Bar
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import frames_for
 from drgs.fitting.start import start
@@ -66,7 +67,6 @@ _SIZES = (
     (430_000, 120_000, 9_000),
 )
 _FEWER, _MORE = 0.5, 1.5  # of the steps of a size, that it may have
-_FEWEST_STEPS = 100
 _TIMED_VIEWS = 8
 _TIMED = 12  # steps: twice all renderers
 _END = 0.05  # of what is left, for what was measured too low
@@ -113,12 +113,21 @@ class FitPlan:
             density=dataclasses.replace(config.density, max_gaussians=self.max_gaussians),
         )
 
-    def line(self) -> str:
-        """In words."""
-        return (
+    def line(self, left: float, used: float) -> str:
+        """The plan in words, and what it takes where the budget is not enough for it.
+
+        Args:
+            left, used: Seconds of the budget that are left, less than 0 where it is used up, and that have been used.
+        """
+        size = (
             f"{self.max_steps} steps at {self.max_pixels} pixels with up to {self.max_gaussians} Gaussians, about "
-            f"{duration(self.seconds)}"
+            f"{duration(self.seconds)}, and {duration(self.after)} for what follows"
         )
+        needed = self.seconds + self.after
+        if left >= needed:
+            return f"plan for the {duration(left)} left: {size}"
+        left_of_it = f"only {duration(left)} of the budget are left" if left >= 1 else "the budget is used up"
+        return f"{left_of_it}: the smallest fit has {size}, about {duration(used + needed)} in all"
 
 
 def seconds_of_budget(text: str) -> float:
@@ -200,18 +209,26 @@ def _timed_pair(images: Sequence[np.ndarray]) -> tuple[float, float]:
     return features, pair
 
 
-def planned_poses(plan: PosePlan, count: int, left: float) -> str:
-    """The plan in words.
+def planned_poses(plan: PosePlan, count: int, left: float, budget: float) -> str:
+    """The plan in words, and what it takes where the budget is not enough for it.
 
     Args:
         plan: How large photographs are looked at.
         count: Number of photographs.
         left: Seconds that are left of the budget.
+        budget: Seconds of the whole capture.
     """
-    size = plan.max_image_size
+    size, rest = plan.max_image_size, left - plan.seconds
+    if rest >= _LEAST:
+        return (
+            f"plan for {duration(budget)}: {count} photographs at {size} pixels for poses, about "
+            f"{duration(plan.seconds)}; then a fit as large as the {duration(rest)} after it allow, by timed steps"
+        )
+    enough = math.ceil(plan.seconds / _POSES_SHARE / 60)
     return (
-        f"{count} photographs at {size} pixels for poses, about {duration(plan.seconds)}; then a fit as large as the "
-        f"{duration(max(left - plan.seconds, 0.0))} after it allow, by timed steps"
+        f"{duration(budget)} are not enough: poses of {count} photographs take about {duration(plan.seconds)} even at "
+        f"{size} pixels, and the smallest fit follows; --budget {enough}min leaves time for a fit, fewer photographs "
+        "take less"
     )
 
 
@@ -251,9 +268,9 @@ def plan_fit(
     best: FitPlan | None = None
     end = stopwatch.now() + left
     before: float | None = None
-    with Bar("how long steps take", len(_SIZES)) as bar:
+    with Bar("how long steps take") as bar:
         for number, (pixels, gaussians, steps) in enumerate(_SIZES):
-            bar.update(number)
+            bar.update(number, text=f"at {min(pixels, largest)} pixels")
             rest = end - stopwatch.now()
             if best is not None and before is not None and 2 * before * (_FEWER * steps + _TIMED) > rest - best.after:
                 break  # a step takes about twice as long as in the size before
@@ -264,7 +281,7 @@ def plan_fit(
             there = math.floor(room / each)
             if best is not None and there < _FEWER * steps:
                 break
-            count = int(min(max(there, _FEWEST_STEPS), _MORE * steps))
+            count = int(min(max(there, FEWEST_STEPS), _MORE * steps))
             best = FitPlan(size.max_pixels, size.max_gaussians, count, count * each, after)
             before = each
             if pixels >= largest:
@@ -295,7 +312,7 @@ class Stopwatch:
 def _seconds_a_step(train: list[View], dataset: Dataset, config: FitConfig, is_first: bool) -> float:
     """`Stopwatch.step`."""
     views = train[:: max(1, len(train) // _TIMED_VIEWS)]
-    with quietly(), _unlogged(), fewer_torch_threads():
+    with Bar("", show=False), _unlogged(), fewer_torch_threads():  # that of how long steps take is shown
         frames = frames_for(views, config.data)
         timed = config.replace(data=dataclasses.replace(config.data, skybox="off", exposure="off", poses="fixed"))
         trainer, *_ = start(_filled(dataset, config), views, frames, timed, None, None, False, 0)

@@ -127,14 +127,16 @@ def _tell_next(args: Capture) -> None:
     if args.length is None:
         print("lengths are shares of the way from a photograph to what it shows; with --length they are in meters")
     for pick in picks:
-        worth = "" if pick["gain"] is None else f" (tells as much as {_counted(pick['gain'])})"
+        worth = "" if pick["gain"] is None else f" (tells {_times(pick['gain'])})"
         print(f"{pick['rank']}. {pick['text']}{worth}")
     print(f"arrows on the map: drgs report {shlex.quote(str(args.output))}; in the browser: drgs view")
 
 
-def _counted(gain: float) -> str:
-    """How many photographs something is worth."""
-    return "one of your photographs" if gain < 1.5 else f"{gain:.0f} of your photographs"
+def _times(gain: float) -> str:
+    """What a photograph would tell, over what one of those there are adds to all others: these share most of it, so
+    that it may be more times that than there are photographs.
+    """
+    return f"{'as much as' if gain < 1.5 else f'{gain:.0f} times what'} one of your photographs adds to the others"
 
 
 def _dataset_of(paths: tuple[Path, ...]) -> Dataset | None:
@@ -355,7 +357,7 @@ class _Capture:
             self.batch.plan["poses"] = dataclasses.asdict(plan)
             self.record.write()
             size = {"max_image_size": plan.max_image_size}
-            self._say(f"plan for {duration(self.clock.budget)}: {planned_poses(plan, len(names), self.clock.left)}")
+            self._say(planned_poses(plan, len(names), self.clock.left, self.clock.budget))
         try:
             with Bar("poses") as bar:
                 summary = run_sfm(
@@ -448,8 +450,7 @@ class _Capture:
                 config = plan.config(config)
                 self.batch.plan["fit"] = dataclasses.asdict(plan)
                 self.record.write()
-                after = f"{duration(plan.after)} for what follows"
-                self._say(f"plan for the {duration(self.clock.left)} left: {plan.line()}, and {after}")
+                self._say(plan.line(self.clock.left, time.monotonic() - self.clock.began))
             elif "fit" in self.batch.plan:
                 plan = FitPlan(**self.batch.plan["fit"])
             rest = plan.after if plan else 0.1 * self.clock.left

@@ -6,7 +6,9 @@ Bars nest; the innermost one is shown. A thread writes the lines, so that work w
 
 from __future__ import annotations
 
+import bisect
 import contextlib
+import math
 import sys
 import threading
 import time
@@ -18,6 +20,7 @@ __all__ = ["Bar", "quietly"]
 FIRST = 1.0  # seconds after which a stage is worth its first line
 EVERY = 10.0  # seconds between two lines at first; they become rarer, up to LEAST_OFTEN
 LEAST_OFTEN = 30.0
+_TELLING = 24  # steps after which a rate is believed: kernels are compiled in a fit's first ones, of every renderer
 _bars: list[Bar] = []  # that are open, the innermost last
 _output: _Lines | _Terminal | Any = None  # None while none of them is shown
 
@@ -44,10 +47,11 @@ class Bar:
         self.is_told = False
         self._show = show
         self._before = done
-        self._reached = 0.0  # when the last step was done
+        self._marks: list[tuple[int, float]] = []  # steps done, and when
 
     def __enter__(self) -> Bar:
-        self.began = self._reached = time.monotonic()
+        self.began = time.monotonic()
+        self._marks = [(self.done, self.began)]
         self.is_shown: bool = bool(_bars and _bars[-1].is_shown) if self._show is None else self._show
         _open(self)
         return self
@@ -77,9 +81,11 @@ class Bar:
             self.began = time.monotonic()
             self.is_told = False
             self._before = done
+            self._marks = [(done, self.began)]
         if done != self.done:
+            self._marks = self._marks if done > self.done else []  # begun anew
             self.done = done
-            self._reached = time.monotonic()
+            self._marks.append((done, time.monotonic()))
         self.total = self.total if total is None else total
         self.text = self.text if text is None else text
         if self.is_shown:
@@ -100,12 +106,18 @@ class Bar:
         parts = [f"{self.done} of {self.total}"] if self.total else []
         parts += [self.text] if self.text else []
         parts.append(f"{now - self.began:.0f} s")
-        steps = self.done - self._before
-        if self.total and steps > 0 and self.done < self.total:
-            each = (self._reached - self.began) / steps
-            left = each * (self.total - self.done) - (now - self._reached)
-            parts += [f"about {left:.0f} s left"] if left >= 1 else []
+        if self.total and self.done < self.total and (left := self._left(now)) >= 1:
+            parts.append(f"about {left:.0f} s left")
         return f"{self.label}: {', '.join(parts)}"
+
+    def _left(self, now: float) -> float:
+        """Seconds until all steps are done, by the later half of those done so far; 0 where that tells nothing yet."""
+        steps = self.done - self._before
+        if not self.total or steps < max(1, min(_TELLING, self.total // 10)):
+            return 0.0
+        done, reached = self._marks[-1]
+        first, began = self._marks[bisect.bisect_right(self._marks, (self._before + steps // 2, math.inf)) - 1]
+        return (reached - began) / max(done - first, 1) * (self.total - done) - (now - reached)
 
 
 @contextlib.contextmanager
