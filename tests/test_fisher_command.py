@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import re
 
 import cv2
 import numpy as np
@@ -14,11 +16,14 @@ from test_active import SIZE, config, lazily, plan, write_still
 from drgs import cli, fisher
 from drgs.cameras import Camera, look_at, orbit
 from drgs.commands.fisher import map_weights
+from drgs.commands.nerfstudio_frame import _moved, in_frame_of_data
 from drgs.data import load
 from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.display.pictures import map_picture
 from drgs.files import load_ply, load_state, save_ply
 from drgs.gain import Prior
+from drgs.integrator import render
+from drgs.settings import RenderSettings
 from drgs.train import fit
 
 
@@ -137,6 +142,72 @@ def test_views_that_see_nothing(place, monkeypatch, capsys):
     assert row["gain"] == {"logdet": 0, "eig": 0}
     assert row["pose"]["eigenvalues"] == [0] * 6
     assert (cv2.imread(str(place / "out/away.variance.png"))[:, :SIZE] == 64).all()
+
+
+# --------------------------------------------------------------------------- frames
+
+TURN = look_at((0, 0, 0), (1, 2, 3))[:3, :3]  # any rotation
+SHIFT, SCALE = np.array([5.0, -40.0, 8.0]), 0.2
+
+
+def nerfstudio_splat(place, folder, applied):
+    """Of `scene.ply` a splat as ns-export writes it, what says so beside it, and a file with applied_transform."""
+    folder.mkdir()
+    g = load_ply(place / "scene.ply")
+    save_ply(_moved(g, TURN, SCALE * SHIFT, SCALE), folder / "splat.ply")
+    orient = np.vstack([np.c_[TURN, SHIFT], [0, 0, 0, 1]])
+    stated = {"transform": (orient @ applied)[:3].tolist(), "scale": SCALE}
+    (folder / "dataparser_transforms.json").write_text(json.dumps(stated))
+    poses = folder / "transforms.json"
+    poses.write_text(json.dumps({"frames": [], "applied_transform": applied[:3].tolist()}))
+    return g, folder / "splat.ply", poses
+
+
+def test_a_scene_and_a_camera_that_are_moved_together_look_the_same(place):
+    """By rotation, scale and shift, of Gaussians with all SH: the image stays."""
+    rng = torch.Generator().manual_seed(1)
+    g = load_ply(place / "scene.ply")
+    g = g.replace(sh=torch.randn(len(g), 16, 3, generator=rng) * 0.3)
+    camera = load_cameras_json(place / "cameras.json")[1]
+    c2w = camera.c2w.copy()
+    c2w[:3, :3] = TURN @ c2w[:3, :3]
+    c2w[:3, 3] = TURN @ (SCALE * c2w[:3, 3]) + SHIFT
+    other = dataclasses.replace(camera, w2c=np.linalg.inv(c2w))
+    settings = RenderSettings.preset("exact", near=0.0)
+    one, two = render(g, camera, settings), render(_moved(g, TURN, SHIFT, SCALE), other, settings)
+    assert one.rgb.std() > 0.05
+    torch.testing.assert_close(one.rgb, two.rgb, atol=2e-3, rtol=0)
+
+
+def test_a_splat_of_nerfstudio_is_brought_to_the_cameras(place, tmp_path, capsys, caplog):
+    """`dataparser_transforms.json` beside it is applied, over the `applied_transform` of the poses; without it fisher
+    says that the views show nothing.
+    """
+    applied = np.array([[0.0, 1, 0, 0], [1, 0, 0, 2], [0, 0, -1, 0], [0, 0, 0, 1]])
+    g, splat, poses = nerfstudio_splat(place, tmp_path / "export", applied)
+    found = in_frame_of_data(load_ply(splat), splat, poses)
+    for name, x in g.parameters().items():
+        y = found.parameters()[name]
+        if name == "quats":
+            x, y = (torch.nn.functional.normalize(q, dim=1) for q in (x, y))
+            y = y * (x * y).sum(1, keepdim=True).sign()
+        torch.testing.assert_close(y, x, atol=1e-4, rtol=1e-4)
+    line = ["fisher", str(splat), "--train", str(place / "data"), "--limit", "1", "--preset", "fast"]
+    line += ["--blocks", "geometry", "-o"]
+    stated = {"transform": np.c_[TURN, SHIFT].tolist(), "scale": SCALE}
+    (splat.parent / "dataparser_transforms.json").write_text(json.dumps(stated))
+    assert cli.main([*line, str(tmp_path / "one")]) == 0
+    assert f"splat.ply: is in nerfstudio's frame, brought to that of {place / 'data'} by" in caplog.text
+    (splat.parent / "dataparser_transforms.json").unlink()
+    assert cli.main([*line, str(tmp_path / "two")]) == 0
+    assert re.search(r"[5-9] of 9 known views show nothing of the scene: do the cameras belong to it", caplog.text)
+    capsys.readouterr()
+    reports = [json.loads((tmp_path / name / "fisher.json").read_text()) for name in ("one", "two")]
+    assert reports[0]["groups"]["means"]["zero"] == 0 < reports[1]["groups"]["means"]["zero"]
+    for stated in ({"scale": 1}, {"transform": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": 1}, {"scale": "x"}):
+        (splat.parent / "dataparser_transforms.json").write_text(json.dumps(stated))
+        assert cli.main([*line, str(tmp_path / "three")]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_picture_is_logarithmic():

@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drgs.codecs import load_gaussians, readable
-from drgs.codecs.folders import file_of_folder
+from drgs.codecs.folders import cameras_of_model, file_of_folder
+from drgs.commands.nerfstudio_frame import in_frame_of_data
+from drgs.data.camera_lists import is_camera_list
 from drgs.files import Run
-from drgs.fitting.records import FitRecord, is_run, load_run
+from drgs.fitting.records import FitRecord, fit_record, is_run, load_run
 from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
@@ -58,6 +60,8 @@ class SceneInput:
         """
         replaced = args.replaced()
         given = cls.at(args.scene)
+        if given.run is None and args.scene.is_file() and (data := _data_of(args)) is not None:
+            given = dataclasses.replace(given, gaussians=in_frame_of_data(given.gaussians, args.scene, data))
         fitted = {} if given.record is None else {"background": given.record.config.settings.background}
         return dataclasses.replace(given, fields=fitted | replaced)
 
@@ -124,3 +128,16 @@ class SceneInput:
     def background(self) -> tuple[float, float, float]:
         """What is behind everything, whatever the preset."""
         return tuple(self.fields.get("background", RenderSettings.background))
+
+
+def _data_of(args: Crossval | Fisher | Query | Render | Select | Tradeoff) -> Path | None:
+    """The data set that an option names, itself or by a run on it; None where there are only lists and orbits."""
+    for text in (getattr(args, name, None) for name in ("train", "cameras", "candidates")):
+        if text is None or text in ("orbit", "dome"):
+            continue
+        path = Path(text)
+        if is_run(path):
+            return fit_record(Run(path)).data
+        if cameras_of_model(path) is None and not is_camera_list(path):
+            return path
+    return None

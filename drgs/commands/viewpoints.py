@@ -14,12 +14,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import logging
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from drgs import data
 from drgs.codecs.folders import cameras_of_model
+from drgs.commands.nerfstudio_frame import DATAPARSER_TRANSFORMS
 from drgs.commands.orbit_keys import UP
 from drgs.commands.orbits import Wish, capture_orbit, dome, scene_orbit, seen_distance
 from drgs.data.camera_lists import is_camera_list, load_cameras_json
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
     from drgs.commands.options import Crossval, Fisher, Query, Render, Select, Tradeoff
     from drgs.commands.scene_input import SceneInput
     from drgs.data import Dataset, View
+    from drgs.ellipsoids import Gaussians
     from drgs.settings import RenderSettings
 
 __all__ = [
@@ -58,6 +61,10 @@ __all__ = [
 MAX_SIDE = 16384  # pixels; a mistyped size shall not ask for terabytes
 _PIXELS = 130_000  # of a view where there is no fit that says
 _MAX_COUNT = 10_000
+# To find out whether cameras see any of the scene at all, at most so many of each are looked at.
+_LOOKED_AT = 20_000
+_LOOKED_FROM = 50
+_log = logging.getLogger(__name__)
 _NOUNS = {"orbit": "an orbit", "dome": "a dome", "list": "a list of cameras"}
 
 
@@ -295,6 +302,14 @@ def known_views(text: str | None, args: Select | Fisher, given: SceneInput, lens
         raise ValueError(
             "a file of Gaussians has no record of its views: --train must name a data set, a run or a cameras.json"
         )
+    known = _known_views(text, args, given, lenses)
+    if text is not None:
+        _check_seen(given.gaussians, known.cameras)
+    return known
+
+
+def _known_views(text: str | None, args: Select | Fisher, given: SceneInput, lenses: bool) -> Known:
+    """The views of `known_views`, whatever they show."""
     source = Source.known(text, given)
     pixels = args.info_pixels or (_PIXELS if given.record is None else given.record.config.data.max_pixels)
     where = str(Path(source.text))
@@ -318,6 +333,22 @@ def known_views(text: str | None, args: Select | Fisher, given: SceneInput, lens
     sizes = {size(a): size(b) for a, b in zip(stated, checked, strict=True)}
     cameras = [_camera(view, {}, pixels, lenses) for view in checked]
     return Known(cameras, where, pixels, place.resolve(), sizes, lenses)
+
+
+def _check_seen(gaussians: Gaussians, cameras: list[Camera]) -> None:
+    """Say so if most of the cameras have no Gaussian's center before them: a file may be in another frame than they."""
+    means = gaussians.means[:: max(1, len(gaussians) // _LOOKED_AT)].detach().cpu().numpy() + gaussians.origin
+    looked = evenly(cameras, _LOOKED_FROM)
+    pixels = [(camera.project(means)[0], (camera.width, camera.height)) for camera in looked]
+    blind = sum(not ((at >= 0) & (at < size)).all(axis=1).any() for at, size in pixels)
+    if blind > len(looked) / 2:
+        _log.warning(
+            "%d of %d known views show nothing of the scene: do the cameras belong to it? (a splat of ns-export is in "
+            "nerfstudio's frame: put %s of its run beside the file)",
+            blind,
+            len(looked),
+            DATAPARSER_TRANSFORMS,
+        )
 
 
 def other_views(
