@@ -91,8 +91,9 @@ def load(
     Looked for, in this order: `transforms.json` or `transforms_{train,val,test}.json` (D-NeRF's too); videos
     `cam*.mp4` beside `poses_bounds.npy` (Neural 3D Video); `train_meta.json` (Dynamic 3D Gaussians); folders of
     frames `cam00`, `cam01`, ... beside a COLMAP model, also in `sparse_`, or beside `poses_bounds.npy`; a
-    COLMAP model in `.`, `sparse/0`, `sparse` or `colmap/sparse/0`; `poses_bounds.npy`; `traj_w_c.txt`
-    (Replica, as Semantic-NeRF renders it). A JSON or npy file may be named itself.
+    COLMAP model in `.`, `sparse/0`, `sparse`, `colmap/sparse/0` and other folders of the kind; `poses_bounds.npy`;
+    `traj_w_c.txt` (Replica, as Semantic-NeRF renders it). A JSON or npy file may be named itself. If there is none of
+    these, the only data set in a folder below is taken, with a line. A photograph that is listed twice counts once.
 
     Where the training views have two times or more, the data set is one of a scene that moves (`Dataset.is_dynamic`).
     Views of synchronous cameras, which the second to the fourth of these formats have, are named by camera and frame
@@ -204,11 +205,20 @@ def _format_of(path: Path) -> str | None:
 
 def _data_sets_below(path: Path) -> list[tuple[str, Path]]:
     """Formats and folders of the data sets nearest below a folder, where archives and other programs put them."""
-    for depth in range(1, _DEPTH + 1):
-        folders = sorted(x for x in path.glob("/".join("*" * depth)) if x.is_dir() and not x.name.startswith("."))
-        if found := [(name, x) for x in folders[:_MOST_FOLDERS] if (name := _format_of(x))]:
+    folders = [path]
+    for _ in range(_DEPTH):
+        folders = sorted(x for folder in folders for x in _folders_in(folder))[:_MOST_FOLDERS]
+        if found := [(name, x) for x in folders if (name := _format_of(x))]:
             return found
     return []
+
+
+def _folders_in(folder: Path) -> list[Path]:
+    try:
+        with os.scandir(folder) as entries:
+            return [Path(entry) for entry in entries if entry.is_dir() and not entry.name.startswith(".")]
+    except PermissionError:
+        return []
 
 
 def _beside(name: str, path: Path, options: dict[str, Any]) -> str:

@@ -30,7 +30,7 @@ def mask_file(masks: Path, name: str) -> Path | None:
     """The mask of an image in a folder: COLMAP's own `NAME.EXT.png`, or `NAME.png`, else of another suffix of images,
     as `NAME.jpg`; None without one.
     """
-    for suffix in IMAGE_SUFFIXES:
+    for suffix in (*IMAGE_SUFFIXES, *(x.upper() for x in IMAGE_SUFFIXES)):
         for candidate in (masks / f"{name}{suffix}", (masks / name).with_suffix(suffix)):
             if is_file(candidate):
                 return candidate
