@@ -341,7 +341,7 @@ def _responses(
             cut(a >= s.alpha_min, a / s.alpha_min - 1)
         if scene.near_margin is not None:
             cut(scene.near_margin > 0, scene.near_margin)
-        key = form.key(t)
+        key = t
         if s.order == "center":
             reach = away if center is None else scene.means - center
             key = reach @ rotation[2] if s.depth_key == "z" else reach.norm(dim=-1)
@@ -414,10 +414,6 @@ class _Integral(_Peak):
         behind = torch.special.erfc(-t * length / math.sqrt(2)) / 2
         tau = scene.softplus * torch.exp(-rho2 / 2) * behind
         return -torch.expm1(-tau), torch.exp(-tau)
-
-    def key(self, t: Tensor) -> Tensor:
-        """What counts of a peak behind the origin lies in front of it: at the origin, therefore."""
-        return t.clamp(min=0)
 
 
 class _Ewa(_Peak):

@@ -92,7 +92,7 @@ class BvhTraversal:
         inside = lib.Bool(bool(self.rays))
         if self.holes is not None:
             inside = dr.gather(lib.UInt32, self.holes, self.order) != 0
-        stream = _ProxyStream(lib, self.proxies, ray, s.order)
+        stream = _ProxyStream(lib, self.proxies, ray, s.order, self.model.signed)
         part = Part(
             lib,
             self.model,
@@ -288,8 +288,9 @@ def _around(
 class _ProxyStream:
     """Listed Gaussians, then the proxies along rays in the order of their entry points; a `Stream`."""
 
-    def __init__(self, lib: Lib, proxies: Proxies | None, ray: Ray, order: str) -> None:
+    def __init__(self, lib: Lib, proxies: Proxies | None, ray: Ray, order: str, signed: bool) -> None:
         self.lib = lib
+        self.signed = signed
         self.proxies = proxies
         self.ray = ray
         self.order = order
@@ -334,7 +335,7 @@ class _ProxyStream:
     def of(self, lanes: UInt32) -> _ProxyStream:
         """The stream of some of the rays."""
         carried = [dr.gather(self.lib.Float, v, lanes) for v in self.ray.carried]
-        return _ProxyStream(self.lib, self.proxies, Ray(carried=carried, basis=self.ray.basis), self.order)
+        return _ProxyStream(self.lib, self.proxies, Ray(carried=carried, basis=self.ray.basis), self.order, self.signed)
 
     def next(self, s: tuple, active: Mask) -> tuple[UInt32, Mask, list, Float, tuple]:
         """One member of the current primitive, or the next primitive (whose members follow)."""
@@ -370,8 +371,9 @@ class _ProxyStream:
         bound = lib.Float(EMPTY)
         if self.order != "center":
             # Listed ones come first, whatever their keys. The factor is the rounding of entries.
-            least = dr.maximum(self.start + entry, 0) * (1 - 1e-4)
-            bound = dr.select(last == 0xFFFFFFFF, EMPTY, positive(lib, least) if self.order == "entry" else least)
+            least = self.start + entry
+            least -= 1e-4 * abs(least)
+            bound = dr.select(last == 0xFFFFFFFF, EMPTY, positive(lib, least) if self.signed else least)
         member = dr.select(valid, member + 1, member)
         return index, valid, [count], bound, (count + 1, at, step, last, member, end, some)
 

@@ -35,6 +35,8 @@ class HitModel:
     Attributes:
         response: The settings' `Response`.
         world: Records are world records.
+        signed: Keys that order hits along a ray may be negative: entries, and peaks behind the origin of a ray where
+            these count.
     """
 
     def __init__(self, lib: Lib, settings: RenderSettings, world: bool = False) -> None:
@@ -42,6 +44,7 @@ class HitModel:
         self.s = settings
         self.world = world
         self.response = response_of(settings)
+        self.signed = settings.order == "entry" or (settings.order == "ray" and not self.response.front_only)
         # Opaque: another value is no other kernel.
         self.alpha_min = dr.opaque(lib.Float, settings.alpha_min)
         self.alpha_max = dr.opaque(lib.Float, settings.alpha_max)

@@ -18,7 +18,7 @@ from drgs import runtime
 from drgs.tracing.arrays import Float, Lib, Mask, UInt32
 from drgs.tracing.primitives import Ray
 from drgs.tracing.records import load_record
-from drgs.tracing.sort_keys import BEYOND, EMPTY, name_of, word_of
+from drgs.tracing.sort_keys import BEYOND, EMPTY, name_of, positive, word_of
 from drgs.tracing.walk import ListStream, Part
 from drgs.tracing.weights import PIXELS, signed
 
@@ -177,8 +177,8 @@ class _Finder:
         record[self.m.extent2] -= self.cut
         for start, ray, st, place in zip(self.starts, rays, states, places, strict=True):
             _, key, ok = self.m.hit(record, ray, active & (st["alive"] != 0))
-            # `integral` has hits whose t* lies behind the origin.
-            word = dr.select(ok, word_of(lib, dr.maximum(key, 0), place[-1]), BEYOND)
+            key = positive(lib, key) if self.m.signed else key
+            word = dr.select(ok, word_of(lib, key, place[-1]), BEYOND)
             # A miss is written, too, where the next hit or nothing will be: a store under a mask that follows no
             # pattern costs several times as much.
             dr.scatter(self.words, word, start + st["count"], active)

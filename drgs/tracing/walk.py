@@ -280,13 +280,11 @@ class Part:
         lib = self.lib
         record = load_record(lib, self.records, index, active)
         _, key, ok = self.model.hit(record, ray, active)
-        # `integral` has hits whose t* lies behind the origin.
-        key = dr.maximum(key, 0)
         if self.center_key is not None:
-            key = dr.gather(lib.Float, self.center_key, index, ok)
-        elif self.model.s.order == "entry":
-            key = positive(lib, entry(record, ray))
-        return key, ok
+            return dr.gather(lib.Float, self.center_key, index, ok), ok
+        if self.model.s.order == "entry":
+            key = entry(record, ray)
+        return positive(lib, key) if self.model.signed else key, ok
 
     def _sorted(self, kernel: Kernel, check: bool) -> list[dict]:
         """Composite through a sorted buffer: a hit leaves it when it is the nearest and a new one needs its place."""
