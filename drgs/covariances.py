@@ -7,7 +7,8 @@ have none, although the image does. A small change of C is instead a strain E of
     E C + C E = dC,    (R^T E R)_ij = (R^T dC R)_ij / (s_i^2 + s_j^2),
 
 whose denominators are sums, not differences, of eigenvalues. The renderer is told strains of 0 that have this
-derivative (`render_with_offsets`), so that it is exact for spheres, discs and needles, too.
+derivative (`render_with_offsets`), so that it is exact for spheres, discs and needles, too: R^T E R, in the axes of the
+Gaussian, for a disc's derivative across itself is too small for a sum of others to hold.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ def factors(
         lead: Their leading axes; None: any.
     Returns:
         Quaternions (..., 4) wxyz and standard deviations (..., 3), numbers; strains (..., 6) of 0, the elements xx, xy,
-        xz, yy, yz, zz of E, with the graph of the covariances.
+        xz, yy, yz, zz of R^T E R, with the graph of the covariances.
     Raises:
         ValueError: If one is not symmetric, not finite, or has a negative eigenvalue.
     """
@@ -57,16 +58,16 @@ def factors(
     axes = torch.cat([axes[..., :2], torch.where(mirrored[..., None, None], -axes[..., 2:], axes[..., 2:])], -1)
     change = x - fixed  # 0, with the graph
     seen = axes.mT @ (0.5 * (change + change.mT)) @ axes
-    strain = axes @ (seen / (values[..., :, None] + values[..., None, :])) @ axes.mT
+    strain = seen / (values[..., :, None] + values[..., None, :])
     rows, columns = torch.triu_indices(3, 3, device=x.device)
     return _quaternions(axes), values.sqrt(), strain[..., rows, columns]
 
 
 def strained(axes: torch.Tensor, strains: torch.Tensor) -> torch.Tensor:
-    """(..., 3, 3) half axes as columns, after strains (..., 6): (I + E) times each."""
+    """(..., 3, 3) axes of unit length as columns, after strains (..., 6) in these axes: R (I + E)."""
     xx, xy, xz, yy, yz, zz = strains.unbind(-1)
     E = torch.stack([torch.stack(row, -1) for row in ([xx, xy, xz], [xy, yy, yz], [xz, yz, zz])], -2)
-    return axes + E @ axes
+    return axes + axes @ E
 
 
 def _refuse(where: str, bad: torch.Tensor, values: torch.Tensor, must: str) -> None:

@@ -78,6 +78,8 @@ class OracleScene:
         means: (N, 3) world units.
         axes: (N, 3, 3), columns are the semi-axes R S.
         whiten: (N, 3, 3) S^-1 R^T, from world axes to the local frame.
+        adjugate: (N, 3, 3) s_1 s_2 s_3 S^-1 R^T, of products of scales: right for discs, which `whiten` is not.
+        volume: (N,) s_1 s_2 s_3.
         logits: (N,) raw opacities.
         softplus: (N,) softplus(logit), the optical depth of a full pass through the center.
         sh: (N, K, 3) coefficients.
@@ -94,6 +96,8 @@ class OracleScene:
     means: torch.Tensor
     axes: torch.Tensor
     whiten: torch.Tensor
+    adjugate: torch.Tensor
+    volume: torch.Tensor
     logits: torch.Tensor
     softplus: torch.Tensor
     sh: torch.Tensor
@@ -191,10 +195,14 @@ def activate(g: Any, s: RenderSettings) -> OracleScene:
     if s.extent is None:
         # The N tails beyond these radii add up to at most N alpha exp(-extent^2 / 2) = 1e-5. No derivative: a cut-off.
         extent = (2 * torch.log((torch.sigmoid(logits.detach()) * n / 1e-5).clamp(min=1))).sqrt()
+    scales = log_scales.exp()
+    others = scales[:, [1, 2, 0]] * scales[:, [2, 0, 1]]
     return OracleScene(
         means=means,
-        axes=rotation * log_scales.exp()[:, None, :],
+        axes=rotation * scales[:, None, :],
         whiten=(-log_scales).exp()[:, :, None] * rotation.transpose(1, 2),
+        adjugate=others[:, :, None] * rotation.transpose(1, 2),
+        volume=scales.prod(1),
         logits=logits,
         softplus=torch.logaddexp(logits, torch.zeros_like(logits)),
         sh=sh,

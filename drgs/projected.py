@@ -53,9 +53,11 @@ def projected(
             u, v = (a.clamp(-0.65 * n / f, 0.65 * n / f) for a, n, f in ((u, camera.width, fx), (v, camera.height, fy)))
         zero = torch.zeros_like(z)
         rows = [fx / z, skew / z + zero, -(fx * u + skew * v) / z, zero, fy / z, -fy * v / z]
-        axes = semi_axes(splats.quats.to(**like), splats.scales.to(**like))
+        scales = splats.scales.to(**like)
+        axes = semi_axes(splats.quats.to(**like), torch.ones_like(scales))
         if splats.strains is not None:
             axes = strained(axes, splats.strains)
+        axes = axes * scales[:, None, :]
         half_axes = torch.stack(rows, 1).reshape(-1, 2, 3) @ w2c[:3, :3] @ axes
         a, b = half_axes.unbind(1)
         # The Gram determinant of the rows: thin projections do not cancel as in xx yy - xy^2.

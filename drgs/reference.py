@@ -372,21 +372,20 @@ class _Peak:
     def meet(
         self, scene: OracleScene, s: RenderSettings, rotation: Tensor, away: Tensor, d: Tensor, pixels: Tensor
     ) -> tuple:
-        """rho^2, t* and |d'| of (P, N) pairs, from the equations at the top of this page."""
-        local = -torch.einsum("nij,pnj->pni", scene.whiten, away)
-        slope = torch.einsum("nij,pj->pni", scene.whiten, d)
+        """rho^2, t* and |d'| of (P, N) pairs, from the equations at the top of this page, times s_1 s_2 s_3 above and
+        below the line: with W = S^-1 R^T, (W a) x (W b) = S R^T (a x b) / (s_1 s_2 s_3). Quotients by a scale would
+        cancel in the derivatives of a disc, which are those of a polynomial.
+        """
+        local = torch.einsum("nij,pnj->pni", scene.adjugate, away)
+        slope = torch.einsum("nij,pj->pni", scene.adjugate, d)
+        crossed = torch.einsum("nji,pnj->pni", scene.axes, torch.linalg.cross(away, d[:, None, :].expand_as(away)))
         length2 = slope.square().sum(-1)
-        t = -(local * slope).sum(-1) / length2
-        return torch.linalg.cross(local, slope).square().sum(-1) / length2, t, length2.sqrt()
+        return crossed.square().sum(-1) / length2, (local * slope).sum(-1) / length2, length2.sqrt() / scene.volume
 
     def opacity(self, scene: OracleScene, rho2: Tensor, t: Tensor, length: Tensor) -> tuple:
         """a and 1 - a, neither by a difference that cancels."""
         alpha = torch.sigmoid(scene.logits)
         return alpha * torch.exp(-rho2 / 2), torch.sigmoid(-scene.logits) - alpha * torch.expm1(-rho2 / 2)
-
-    def key(self, t: Tensor) -> Tensor:
-        """What orders hits along a ray."""
-        return t
 
 
 class _OddPeak(_Peak):

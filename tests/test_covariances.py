@@ -129,3 +129,29 @@ def test_covariances_that_are_none():
     (found,) = torch.autograd.grad(image.square().sum(), [flat])
     assert torch.isfinite(found).all()
     assert found.any()  # a point is dilated, and would be wider
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_flat_gaussians(path):
+    """Without an extent along one axis: images and derivatives are those of a Gaussian with next to none."""
+    options, _ = PATHS[path]
+    given = {**arguments(n=3, width=20, height=16, seed=2), "quats": None, "scales": None}
+    given["means"] = torch.tensor([[-0.4, 0.1, 3.0], [0.5, 0.3, 3.5], [0.1, -0.3, 4.0]], dtype=torch.float64)
+    given["viewmats"] = torch.eye(4, dtype=torch.float64)[None]
+    given["opacities"] = torch.tensor([0.7, 0.8, 0.6], dtype=torch.float64)
+    quats = torch.randn(3, 4, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
+    if path == "own rays":
+        camera = Camera(K=given["Ks"][0].numpy(), w2c=given["viewmats"][0].numpy(), width=20, height=16)
+        d = torch.from_numpy(camera.pixel_directions())
+        options = {**options, "rays": torch.cat([torch.zeros_like(d), d], -1)[None]}
+    found = []
+    for thin in (2e-5, 0.0):
+        covars = covariances_of({**given, "quats": quats}, (0.4, 0.3, thin)).requires_grad_()
+        image = drgs.rasterization(**given, covars=covars, **options)[0]
+        u = torch.linspace(-1, 1, image.numel(), dtype=torch.float64).reshape(image.shape)
+        found.append((image.detach(), torch.autograd.grad((u * image).sum(), covars)[0]))
+    (near, slopes), (flat, at_zero) = found
+    torch.testing.assert_close(flat, near, rtol=0, atol=1e-5)
+    axes = drgs.ellipsoids.semi_axes(quats, torch.ones(3, 3, dtype=torch.float64))
+    slopes, at_zero = (axes.mT @ x @ axes for x in (slopes, at_zero))
+    torch.testing.assert_close(at_zero, slopes, rtol=2e-3, atol=1e-4)

@@ -23,6 +23,7 @@ from drgs.ellipsoids import Gaussians
 from drgs.integrator import render, render_jvp, render_rays
 from drgs.lab.refusals import REFUSALS
 from drgs.lab.stress import refused, row_of, truth_of
+from drgs.rasterize import rasterization
 from drgs.settings import RenderSettings
 from drgs.tracing import bvh
 
@@ -205,3 +206,58 @@ def test_values_beyond_float32_do_not_become_nan(response):
         found = gradients(g, cam, out, {"rgb": torch.ones(7, 9, 3), "depth": torch.ones(7, 9)})
         for name, x in found.items():
             assert torch.isfinite(x).all(), name
+
+
+_DISCS = {
+    "exact": RenderSettings.preset("exact"),
+    "exact on bvh": RenderSettings.preset("exact", traversal="bvh"),
+    "integral": RenderSettings.preset("exact", response="integral"),
+    "integral on bvh": RenderSettings.preset("exact", response="integral", traversal="bvh"),
+    "fast": RenderSettings.preset("fast"),
+    "mitsuba": RenderSettings.preset("mitsuba"),
+    "3dgut": RenderSettings.preset("3dgut", culling="extent"),
+    "gsplat": RenderSettings.preset("gsplat"),
+    "inria": RenderSettings.preset("inria"),
+}
+
+
+def _discs(thin):
+    """Three Gaussians as thin as that, each along another axis, and a camera; scales, quaternions and means."""
+    scales = torch.tensor([[0.3, 0.2, thin], [thin, 0.3, 0.4], [0.2, thin, 0.3]], dtype=torch.float64)
+    quats = torch.tensor([[1, 0.2, 0.3, 0.1], [0.5, -0.4, 0.7, 0.3], [0.3, 0.8, -0.2, 0.1]], dtype=torch.float64)
+    means = torch.tensor([[0.1, 0.05, 3.0], [-0.3, 0.2, 3.6], [0.2, -0.3, 4.2]], dtype=torch.float64)
+    made = Camera(K=[[20.0, 0, 8], [0, 20, 8], [0, 0, 1]], w2c=np.eye(4), width=16, height=16)
+    return scales, quats, means, made
+
+
+@pytest.mark.parametrize("thin", [1e-3, 1e-12, 0.0])
+@pytest.mark.parametrize("name", _DISCS)
+def test_derivatives_of_discs(name, thin):
+    """By each scale, the thin one's too, which goes to 0 with it; by tensors and, forward, by raw parameters."""
+    settings = _DISCS[name]
+    scales, quats, means, seen = _discs(thin)
+    opacities = torch.tensor([0.8, 0.6, 0.7], dtype=torch.float64)
+    colors = torch.tensor([[0.2, 0.5, 0.9], [0.8, 0.3, 0.1], [0.4, 0.9, 0.2]], dtype=torch.float64)
+    sh = ((colors - 0.5) / 0.28209479177387814)[:, None]
+    leaves = [x.requires_grad_() for x in (scales, quats, means)]
+    view = {"viewmats": torch.eye(4, dtype=torch.float64)[None], "Ks": torch.tensor(seen.K)[None]}
+    image, _, _ = rasterization(means, quats, scales, opacities, colors, **view, width=16, height=16, preset=settings)
+    raw = scales if thin else scales + 1e-20 * (scales == 0)
+    g = Gaussians(means, quats, raw.log(), torch.logit(opacities), sh)
+    oracle = reference.render(g, seen, settings)
+    good = ~oracle.ambiguous[..., None]
+    assert float(good.double().mean()) > 0.8
+    assert float(((image[0] - oracle.rgb) * good).detach().abs().max()) < 2e-6
+    u = good * torch.linspace(-1, 1, image.numel(), dtype=torch.float64).reshape(16, 16, 3)
+    found = torch.autograd.grad((u * image[0]).sum(), leaves)
+    wanted = torch.autograd.grad((u * oracle.rgb).sum(), leaves)
+    assert float(wanted[0].abs().min()) > 1e-3 * max(thin, 1e-20)
+    torch.testing.assert_close(found[0], wanted[0], rtol=1e-3, atol=0)
+    for got, want in zip(found[1:], wanted[1:], strict=True):
+        assert float((got - want).norm() / want.norm()) < 1e-4
+    if thin and settings.order != "entry":
+        # Forward mode by the thin scales alone.
+        tangent = torch.where(raw == thin, 1 / raw, 0).detach()
+        moved = render_jvp(g.detach(), seen, {"log_scales": tangent}, settings)
+        want = float((wanted[0] * (raw == thin)).sum())
+        assert float((u * moved.rgb).sum()) == pytest.approx(want, rel=1e-3)

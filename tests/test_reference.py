@@ -750,3 +750,20 @@ def test_gsplat_image(data_dir):
     _close(out.alpha, image[..., 3], 2e-6)
     arrays = _as_arrays(SimpleNamespace(**{k: getattr(g, k).double() for k in NAMES[:-1]}))
     _close(out.rgb, oracle_rasterizers.gsplat(*arrays, cam.K, w2c, width, height)[0], 1e-9)
+
+
+@pytest.mark.parametrize("response", ["peak", "integral", "ewa"])
+def test_derivatives_of_discs(response):
+    """By the thin scale s they are c s, c from differences of the image: no quotient by it cancels."""
+    g = _gaussians({"mean": (0.1, 0.05, 3.0), "quat": (1.0, 0.2, 0.3, 0.1), "opacity": 0.8})
+
+    def image(thin):
+        g.log_scales = torch.stack([_f64(0.3), _f64(0.2), thin]).log()[None]
+        return render(g, _camera(), _settings(response)).rgb[..., 1].square().sum()
+
+    h = 1e-3
+    c = 2 * (image(_f64(h)) - image(_f64(1e-20))) / h**2
+    assert abs(c) > 0.1
+    for thin in (1e-6, 1e-12, 1e-20):
+        s = torch.tensor(thin, dtype=torch.float64, requires_grad=True)
+        assert float(torch.autograd.grad(image(s), s)[0]) == pytest.approx(float(c) * thin, rel=1e-3)

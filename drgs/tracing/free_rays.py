@@ -92,7 +92,7 @@ class FreeRays(LensRays):
         least = self.lib.Float(0)
         most = self.lib.Float(0)
         for k in range(3):
-            n = cross(rows[(k + 1) % 3], rows[(k + 2) % 3])
+            n = [r[layout.W_COFACTOR + k] * x for x in rows[k]]
             c = cross(d, n)  # n . (p x d) = p . (d x n)
             e = cross(n, p)
             middle = dot(p, c)
@@ -100,7 +100,7 @@ class FreeRays(LensRays):
             off += dr.sqrt(dot(n, n)) * both
             rounding = _ROUNDING * dot([abs(v) for v in p], [abs(v) for v in c])
             least = dr.fma(q := dr.maximum(abs(middle) - off - rounding, 0), q, least)
-            w = rows[k]
+            w = [r[layout.W_INVERSE + k] * x for x in rows[k]]
             along = abs(dot(w, d)) + dot([abs(v) for v in w], spread_d)
             most = dr.fma(along, along, most)
         # 1.0001 is more than float32 rounds.

@@ -156,10 +156,14 @@ class Activated:
         view: (3, 4) rows of w2c.
         center: (3,) means in camera axes.
         from_local: (3, 3) local axes to camera axes, of half axes R S: as the Gaussian is strained, if it is.
+        inverse, cofactor: (3,) diagonals of S^-1 and of its cofactor matrix, s_k / (s_1 s_2 s_3), both times the least
+            scale, which cancels in rho^2 and t*. They are formed as products of scales: by the scale of a disc's thin
+            axis, which may be 0 nearly, derivatives of quotients would cancel.
+        norm: |W v| = norm |diag(inverse) R^T v|.
         rotation_of_inverse: (3, 3) R in W = S^-1 R^T, which takes world vectors to the local frame: the same but for
-            strains, which shrink there what they stretch here.
+            strains, whose diagonal is in `inverse`: there times 1 + trace(E), for the same reason.
         inverse_from_local: (3, 3) the same in camera axes.
-        swelling: What part of itself the volume grows by under the strain; None without strains.
+        stretching: (3,) diagonal of the strain in local axes; None without strains.
     """
 
     def __init__(
@@ -206,18 +210,37 @@ class Activated:
         self.center = [
             v[r][0] * self.mean[0] + v[r][1] * self.mean[1] + v[r][2] * self.mean[2] + v[r][3] for r in range(3)
         ]
+        # Of s_1 s_2 s_3 S^-1 and S, `inverse` and `cofactor` are the same multiple. Which one changes no value, hence
+        # detached: first of scales relative to the largest, which float64 can multiply, then so that the largest
+        # entry of `inverse` is 1.
+        largest = dr.detach(dr.maximum(dr.maximum(self.scale[0], self.scale[1]), self.scale[2]))
+        relative = [s / largest for s in self.scale]
+        products = [relative[(k + 1) % 3] * relative[(k + 2) % 3] for k in range(3)]
+        top = dr.detach(dr.maximum(dr.maximum(products[0], products[1]), products[2]))
+        top = dr.maximum(top, 1e-300)  # never 0 / 0
+        self.inverse = [x / top for x in products]
+        self.cofactor = [x / (top * largest) for x in relative]
+        self.norm = top / (relative[0] * relative[1] * relative[2] * largest)
         stretched = self.rotation_of_inverse = self.rotation
-        self.swelling: Float | None = None
+        self.stretching: list[Float] | None = None
         if "strains" in p:
-            # The strain is 0, and moves the Gaussian to first order only: (I + E) R and (I - E) R.
+            # The strain is 0, and moves the Gaussian to first order only: R (I + E), and R (I - E) of W.
             xx, xy, xz, yy, yz, zz = (column("strains", k, 6) for k in range(6))
-            E = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
-            moved = [[sum(E[r][k] * self.rotation[k][c] for k in range(3)) for c in range(3)] for r in range(3)]
-            stretched, self.rotation_of_inverse = (
-                [[a + sign * b for a, b in zip(*rows, strict=True)] for rows in zip(self.rotation, moved, strict=True)]
-                for sign in (1, -1)
-            )
-            self.swelling = xx + yy + zz
+            shears = [[0, xy, xz], [xy, 0, yz], [xz, yz, 0]]
+            moved = [
+                [sum(row[k] * shears[k][c] for k in range(3) if k != c) for c in range(3)] for row in self.rotation
+            ]
+            self.stretching = [xx, yy, zz]
+            stretched = [
+                [a * (1 + e) + b for a, b, e in zip(*rows, self.stretching, strict=True)]
+                for rows in zip(self.rotation, moved, strict=True)
+            ]
+            self.rotation_of_inverse = [
+                [a - b for a, b in zip(*rows, strict=True)] for rows in zip(self.rotation, moved, strict=True)
+            ]
+            others = [yy + zz, zz + xx, xx + yy]
+            self.inverse = [x * (1 + e) for x, e in zip(self.inverse, others, strict=True)]
+            self.norm *= 1 - (xx + yy + zz)
         self.from_local = _rotated(v, stretched)
         same = self.rotation_of_inverse is self.rotation
         self.inverse_from_local = self.from_local if same else _rotated(v, self.rotation_of_inverse)

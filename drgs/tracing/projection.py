@@ -125,7 +125,7 @@ def project_world(
     screen: Screen | None = None,
     cull: Cull | None = None,
 ) -> Projected:
-    """World records for arbitrary rays: mean, W = S^-1 R^T, opacity, extent^2, color.
+    """World records for arbitrary rays: mean, W = S^-1 R^T and its cofactor matrix, opacity, extent^2, color.
 
     Args:
         lib: Dr.Jit types of the backend.
@@ -142,10 +142,13 @@ def project_world(
     Float = lib.Float
     response = response_of(settings)
     g = Activated(lib, p, w2c, settings, dr.width(p["logit_opacities"]), response.at_most_alpha)
-    inverse = [dr.rcp(s) for s in g.scale]
+    cofactor = g.cofactor
+    if g.stretching is not None:
+        cofactor = [x * (1 + e) for x, e in zip(cofactor, g.stretching, strict=True)]
     record = [Float(x) for x in g.mean]
-    record += [Float(inverse[r] * g.rotation_of_inverse[c][r]) for r in range(3) for c in range(3)]
-    record += _common(lib, g, response, coefficients)
+    record += [Float(g.rotation_of_inverse[c][r]) for r in range(3) for c in range(3)]
+    record += [Float(x) for x in [*g.inverse, *cofactor]]
+    record += [*_common(lib, g, response, coefficients), Float(g.norm)]
     # Keys order hits, and an order has no derivative.
     distance = dr.detach(g.distance())
     z = dr.detach(g.center[2])

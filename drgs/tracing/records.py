@@ -18,12 +18,16 @@ __all__ = ["RECORD", "count_of", "cross", "dot", "load_packed", "load_record", "
 RECORD = 24
 AX, AY, R11, R12, R13, R21, R22, R23, E2, E3, E4, E5, E6, H1, H2, H3, NORM, ALPHA, EXT2, RGB = range(20)
 SIDE = 22  # of the cube, under a wide lens (lens_rays.py)
-# A world record: mean (3), W by rows (9), opacity, extent^2, rgb (3); padded to the same stride.
+# A world record: mean (3), R^T by rows (9), `Activated.inverse` and `cofactor` (3 each), which make W and its cofactor
+# matrix of it, opacity, extent^2, rgb (3), and `Activated.norm`.
 W_MEAN = 0
 W_ROWS = 3
-W_ALPHA = 12
-W_EXT2 = 13
-W_RGB = 14
+W_INVERSE = 12
+W_COFACTOR = 15
+W_ALPHA = 18
+W_EXT2 = 19
+W_RGB = 20
+W_NORM = 23
 
 
 def dot(a: Sequence[Float], b: Sequence[Float]) -> Float:

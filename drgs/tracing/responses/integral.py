@@ -17,7 +17,6 @@ import drjit as dr
 from drgs.tracing import records as layout
 from drgs.tracing.arrays import Float
 from drgs.tracing.primitives import Ray
-from drgs.tracing.records import dot
 from drgs.tracing.responses.peak import Peak, approach, times
 
 __all__ = ["INTEGRAL", "Integral"]
@@ -43,11 +42,10 @@ class Integral(Peak):
     def slots(self, world: bool, depth: bool) -> list[int]:
         """All numbers of the shape: the opacity depends on t*, too."""
         used = super().slots(world, False)
-        return used if world else [*used, layout.H1, layout.H2, layout.H3, layout.NORM]
+        return [*used, *([layout.W_NORM] if world else [layout.H1, layout.H2, layout.H3, layout.NORM])]
 
-    def _u_in_world(self, key: Float, d: list[Float], inverse: Float) -> Float:
-        # |d'|^2 is 0 where a scale is beyond 1e19: all that is in sight is then at u = 0. A mask has no derivative.
-        return dr.select(dr.detach(dot(d, d)) > 0, key * dr.rsqrt(inverse), 0)
+    def _u_in_world(self, r: list[Float], key: Float, inverse: Float) -> Float:
+        return r[layout.W_NORM] * key * dr.rsqrt(inverse)
 
     def _u_on_screen(self, r: list[Float], along: Float, inverse: Float) -> Float:
         return r[layout.NORM] * along * dr.sqrt(inverse)

@@ -1,7 +1,8 @@
 """Response `peak`: a = alpha exp(-rho^2 / 2) where a ray comes nearest to the Gaussian in its own metric.
 
 Moenne-Loccoz et al. 2024 (3D Gaussian ray tracing). With W = S^-1 R^T, o' = W (o - mu), d' = W d:
-t* = -o'.d' / |d'|^2, rho^2 = |o' x d'|^2 / |d'|^2.
+t* = -o'.d' / |d'|^2, rho^2 = |o' x d'|^2 / |d'|^2. Both o' x d' and d' are used times the least scale: what is left are
+products of scales (`Activated.inverse`), and a disc is no special case, nor are its derivatives.
 
 On the screen. A pinhole ray has the direction d(x, y) = d_a + (x - x_a) d_x + (y - y_a) d_y in camera coordinates,
 unnormalized with d_z = 1, around an anchor pixel (x_a, y_a); c is the mean there, o' = -W c. Nothing cancels: o' x d'
@@ -76,38 +77,33 @@ class Peak(AlphaStrength):
     def project(self, g: Activated, screen: Screen) -> tuple[list[Float], list[Float], Mask, tuple]:
         """The 15 numbers of rho^2, t* and |d'| around the anchor, and the bounds of the extent ellipsoid."""
         dx, dy, da = screen.axes()
-        inverse = [dr.rcp(s) for s in g.scale]
-        volume = inverse[0] * inverse[1] * inverse[2]
-        cofactor = [s * volume for s in g.scale]
-        if g.swelling is not None:
-            cofactor = [x * (1 - g.swelling) for x in cofactor]
 
         # diag(weight) R^T v, from camera axes; R as in W, and as in det(W) W^-T, which cross products have.
-        def local(v: list[Float], weight: list[Float]) -> list[Float]:
-            return _weighted(g.inverse_from_local, v, weight)
+        def local(v: list[Float]) -> list[Float]:
+            return _weighted(g.inverse_from_local, v, g.inverse)
 
         def crossed(v: list[Float]) -> list[Float]:
-            return _weighted(g.from_local, v, cofactor)
+            return _weighted(g.from_local, v, g.cofactor)
 
-        d = local(da, inverse)
-        norm = dr.sqrt(dot(d, d))
-        unit = dr.rcp(norm)
+        d = local(da)
+        length = dr.sqrt(dot(d, d))
+        unit = dr.rcp(length)
         A = _scaled(crossed(cross(g.center, dx)), unit)
         B = _scaled(crossed(cross(g.center, dy)), unit)
         C = _scaled(crossed(cross(g.center, da)), unit)
         # All three are perpendicular to W c: two components each say everything.
-        u, v = _frame(local(g.center, inverse))
+        u, v = _frame(local(g.center))
         r = [dot(u, A), dot(u, B), dot(u, C), dot(v, A), dot(v, B), dot(v, C)]
         # The same for (d'_a, d'_x, d'_y), divided by |d'_a|: Gram-Schmidt from d'_a on.
         f1 = _scaled(d, unit)
-        Dx, Dy = _scaled(local(dx, inverse), unit), _scaled(local(dy, inverse), unit)
+        Dx, Dy = _scaled(local(dx), unit), _scaled(local(dy), unit)
         e2, e3 = dot(f1, Dx), dot(f1, Dy)
         rest = _perpendicular(_less(Dx, f1, e2), f1)
         e4 = dr.sqrt(dot(rest, rest))
         f2 = _scaled(rest, dr.rcp(e4))
         f3 = cross(f1, f2)
-        h = _scaled(local(g.center, inverse), unit)
-        numbers = [*r, e2, e3, e4, dot(f2, Dy), dot(f3, Dy), dot(f1, h), dot(f2, h), dot(f3, h), norm]
+        h = _scaled(local(g.center), unit)
+        numbers = [*r, e2, e3, e4, dot(f2, Dy), dot(f3, Dy), dot(f1, h), dot(f2, h), dot(f3, h), length * g.norm]
         return numbers, *silhouette(g, screen), (g.rotation, g.scale, (u, v), (f1, f2, f3))
 
     def extras(self, lib: Lib, projected: Projected, moved: list[list[Float]] | None) -> list[Float]:
@@ -139,17 +135,16 @@ class Peak(AlphaStrength):
     def along(self, r: list[Float], ray: Ray, world: bool) -> tuple[Float, Float, Float | None]:
         """rho^2, t* and u of a ray."""
         if world:
-            t0, a, d, inverse = _local(r, ray)
-            c = cross(a, d)
-            key = t0 - dot(a, d) * inverse
-            return dot(c, c) * inverse, key, self._u_in_world(key, d, inverse)
+            t0, along, c, _, inverse = _local(r, ray)
+            key = t0 - along * inverse
+            return dot(c, c) * inverse, key, self._u_in_world(r, key, inverse)
         c1, c2, d, inverse = _on_screen(r, ray)
         squared = dr.fma(c1, c1, c2 * c2)
         along = dr.fma(r[layout.H1], d[0], dr.fma(r[layout.H2], d[1], r[layout.H3] * d[2]))
         length = ray.length + ray.carried[-1] if ray.shifted and not ray.direction else ray.length
         return squared * inverse, along * inverse * length, self._u_on_screen(r, along, inverse)
 
-    def _u_in_world(self, key: Float, d: list[Float], inverse: Float) -> Float | None:
+    def _u_in_world(self, r: list[Float], key: Float, inverse: Float) -> Float | None:
         return None
 
     def _u_on_screen(self, r: list[Float], along: Float, inverse: Float) -> Float | None:
@@ -167,10 +162,9 @@ class Peak(AlphaStrength):
         """p, e, u and rho^2; on the screen p and e in the frame of the ray's direction at the anchor."""
         rho2, _, u = self.along(r, ray, world)
         if world:
-            _, a, d, inverse = _local(r, ray)
+            _, _, c, d, inverse = _local(r, ray)
             root = dr.sqrt(inverse)
-            # a - (a.d) d / |d|^2 would cancel where a is long: across a sheet it is 1e6 times p.
-            return [x * inverse for x in cross(d, cross(a, d))], [x * root for x in d], u, rho2
+            return [x * inverse for x in cross(d, c)], [x * root for x in d], u, rho2
         c1, c2, d, inverse = _on_screen(r, ray)
         q = [dr.fma(c1, extra[i], c2 * extra[3 + i]) for i in range(3)]
         root = dr.sqrt(inverse)
@@ -201,10 +195,9 @@ PEAK = Peak()
 
 def entry(r: list[Float], ray: Ray) -> Float:
     """Where a world ray enters the ellipsoid of the extent: before its origin if that is inside."""
-    t0, a, d, inverse = _local(r, ray)
-    c = cross(a, d)
+    t0, along, c, _, inverse = _local(r, ray)
     half = dr.maximum(r[layout.W_EXT2] - dot(c, c) * inverse, 0) * inverse
-    return t0 - dot(a, d) * inverse - dr.sqrt(half)
+    return t0 - along * inverse - dr.sqrt(half) / r[layout.W_NORM]
 
 
 def deviation(r: list[Float], patch: Patch) -> Float:
@@ -283,8 +276,11 @@ def _direction(r: list[Float], dx: Float, dy: Float, w: Float | int) -> list[Flo
     return [dr.fma(r[L.E2], dx, dr.fma(r[L.E3], dy, w)), dr.fma(r[L.E4], dx, r[L.E5] * dy), r[L.E6] * dy]
 
 
-def _local(r: list[Float], ray: Ray) -> tuple[Float, list[Float], list[Float], Float]:
-    """t0 of a ray o + t d in the world, w = (o - mu) + t0 d and d in the local frame, and 1 / |d'|^2.
+def _local(r: list[Float], ray: Ray) -> tuple[Float, Float, list[Float], list[Float], Float]:
+    """A world ray o + t d in the local frame, with w = (o - mu) + t0 d: t0, w'.d', w' x d', d' and 1 / |d'|^2.
+
+    w', d' and w' x d' are divided by `Activated.norm`, which cancels in rho^2, t* and the peak. w' x d' is the cofactor
+    matrix of W times w x d: of a disc, whose W is large, nothing large is formed.
 
     t0, where the ray is nearest to the mean, only moves the point about which the local frame is expanded, so that what
     is rounded is as small as the Gaussian's distance from the ray.
@@ -296,10 +292,12 @@ def _local(r: list[Float], ray: Ray) -> tuple[Float, list[Float], list[Float], F
     t0 = dr.detach(dot(to, d))  # no value depends on it but for rounding, hence no derivative
     w = [dr.fma(t0, d[k], -to[k]) for k in range(3)]
     rows = [r[L.W_ROWS + 3 * k : L.W_ROWS + 3 * k + 3] for k in range(3)]
-    a, d = ([dot(row, v) for row in rows] for v in (w, d))
+    w, d = ([dot(row, v) for row in rows] for v in (w, d))
+    c = [x * y for x, y in zip(r[L.W_COFACTOR : L.W_COFACTOR + 3], cross(w, d), strict=True)]
+    w, d = ([x * y for x, y in zip(r[L.W_INVERSE : L.W_INVERSE + 3], v, strict=True)] for v in (w, d))
     squared = dot(d, d)
     # Lanes without a candidate read zeros: 0 / 0 would spoil their (masked) derivatives.
-    return t0, a, d, dr.rcp(dr.select(squared > 0, squared, 1))
+    return t0, dot(w, d), c, d, dr.rcp(dr.select(squared > 0, squared, 1))
 
 
 def _frame(n: list[Float]) -> tuple[list[Float], list[Float]]:
