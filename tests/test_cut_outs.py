@@ -10,6 +10,8 @@ from test_data import write_image
 
 from drgs import cli
 from drgs.cameras import orbit
+from drgs.commands.config_file import config_fields, default_of
+from drgs.commands.options import Fit
 from drgs.data import Dataset, View, load
 from drgs.data.backgrounds import default_background
 from drgs.data.checks import read_image
@@ -115,3 +117,18 @@ def test_a_fit_of_blenders_layout_is_on_white(tmp_path, caplog):
     assert background("told", "--max-steps", "1", "--background", "0", "0", "0") == [0, 0, 0]
     assert "as readers of Blender's and D-NeRF's data sets take it" not in caplog.text
     assert background("told", "--max-steps", "1", "--resume") == [0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("max_steps = 5", None),
+        ("[settings]\nbackground = [0, 0, 0]", (0, 0, 0)),
+    ],
+)
+def test_a_file_says_the_background_or_leaves_it_open(tmp_path, text, expected):
+    """A file without settings leaves it to the photographs; black that is said is black."""
+    (tmp_path / "fit.toml").write_text(text)
+    options = default_of(Fit, config_fields(tmp_path / "fit.toml"), None)
+    assert options.background == expected
+    assert options.fit_config().settings.background == (0, 0, 0)

@@ -158,13 +158,15 @@ def start(
     if empty := [x for x in (frame.empty() for frame in frames) if x is not None]:
         share = float(sum(x.sum() for x in empty)) / sum(frame.pixels[..., 0].numel() for frame in frames)
         color = " ".join(f"{x:g}" for x in config.settings.background)
+        transparent = any(frame.alpha is not None for frame in frames)
         _log.info(
-            "%.0f %% of the training pixels show nothing, by masks or alpha: %s is behind them%s",
+            "%.0f %% of the training pixels show nothing, by masks or alpha: %s is behind them%s%s",
             100 * share,
             color,
-            ""
-            if any(config.settings.background) or all(frame.alpha is None for frame in frames)
-            else " (--background; readers of D-NeRF's and Blender's data sets take 1 1 1)",
+            " (--background; readers of D-NeRF's and Blender's data sets take 1 1 1)"
+            if transparent and not any(config.settings.background)
+            else "",
+            "; until the end PSNR counts them, too" if transparent else "",
         )
     made = parts or parts_of(config, extent, channels)
     if room:
