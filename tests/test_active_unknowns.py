@@ -80,7 +80,9 @@ def even(tmp_path_factory):
 def estimate(logs, labels):
     """What points are made to say."""
     logs = np.asarray(logs, np.float64)
-    return ExposureEstimate(logs, 0.01 * np.ones_like(logs), 100, len(set(labels)), np.asarray(labels))
+    return ExposureEstimate(
+        logs, 0.01 * np.ones_like(logs), 100, len(set(labels)), np.asarray(labels), 0.5, logs.any(axis=1)
+    )
 
 
 # ---- a photograph that joins

@@ -11,7 +11,7 @@ import pytest
 
 import drgs
 from drgs.cameras import Camera, intrinsics, look_at
-from drgs.data import Dataset, View, added_points, initial_points, kept_matches, load
+from drgs.data import Dataset, View, added_points, initial_points, kept_matches, load, shared_points
 from drgs.data.guesses import points_beside
 from drgs.data.guided import Matches
 from drgs.data.matching import nearby_pairs, sequential_pairs
@@ -493,3 +493,40 @@ def test_damaged_point_clouds(tmp_path, change, told):
     with pytest.raises(ValueError, match=told) as error:
         read_point_ply(path)
     assert "\n" not in str(error.value)
+
+
+def test_what_is_hidden_is_not_shared(tmp_path, rng):
+    """Points on both sides of a slab, with tracks of one to three photographs of their side: all of this side show
+    them, and those of the other side do not, where projections alone would be inside the picture.
+    """
+    views = []
+    for i in range(6):
+        eye = (0.1 * (i % 3), 0.0, 4.0 if i < 3 else -4.0)
+        camera = Camera(intrinsics(300, 300, 160, 120), look_at(eye, (0, 0, 0), (0, 1, 0)), WIDTH, HEIGHT)
+        views.append(View(camera, f"{i}"))
+    points = np.concatenate([rng.uniform(-1, 1, (400, 2)), np.repeat([0.5, -0.5], 200)[:, None]], axis=1)
+    tracks = {f"{i}": np.arange(0, 200, 1 + i % 3) + (0 if i < 3 else 200) for i in range(6)}
+    got, shown = shared_points(Dataset(tmp_path, "colmap", views, points, tracks=tracks), views)
+    np.testing.assert_array_equal(got, points)
+    assert min(shown[:3, :200].mean(), shown[3:, 200:].mean()) > 0.75  # their own tracks: 0.61
+    assert not shown[:3, 200:].any()
+    assert not shown[3:, :200].any()
+
+
+def test_depth_maps_say_what_is_hidden(tmp_path, rng):
+    """A square that five depth maps agree about, and one map that sees something nearer in front of all of it."""
+    views = plane_views(tmp_path, rng, depth=True)
+    views[2].depth_scale /= 2
+    points, shown = shared_points(None, views)
+    nearer = np.abs(points[:, 2]) > 0.5
+    assert 0.1 < nearer.mean() < 0.3
+    assert not shown[2, ~nearer].any()
+    assert shown[np.ix_([0, 1, 3, 4], ~nearer)].mean() > 0.9
+    assert not shown[np.ix_([0, 1, 3, 4], nearer)].any()
+
+
+def test_nothing_is_shared_where_nobody_knows(tmp_path, rng):
+    """Points without tracks, as of a PLY file, and no matches: photographs are not compared by what may be hidden."""
+    views = plane_views(tmp_path, rng, count=2)
+    assert shared_points(Dataset(tmp_path, "transforms", views, np.zeros((3, 3))), views) is None
+    assert shared_points(None, views, matches=Matches())[1].sum() > 50

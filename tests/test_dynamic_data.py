@@ -405,6 +405,25 @@ def test_folders_of_frames(tmp_path, place, name):
     assert load(tmp_path, points=False, times=3).frames == (0, 2, 5)
 
 
+def test_a_model_says_which_photographs_show_a_point(tmp_path):
+    """Tracks are kept by the names of photographs, in the order of the points; a photograph without one has none."""
+    tracks = [(0, 1), (1, 2), (0, 2, 1)]
+    names = [f"{k}.png" for k in "cabd"]  # COLMAP's numbers are in another order than the names
+    write_model(tmp_path / "sparse", cameras(4), names, tracks)
+    (tmp_path / "images").mkdir()
+    for name in names:
+        cv2.imwrite(str(tmp_path / "images" / name), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    data = load(tmp_path)
+    assert {name: list(shown) for name, shown in data.tracks.items()} == {
+        "c": [0, 2],
+        "a": [0, 1, 2],
+        "b": [1, 2],
+        "d": [],
+    }
+    np.testing.assert_allclose(data.points[:, 0], [0, 1, 2])
+    assert load(tmp_path, points=False).tracks is None
+
+
 def test_cameras_that_move(tmp_path):
     """Where a model has other poses for later frames of a camera, the first one is not taken for all of them."""
     write_frames(tmp_path, count=2, numbers=(0, 1))

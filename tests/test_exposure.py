@@ -2,17 +2,22 @@
 
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
 import torch
+from test_active_unknowns import VIEWS, write_photographs
 from test_train import config, dataset  # noqa: F401 (a fixture)
 
 from drgs.cameras import orbit
+from drgs.data import load
 from drgs.files import load_state
 from drgs.fitting.exposure import Exposure, estimate_exposure, exposure_network
 from drgs.fitting.frames import Frame
 from drgs.fitting.records import fit_record
+from drgs.tracing.call import Output
+from drgs.train import fit
 
 
 def _photographs(gains, hidden=0.0, seed=0):
@@ -83,6 +88,79 @@ def test_photographs_without_common_points_keep_gain_one():
     assert not found.log_gains.any()
     assert not found.is_clear
     assert "2 sets" in found.words()
+
+
+def test_one_photograph_at_half_brightness_is_recovered():
+    """Its gain is a half, to 2 %, those of the others are equal; nothing of it is taken for another color."""
+    gains = np.ones((8, 3))
+    gains[3] = 0.5
+    found = estimate_exposure(*_photographs(gains, 0.1))
+    relative = np.exp(found.log_gains - np.delete(found.log_gains, 3, axis=0).mean(axis=0))
+    assert np.abs(relative - gains).max() < 0.02
+    assert found.used[3]
+    assert found.is_clear
+    assert found.lowered > 0.5
+
+
+def test_light_from_one_side_is_no_gain():
+    """Where each photograph is bright on one side, as of a thing that is turned in front of a lamp, gains of points
+    differ; but a gain of one half does not make the other half right, so that none is clear.
+    """
+    frames, points = _photographs(np.ones((8, 3)))
+    rng = np.random.default_rng(1)
+    for frame in frames:
+        center = rng.uniform(0, 300)
+        frame.pixels *= torch.exp(-(((torch.arange(300) - center) / 150) ** 2))[None, :, None]
+    found = estimate_exposure(frames, points)
+    assert found.lowered < 0.05
+    assert not found.is_clear
+    assert not found.warning()
+    assert "not used" in found.words()
+
+
+def test_pixels_that_show_nothing_are_not_compared():
+    """A gray background that an alpha channel leaves free is that of every photograph, whatever its exposure: with it
+    gains would seem nearer to 1 than they are.
+    """
+    gains = np.exp(np.linspace(-0.4, 0.4, 6))[:, None] * np.ones(3)
+    frames, points = _photographs(gains)
+    for frame in frames:
+        pixels, _ = frame.camera.project(points)
+        alpha = torch.zeros(300, 300)
+        for x, y in pixels[:100].astype(int):
+            alpha[max(0, y - 2) : y + 3, max(0, x - 2) : x + 3] = 1
+        frame.pixels = torch.where(alpha[..., None] > 0, frame.pixels, torch.tensor(0.5))
+        frame.alpha = alpha
+    found = estimate_exposure(frames, points)
+    assert np.abs(found.log_gains - np.log(gains)).max() < 0.02
+
+
+def test_gains_leave_the_background_and_what_is_saturated():
+    """An empty pixel on white stays white, whatever the gain, and a half covered one stays half white; where the
+    photograph is saturated, a brighter rendering is right and gets no gradient, a darker one is wrong.
+    """
+    frames, _ = _photographs(np.ones((2, 3)))
+    gains = exposure_network(frames, False, np.log([[0.5] * 3, [2.0] * 3]), (1.0, 1.0, 1.0)).module
+    rgb = torch.tensor([[1.0, 0.6, 0.7, 0.4]])[..., None].repeat(1, 1, 3).requires_grad_()
+    alpha = torch.tensor([[0.0, 0.5, 1.0, 1.0]])
+    photograph = torch.tensor([[1.0, 0.5, 1.0, 1.0]])[..., None].repeat(1, 1, 3)
+    for frame, expected in zip(frames, ([1.0, 0.55, 0.35, 0.2], [1.0, 0.7, 1.0, 0.8]), strict=True):
+        shown = dataclasses.replace(frame, pixels=photograph, alpha=alpha)
+        found = gains(Output(rgb=rgb, alpha=alpha), shown).rgb
+        torch.testing.assert_close(found[0, :, 0], torch.tensor(expected))
+    (gradient,) = torch.autograd.grad(found.sum(), rgb)  # of the second photograph
+    assert gradient[0, :, 0].tolist() == [2.0, 2.0, 0.0, 2.0]
+
+
+@pytest.mark.parametrize(("gains", "told"), [((1.0, 0.5), True), ((1.0, 1.0), False)])
+def test_a_fit_without_gains_says_that_photographs_differ(tmp_path, capsys, gains, told):
+    """One line, before the first step, if every other photograph has half the brightness; and no gain is fitted."""
+    write_photographs(tmp_path / "data", np.resize(gains, (VIEWS, 1)) * np.ones(3))
+    run = fit(load(tmp_path / "data"), tmp_path / "run", config(max_steps=1), progress=True).run
+    lines = [line for line in capsys.readouterr().err.splitlines() if "--exposure auto" in line]
+    assert len(lines) == told
+    assert not told or float(re.search(r"differ by (\S+)", lines[0])[1]) == pytest.approx(0.5, abs=0.03)
+    assert "exposure" not in run.config()
 
 
 def test_learned_gains_keep_zero_mean_and_held_ones_stay():

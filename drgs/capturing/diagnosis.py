@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.data import shared_points
 from drgs.data.checks import read_image
 from drgs.data.mapping import runs
 from drgs.data.shooting import Finding
@@ -187,18 +188,19 @@ def of_exposure(dataset: Dataset, seed: int = 0) -> list[Finding]:
     """Photographs whose exposure or white balance differs from that of the others.
 
     Args:
-        dataset: The data set, with points.
+        dataset: The data set.
         seed: Seed of the points that are looked at.
     """
-    if dataset.points is None or not len(dataset.points) or dataset.times:
+    views = sorted(dataset.views, key=lambda view: view.name)
+    if dataset.times or (compared := shared_points(dataset, views, seed)) is None:
         return []
-    frames = load_frames(sorted(dataset.views, key=lambda view: view.name), _EXPOSURE_PIXELS)
-    estimate = estimate_exposure(frames, dataset.points, seed)
+    points, seen = compared
+    estimate = estimate_exposure(load_frames(views, _EXPOSURE_PIXELS), points, seed, seen)
     if not estimate.is_clear:
         return []
     stops = estimate.log_gains / math.log(2)
     order = np.argsort(-np.abs(stops).max(axis=1), kind="stable")[:_SHOWN]
-    shown = ", ".join(f"{frames[i].name} ({max(stops[i], key=abs):+.1f} stops)" for i in order)
+    shown = ", ".join(f"{views[i].name} ({max(stops[i], key=abs):+.1f} stops)" for i in order)
     return [
         Finding(
             "exposure",

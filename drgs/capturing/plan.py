@@ -355,4 +355,4 @@ def _filled(dataset: Dataset, config: FitConfig) -> Dataset:
     spread = np.median(np.abs(points - np.median(points, axis=0)), axis=0)
     moved = points[chosen] + 0.01 * spread * rng.normal(size=(wanted, 3))
     shown = None if colors is None else colors[chosen]
-    return dataclasses.replace(dataset, points=moved, colors=shown)
+    return dataclasses.replace(dataset, points=moved, colors=shown, tracks=None)

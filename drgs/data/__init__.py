@@ -18,7 +18,14 @@ from drgs.data.held_out import apply_held_out
 from drgs.data.llff import POSES_BOUNDS
 from drgs.data.masks import note_partial_masks
 from drgs.data.multicamera import frame_folders
-from drgs.data.points import added_points, initial_points, matched_points, triangulated_count, triangulated_points
+from drgs.data.points import (
+    added_points,
+    initial_points,
+    matched_points,
+    shared_points,
+    triangulated_count,
+    triangulated_points,
+)
 from drgs.data.replica import POSES
 from drgs.data.semantics import Semantics
 from drgs.data.sidecars import attach
@@ -39,6 +46,7 @@ __all__ = [
     "matched_points",
     "load",
     "scene_extent",
+    "shared_points",
     "triangulated_count",
     "triangulated_points",
 ]

@@ -42,6 +42,7 @@ _MODELS = {
     "EQUIRECTANGULAR": (17, 2),
 }
 _ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE")
+_MOST_TRACKS = 20_000  # points whose tracks are kept: enough to compare photographs, read in a tenth of a second
 _log = logging.getLogger(__name__)
 
 
@@ -74,6 +75,7 @@ def load_colmap(
     views = []
     absent = []
     listed = []
+    by_id = {}
     # By name: COLMAP numbers images in the order in which its threads finish them.
     registered = sorted(reconstruction.reg_image_ids(), key=lambda image_id: reconstruction.images[image_id].name)
     if not registered:
@@ -85,6 +87,7 @@ def load_colmap(
         where = f"{model}: image {index} ({image.name})"
         view = View(None, str(Path(image.name).with_suffix("")), image_path=file)
         listed.append(view)
+        by_id[image_id] = view
         if not is_file(view.image_path):
             absent.append(view)
             continue
@@ -107,10 +110,22 @@ def load_colmap(
         point_source=source,
         absent=absent,
         reprojection=_reprojection(reconstruction),
+        tracks=_tracks(reconstruction, by_id),
     )
 
 
 COLMAP = Format(lambda path: find_model(path) is not None, load_colmap, MODEL_FOLDERS)
+
+
+def _tracks(reconstruction: Any, by_id: dict[int, View]) -> dict[str, np.ndarray] | None:
+    """View name -> indices of points that it shows, of the order of `model_points`; None where no point has a track."""
+    keys = sorted(reconstruction.point3D_ids())
+    found: dict[str, list[int]] = {view.name: [] for view in by_id.values()}
+    for index in range(0, len(keys), -(-len(keys) // _MOST_TRACKS) or 1):
+        images = {element.image_id for element in reconstruction.points3D[keys[index]].track.elements}
+        for image_id in images & by_id.keys():
+            found[by_id[image_id].name].append(index)
+    return {name: np.array(x, np.int64) for name, x in found.items()} if any(found.values()) else None
 
 
 def _reprojection(reconstruction: Any) -> float | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -40,6 +40,8 @@ class Dataset:
             where there are no synchronous cameras.
         reprojection: Median angle in radians between observations of the data set's points and where its cameras see
             these points; None where it states none.
+        tracks: View name -> (N,) int64 indices of points that this view was found to show, among 20,000 at most; None
+            where the data set does not say.
     """
 
     path: Path
@@ -55,6 +57,7 @@ class Dataset:
     test_cameras: tuple[str, ...] | None = None
     frames: tuple[int, ...] = ()
     reprojection: float | None = None
+    tracks: Mapping[str, np.ndarray] | None = None
 
     @property
     def times(self) -> tuple[float, ...]:

@@ -31,6 +31,7 @@ __all__ = [
     "initial_points",
     "matched_points",
     "read_point_ply",
+    "shared_points",
     "triangulated_count",
     "triangulated_points",
 ]
@@ -42,6 +43,11 @@ _NEIGHBORS = 10
 _FEATURE_SIZE = 1600
 _MAX_PLY_HEADER = 65536
 _SHOWN = 200  # characters of a reader's own message
+_COMPARED = 20_000  # points of depth maps that photographs are compared by
+_SOME = 100  # photographs, at most, whose depth maps they are drawn from: every map is read once more to be compared
+_CELLS = 20  # cells along the longer side of a photograph, whose nearest point that it shows hides what is behind
+_TRACK_DEPTH = 0.01  # of the depth, by which a point may differ from what its cell shows: more lets thin things through
+_MAP_DEPTH = 0.05  # of the depth, by which a point may differ from a depth map: sensors are wrong by 1 to 3 %
 _PLY_BYTES = {
     **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
     **dict.fromkeys(("int", "uint", "int32", "uint32", "float", "float32"), 4),
@@ -54,6 +60,7 @@ def initial_points(
     seed: int = 0,
     max_points: int = 100_000,
     progress: Callable[[str, int, int], None] | None = None,
+    matches: Matches | None = None,
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """Points to start Gaussians from, by the first way that works.
 
@@ -69,6 +76,7 @@ def initial_points(
         seed: Seed of all random choices.
         max_points: Number of points at most.
         progress: Called with (stage, done, total) while triangulating.
+        matches: Gets the features and matches, if there are any, as `matched_points` goes on with.
     Returns:
         points (P,3) float64, colors (P,3) float32 in [0,1], and where they come from, one line.
     """
@@ -88,7 +96,8 @@ def initial_points(
             return points, colors, f"back-projected from {used} depth maps, holes filled, {len(points)} points"
     tried = ""
     if len(views) >= 2 and all(view.has_image for view in views):
-        triangulated = found_once(views, lambda: _triangulated(views, Matches(), progress))
+        matches = matches or Matches()
+        triangulated = found_once(views, lambda: _triangulated(views, matches, progress))
         points, colors, found = _with_guesses(views, seed, max_points, *triangulated, progress)
         if len(points):
             source = f"triangulated from {len(views)} given poses, {found} points"
@@ -164,6 +173,43 @@ def matched_points(
     """
     points, _, shown = _triangulated(views, matches, progress)
     return points, shown
+
+
+def shared_points(
+    dataset: Dataset | None,
+    views: list[View],
+    seed: int = 0,
+    matches: Matches | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Points that photographs are compared by, and which photographs show them: by projecting alone, a point that
+    something hides would be taken for what hides it.
+
+    By the first way that there is: tracks of the data set, depth maps, features that are matched.
+
+    Args:
+        dataset: The data set, for its tracks; None: nothing but views is read.
+        views: V views of it, still, with images; nothing of others is read.
+        seed: Seed of the pixels that are drawn from depth maps.
+        matches: Matches between these views, as `initial_points` filled them; empty ones are made here, which takes
+            seconds. None: nothing is matched.
+        progress: Callback, as `initial_points` takes it.
+    Returns:
+        Points (P, 3) and (V, P) bool; None where nothing says what hides them.
+    """
+    if dataset is not None and dataset.tracks is not None and dataset.points is not None:
+        tracks = [dataset.tracks.get(view.name, np.empty(0, np.int64)) for view in views]
+        kept = np.unique(np.concatenate(tracks))
+        shown = np.zeros((len(views), len(kept)), bool)
+        for row, track in enumerate(tracks):
+            shown[row, np.searchsorted(kept, track)] = True
+        return _shown_beside(views, dataset.points[kept], shown)
+    if any(view.depth_path is not None for view in views):
+        return _shown_by_depth(views, np.random.default_rng(seed))
+    if matches is None or len(views) < 2:
+        return None
+    points, _, shown = found_once(views, lambda: _triangulated(views, matches, progress))
+    return _shown_beside(views, points, shown)
 
 
 def triangulated_count(
@@ -319,6 +365,51 @@ def _from_depth(views: list[View], limit: int, rng: np.random.Generator) -> tupl
     if not points:
         return np.empty((0, 3)), np.empty((0, 3), dtype=np.float32)
     return np.concatenate(points)[:limit], np.concatenate(colors)[:limit]
+
+
+def _shown_beside(views: list[View], points: np.ndarray, shown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The points, and which views show them: `shown`, and where they are as far away as the nearest point that the view
+    was found to show in their part of the picture. Tracks alone are short: errors add up from one to the next.
+    """
+    found = shown.copy()
+    for row, view in enumerate(views):
+        inside, pixels, depth = _inside(view, points)
+        cells = (pixels * _CELLS / max(view.camera.width, view.camera.height)).astype(int) @ (1, _CELLS)
+        nearest = np.full(_CELLS * _CELLS, np.inf)
+        mine = shown[row, inside]
+        np.minimum.at(nearest, cells[mine], depth[mine])
+        found[row, inside[np.abs(depth / nearest[cells] - 1) < _TRACK_DEPTH]] = True
+    return points, found
+
+
+def _shown_by_depth(views: list[View], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Points of depth maps, an even share a map, and which views show them, by their own depth maps."""
+    points = []
+    some = views[:: -(-len(views) // _SOME)]
+    share = -(-_COMPARED // len(some))
+    for view in some:
+        if (depth := view.depth()) is not None:
+            known = np.flatnonzero(depth)
+            pixels = rng.choice(known, min(share, len(known)), replace=False)
+            points.append(back_project(view.camera, pixels, depth.reshape(-1)[pixels]))
+    found = np.concatenate([np.empty((0, 3)), *points])
+    shown = np.zeros((len(views), len(found)), bool)
+    for row, view in enumerate(views):
+        if (depth := view.depth()) is not None:
+            inside, pixels, own = _inside(view, found)
+            columns, rows = pixels.astype(int).T
+            shown[row, inside] = np.abs(depth[rows, columns] / own - 1) < _MAP_DEPTH
+    return found, shown
+
+
+def _inside(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Indices of the points in a view's picture, their pixels (N, 2) and depths (N,)."""
+    camera = view.shown_camera
+    pixels, depth = camera.project(points)
+    inside = np.flatnonzero(
+        (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+    )
+    return inside, pixels[inside], depth[inside]
 
 
 def _filled(depth: np.ndarray) -> np.ndarray:

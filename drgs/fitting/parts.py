@@ -105,7 +105,10 @@ def with_exposure(
     from drgs.fitting.exposure import exposure_network
 
     network = exposure_network(
-        frames, config.data.exposure == "learned", None if estimate is None else estimate.log_gains
+        frames,
+        config.data.exposure == "learned",
+        None if estimate is None else estimate.log_gains,
+        config.settings.background,
     )
     return dataclasses.replace(parts, networks=[*parts.networks, network], exposure=network.module)
 

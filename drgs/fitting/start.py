@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from drgs.data import initial_points, scene_extent
+from drgs.data import initial_points, scene_extent, shared_points
+from drgs.data.guided import Matches
 from drgs.display.progress import Bar
 from drgs.fitting.going_on import begin_with
 from drgs.fitting.parts import parts_of, with_exposure, with_poses
@@ -124,16 +125,19 @@ def start(
         points = model.tensors["means"].detach()[model.skybox :].numpy()  # places that are compared, no gradient
         extent = scene_extent([frame.camera for frame in frames], points)
         choice = SkyboxChoice("the fit goes on from Gaussians of another one")
-        made, found, evidence = _unknowns(dataset, frames, config, parts_of(config, extent, None), extent, points)
+        compared = _compared(dataset, views, config, None)
+        made = parts_of(config, extent, None)
+        made, found, evidence = _unknowns(dataset, frames, config, made, extent, points, compared)
         return Trainer(config, frames, model, extent, made), beginning.source, found, evidence, choice
     choice = _choose_skybox(frames, config, parts is not None, strict, motion is not None)
     room = max(1, round(SHARE * config.density.max_gaussians)) if choice.reason is None else 0
     # Points that a data set brings along may have seen all its views; ours are made from the training views alone.
     given = config.data.init_points in (("all",) if strict else ("auto", "all")) and dataset.points is not None
+    matches = Matches()
     with Bar("initial points") as bar:
         seen = views if motion is None else first_time(views)
         points, colors, source = initial_points(
-            dataset if given else seen, config.seed, config.density.max_gaussians - reserved - room, bar.stage
+            dataset if given else seen, config.seed, config.density.max_gaussians - reserved - room, bar.stage, matches
         )
         bar.note(f"initial points: {source}")
     extent = scene_extent([frame.camera for frame in frames], points)
@@ -176,9 +180,26 @@ def start(
         _log.info("skybox: %d Gaussians, %.4g and more away", len(skybox), RADIUS * extent)
     found = evidence = None
     if parts is None:
-        by, shown = (points, None) if compared is None else compared
-        made, found, evidence = _unknowns(dataset, frames, config, made, extent, by, shown, strict)
+        if motion is None and not strict:
+            compared = _compared(dataset, views, config, None if given else matches)
+        made, found, evidence = _unknowns(dataset, frames, config, made, extent, points, compared, strict)
     return Trainer(config, frames, model, extent, made, motion), source, found, evidence, choice
+
+
+def _compared(
+    dataset: Dataset, views: list[View], config: FitConfig, matches: Matches | None
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Points by which the exposure of photographs is compared, and which show them, as `shared_points` says.
+
+    Args:
+        dataset, views, config: Arguments of `start`.
+        matches: The matches of these views; None where nothing was matched: it is done only if the fit asks for
+            exposure.
+    """
+    if matches is None and config.data.exposure != "off":
+        matches = Matches()
+    with Bar("points that photographs share") as bar:
+        return shared_points(dataset, views, config.seed, matches, bar.stage)
 
 
 def _unknowns(
@@ -188,7 +209,7 @@ def _unknowns(
     made: Parts,
     extent: float,
     points: np.ndarray,
-    shown: np.ndarray | None = None,
+    compared: tuple[np.ndarray, np.ndarray | None] | None = None,
     strict: bool = False,
 ) -> tuple[Parts, ExposureEstimate | None, PoseEvidence | None]:
     """Parts with what is unknown of photographs, exposure and poses, where that is asked for or clear; and what is
@@ -197,15 +218,23 @@ def _unknowns(
     Args:
         dataset, frames, config, extent, strict: Arguments of `start`, and the extent of the scene.
         made: Parts without.
-        points: Points (P, 3) by which photographs are compared.
-        shown: (V, P) bool, which photograph shows which point; None where all may.
+        points: Initial points (P, 3).
+        compared: Points (P, 3) by which photographs are compared, and (V, P) bool, which photograph shows which; None
+            for the initial points, each of which all may show.
     """
     found = evidence = None
+    if config.data.exposure == "off" and compared is not None:
+        from drgs.fitting.exposure import estimate_exposure
+
+        with Bar("exposure") as bar:
+            if said := estimate_exposure(frames, compared[0], config.seed, compared[1]).warning():
+                bar.note(said)
     if config.data.exposure != "off":
         from drgs.fitting.exposure import estimate_exposure
 
         with Bar("exposure") as bar:
-            found = estimate_exposure(frames, points, config.seed, shown)
+            by, shown = compared or (points, None)
+            found = estimate_exposure(frames, by, config.seed, shown)
             is_on = config.data.exposure != "auto" or found.is_clear
             said = "each has its own" if is_on else "off, all have the same"
             now = " for now" if strict and config.data.exposure == "auto" else ""
