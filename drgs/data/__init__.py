@@ -16,12 +16,10 @@ from drgs.data.formats import Format
 from drgs.data.guesses import scene_extent
 from drgs.data.held_out import apply_held_out
 from drgs.data.llff import POSES_BOUNDS
-from drgs.data.masks import note_partial_masks
 from drgs.data.multicamera import frame_folders
 from drgs.data.points import (
     added_points,
     initial_points,
-    matched_points,
     shared_points,
     triangulated_count,
     triangulated_points,
@@ -30,7 +28,7 @@ from drgs.data.replica import POSES
 from drgs.data.semantics import Semantics
 from drgs.data.sidecars import attach
 from drgs.data.videos import list_videos
-from drgs.data.view_checks import check_times, count_once
+from drgs.data.view_checks import check_times, count_once, note_partial_masks
 from drgs.data.views import View
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.registry import Registry
@@ -43,7 +41,6 @@ __all__ = [
     "View",
     "added_points",
     "initial_points",
-    "matched_points",
     "load",
     "scene_extent",
     "shared_points",

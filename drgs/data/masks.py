@@ -7,19 +7,14 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drgs.data.checks import IMAGE_SUFFIXES, image_size, read_image, unit_range
-from drgs.data.image_headers import png_has_alpha
 from drgs.data.resizing import nearest_resized
 from drgs.guards.foreign import is_file
 
-if TYPE_CHECKING:
-    from drgs.data.views import View
-
-__all__ = ["ALPHA_MASKS", "feature_mask", "mask_file", "masked_photo", "masks_of", "note_partial_masks", "read_mask"]
+__all__ = ["ALPHA_MASKS", "feature_mask", "mask_file", "masked_photo", "masks_of", "read_mask"]
 
 ALPHA_MASKS = "alpha"  # in place of a folder: the photographs' own alpha channel
 _KEPT = 0.5  # weight from which on a pixel may hold a feature
@@ -48,24 +43,6 @@ def read_mask(path: Path) -> np.ndarray:
         return (raw >= _KEPT * np.iinfo(raw.dtype).max).astype(np.float32)
     # Masks stored as 0 and 1 in 8 bits would otherwise be nearly black.
     return raw.astype(np.float32) if raw.max() <= 1 else unit_range(raw, path)
-
-
-def note_partial_masks(views: list[View], lazy: bool) -> None:
-    """Set `View.empty_outside` to False where some views alone are cut out, by a mask file or an alpha channel.
-
-    The others show what is outside: it is not empty.
-
-    Args:
-        views: Of one data set.
-        lazy: Open no image: alpha channels are not looked for.
-    """
-    is_cut_out = [
-        view.mask_path is not None or (not lazy and view.image_path is not None and png_has_alpha(view.image_path))
-        for view in views
-    ]
-    if any(is_cut_out) and not all(is_cut_out):
-        for view, cut_out in zip(views, is_cut_out, strict=True):
-            view.empty_outside = not cut_out
 
 
 def masks_of(photos: list[Path], masks: str | os.PathLike) -> list[Path]:

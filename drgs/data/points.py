@@ -29,7 +29,6 @@ from drgs.guards.ply_headers import ply_source
 __all__ = [
     "added_points",
     "initial_points",
-    "matched_points",
     "read_point_ply",
     "shared_points",
     "triangulated_count",
@@ -76,7 +75,7 @@ def initial_points(
         seed: Seed of all random choices.
         max_points: Number of points at most.
         progress: Called with (stage, done, total) while triangulating.
-        matches: Gets the features and matches, if there are any, as `matched_points` goes on with.
+        matches: Gets the features and matches, if there are any, which `shared_points` goes on with.
     Returns:
         points (P,3) float64, colors (P,3) float32 in [0,1], and where they come from, one line.
     """
@@ -163,16 +162,6 @@ def _with_guesses(
     room = None if hull is None else hull.points(guesses, rng, progress)
     more, more_colors = room or points_beside(views, points, shown, guesses, rng)
     return np.concatenate([points[keep], more]), np.concatenate([colors[keep], more_colors]), found
-
-
-def matched_points(
-    views: list[View], matches: Matches, progress: Callable[[str, int, int], None] | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """(P, 3) points that two or more of V views show, as far as they are triangulated, and (V, P) bool of which show
-    which; arguments as of `triangulated_points`.
-    """
-    points, _, shown = _triangulated(views, matches, progress)
-    return points, shown
 
 
 def shared_points(

@@ -13,13 +13,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.data.checks import read_image, unit_range
+from drgs.data.image_headers import png_has_alpha
 from drgs.data.resizing import resize_area
 
 if TYPE_CHECKING:
     from drgs.data.dataset import Dataset
     from drgs.data.views import View
 
-__all__ = ["check_cameras", "check_parallax", "check_times", "count_once", "go_on_without", "make_unique"]
+__all__ = [
+    "check_cameras",
+    "check_parallax",
+    "check_times",
+    "count_once",
+    "go_on_without",
+    "make_unique",
+    "note_partial_masks",
+]
 
 # of cameras that film what moves (docs/dynamic-data.md, Layouts)
 _FEW_PLACES = 4
@@ -252,3 +261,21 @@ def _look_alike(one: Path, other: Path) -> bool:
     gray = [picture[..., :3].mean(axis=-1) if picture.ndim == 3 else picture for picture in pictures]
     small = [resize_area(picture, _THUMBNAIL, _THUMBNAIL) for picture in gray]
     return bool(np.abs(small[0] - small[1]).max() <= _ALIKE)
+
+
+def note_partial_masks(views: list[View], lazy: bool) -> None:
+    """Set `View.empty_outside` to False where some views alone are cut out, by a mask file or an alpha channel.
+
+    The others show what is outside: it is not empty.
+
+    Args:
+        views: Of one data set.
+        lazy: Open no image: alpha channels are not looked for.
+    """
+    is_cut_out = [
+        view.mask_path is not None or (not lazy and view.image_path is not None and png_has_alpha(view.image_path))
+        for view in views
+    ]
+    if any(is_cut_out) and not all(is_cut_out):
+        for view, cut_out in zip(views, is_cut_out, strict=True):
+            view.empty_outside = not cut_out
