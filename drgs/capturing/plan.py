@@ -22,7 +22,7 @@ import numpy as np
 
 from drgs.capturing.pace import FEWEST_STEPS
 from drgs.data.checks import image_size, read_image
-from drgs.data.matching import extract, match, quiet
+from drgs.data.matching import extract, match, quiet, start_extraction
 from drgs.data.pairing import MAX_EXHAUSTIVE
 from drgs.data.videos import VideoFrame, read_video
 from drgs.display.progress import Bar
@@ -199,6 +199,7 @@ def _timed_pair(images: Sequence[np.ndarray]) -> tuple[float, float]:
         names = [f"{number}.png" for number in range(len(images))]
         for name, image in zip(names, images, strict=True):
             _write_small(image, made / name)
+        start_extraction()
         began = time.perf_counter()
         with quiet():
             extract(database, made, names, camera_model="SIMPLE_RADIAL", shared_camera=False, wide_baseline=True)

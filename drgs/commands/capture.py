@@ -141,7 +141,7 @@ def _times(gain: float) -> str:
 
 def _dataset_of(paths: tuple[Path, ...]) -> Dataset | None:
     """The data set, with poses, that a single path names; None where it names photographs or videos."""
-    if len(paths) != 1 or not paths[0].exists() or (paths[0].is_file() and paths[0].suffix not in (".json", ".npy")):
+    if len(paths) != 1 or not (paths[0].is_dir() or (paths[0].is_file() and paths[0].suffix in (".json", ".npy"))):
         return None
     try:
         return data.load(paths[0], lazy=True, points=False, semantics=False)

@@ -9,7 +9,7 @@ from typing import Any
 from drgs.data.colmap_bindings import pycolmap
 from drgs.data.reader_process import serve
 
-__all__ = ["extract_features"]
+__all__ = ["extract_features", "ready"]
 
 _MASKED_CONTRAST = 0.002  # a third of COLMAP's: an object alone has few features, and weak ones match as well
 # of which COLMAP's own handlers print a stack on stderr
@@ -57,8 +57,13 @@ def extract_features(path: Path, names: list[str], options: dict[str, Any], tell
         return max(found.camera_id for found in handle.read_all_cameras())
 
 
+def ready(path: Path, tell: Any) -> bool:
+    """That the process has started."""
+    return True
+
+
 if __name__ == "__main__":
     pycolmap.logging.minloglevel = 3  # errors included: they arrive as exceptions
     for crash in _CRASHES:
         signal.signal(crash, signal.SIG_DFL)
-    serve({"extract_features": extract_features})
+    serve({"extract_features": extract_features, "ready": ready})

@@ -18,7 +18,7 @@ from drgs.guards.unfinished import temporary_folder
 from drgs.guards.writing import check_room
 from drgs.runtime import thread_count
 
-__all__ = ["extract", "match", "nearby_pairs", "quiet", "sequential_pairs", "state_focal_lengths"]
+__all__ = ["extract", "match", "nearby_pairs", "quiet", "sequential_pairs", "start_extraction", "state_focal_lengths"]
 
 Progress = Callable[[str, int, int], None]
 _PAIRS_A_STEP = 16  # a thread: all of them are busy, and progress is seen
@@ -98,6 +98,11 @@ def extract(
         camera = _extractor.ask("extract_features", Path(shown), some, options)
     if progress:
         progress("features", len(names), len(names))
+
+
+def start_extraction() -> None:
+    """Start the process that `extract` asks, so that the time of its first call is that of features alone."""
+    _extractor.ask("ready", Path())
 
 
 def state_focal_lengths(database: Path, folder: Path) -> None:
