@@ -12,7 +12,7 @@ from PIL import Image
 
 from drgs.data import decoding
 from drgs.data.checks import read_image
-from drgs.data.hdr import hdr_transfer
+from drgs.data.hdr import HdrReader, hdr_transfer
 from drgs.data.heif import heif_as_jpeg
 from drgs.data.videos import VideoFrame
 
@@ -94,7 +94,7 @@ def test_without_pyav_it_is_said(tmp_path, monkeypatch, caplog, kind, suffix):
     """By the header of the file."""
     path = write_hdr(tmp_path / f"a.{suffix}", kind)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    assert hdr_transfer(path, suffix != "mkv") == kind
+    assert hdr_transfer(path, suffix != "mkv") == TRC[kind]
     decoding._Reader(path, [], 4, suffix != "mkv")
     assert caplog.messages == [
         f"{path}: is HDR video ({kind}), whose colors come out wrong without the package av; pip install "
@@ -115,8 +115,8 @@ def test_headers_that_say_nothing(tmp_path, monkeypatch):
         b"\xff" * 30,
     ):
         path.write_bytes(data)
-        assert hdr_transfer(path, True) == ""
-        assert hdr_transfer(path, False) == ""
+        assert hdr_transfer(path, True) == 0
+        assert hdr_transfer(path, False) == 0
 
 
 def test_a_video_that_is_turned(tmp_path):
@@ -148,3 +148,22 @@ def test_photographs(tmp_path, kind):
     with Image.open(io.BytesIO(heif_as_jpeg(path, 98))) as shown:
         assert shown.getexif()[0x010F] == "a maker"
         np.testing.assert_allclose(patches_of(np.asarray(shown)), PATCHES, atol=12 / 255)
+
+
+def test_a_frame_that_cannot_be_decoded(tmp_path):
+    """There is none, which `VideoFrame` says in a line; those that are whole are read."""
+    path = write_hdr(tmp_path / "a.mp4", "HLG", frames=6)
+    data = bytearray(path.read_bytes())
+    with av.open(str(path)) as container:
+        packets = [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
+    for at, size in packets[3:]:  # each unit keeps its length, which comes before it
+        end = at + size
+        while at < end:
+            length = int.from_bytes(data[at : at + 4], "big")
+            data[at + 4 : at + 4 + length] = b"\xff" * length
+            at += 4 + length
+    path.write_bytes(data)
+    reader = HdrReader(path, TRC["HLG"], [])
+    np.testing.assert_allclose(patches_of(reader.frame(0)), PATCHES, atol=2.5 / 255)
+    assert reader.frame(5) is None
+    assert reader.frame(1).shape == (PATCH, PATCH * len(PATCHES), 3)

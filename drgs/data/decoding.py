@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from drgs.data.checks import native_stderr
-from drgs.data.hdr import HdrReader, hdr_transfer
+from drgs.data.hdr import HDR, HdrReader, hdr_transfer
 from drgs.data.reader_process import serve
 from drgs.guards import memory
 
@@ -194,13 +194,13 @@ class _Reader:
         self._hdr: HdrReader | None = None
         transfer = hdr_transfer(path, is_mp4)
         if transfer and importlib.util.find_spec("av") is not None:
-            self._hdr = HdrReader(path, stamps)
+            self._hdr = HdrReader(path, transfer, stamps)
         elif transfer:
             _log.warning(
                 "%s: is HDR video (%s), whose colors come out wrong without the package av; pip install 'drgs[video]', "
                 "or convert it to SDR",
                 path,
-                transfer,
+                HDR[transfer],
             )
 
     def frame(self, index: int, is_gray: bool = False) -> np.ndarray:

@@ -18,9 +18,11 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["HdrReader", "hdr_transfer", "in_srgb", "is_hdr"]
+__all__ = ["HDR", "HdrReader", "hdr_transfer", "in_srgb"]
 
-_NAMES = {16: "PQ", 18: "HLG"}  # by the number of the transfer characteristics, ITU-T H.273
+HDR = {16: "PQ", 18: "HLG"}
+"""Names of the transfer characteristics that are converted, by their numbers in ITU-T H.273."""
+
 _HLG_WHITE = 0.75
 _PQ_WHITE = 203.0  # cd/m2
 _PQ_PEAK = 10_000.0  # cd/m2
@@ -34,8 +36,8 @@ _TO_SRGB = np.array(
 )  # fmt: skip
 
 
-def hdr_transfer(path: Path, is_mp4: bool) -> str:
-    """`HLG`, `PQ`, or nothing for other videos, as the decoder says, or, without PyAV, the header of the file.
+def hdr_transfer(path: Path, is_mp4: bool) -> int:
+    """Number in `HDR` of a video, as the decoder says, or, without PyAV, the header of the file; 0 for other videos.
 
     Args:
         path: An mp4, a Matroska, a WebM or an AVI file.
@@ -45,12 +47,14 @@ def hdr_transfer(path: Path, is_mp4: bool) -> str:
         import av
 
         with contextlib.suppress(av.error.FFmpegError), av.open(str(path.resolve())) as container:
-            return _NAMES.get(container.streams.video[0].codec_context.color_trc, "")
+            found = [stream.codec_context.color_trc for stream in container.streams.video[:1]]
+            return found[0] if found and found[0] in HDR else 0
     with path.open("rb") as file:
         data = _movie_header(file) if is_mp4 else file.read(_MATROSKA)
     pattern = rb"colrncl[cx]..(..)" if is_mp4 else rb"\x55\xba\x81(.)"  # of the first track that says so
     found = re.search(pattern, data, re.DOTALL)
-    return _NAMES.get(int.from_bytes(found[1], "big"), "") if found else ""
+    transfer = int.from_bytes(found[1], "big") if found else 0
+    return transfer if transfer in HDR else 0
 
 
 def _movie_header(file: Any) -> bytes:
@@ -72,14 +76,16 @@ class HdrReader:
 
     Args:
         path: The video.
+        transfer: As `hdr_transfer` says.
         stamps: Milliseconds at which each frame is shown; empty where the file does not say.
     Raises:
         OSError, ValueError: PyAV cannot open it.
     """
 
-    def __init__(self, path: Path, stamps: Sequence[float]) -> None:
+    def __init__(self, path: Path, transfer: int, stamps: Sequence[float]) -> None:
         import av
 
+        self._transfer = transfer
         self._stamps = stamps
         self._container = av.open(str(path.resolve()))
         self._stream = self._container.streams.video[0]
@@ -94,10 +100,21 @@ class HdrReader:
             index: Number of the frame as it is shown, from 0.
             is_gray: Its coded luma (H, W) instead.
         """
-        found = self._decoded(index)
+        import av
+
+        try:
+            found = self._decoded(index)
+        except av.error.FFmpegError:
+            found = None
         if found is None:
             return None
-        shown = found.to_ndarray(format="gray") if is_gray else _frame_in_srgb(found)
+        # FFmpeg 8 would convert tones, too, of a frame that says which it has; before, PyAV does not tell.
+        with contextlib.suppress(AttributeError):
+            found.color_trc = found.color_primaries = 1
+        if is_gray:
+            shown = found.to_ndarray(format="gray")
+        else:
+            shown = in_srgb(found.to_ndarray(format="rgb48le"), self._transfer)
         return np.ascontiguousarray(np.rot90(shown, round(found.rotation / 90)))
 
     def _decoded(self, index: int) -> Any:
@@ -135,17 +152,12 @@ class HdrReader:
         return None
 
 
-def is_hdr(transfer: int | None) -> bool:
-    """Whether a number of transfer characteristics, by ITU-T H.273, is that of HLG or PQ."""
-    return transfer in _NAMES
-
-
 def in_srgb(signal: np.ndarray, transfer: int) -> np.ndarray:
     """(H, W, 3) uint8 of an HLG or PQ picture of BT.2020.
 
     Args:
         signal: (H, W, 3) uint16, RGB as it is coded, of 65535.
-        transfer: 16 of PQ, 18 of HLG.
+        transfer: Its number in `HDR`.
     """
     import cv2
 
@@ -153,19 +165,11 @@ def in_srgb(signal: np.ndarray, transfer: int) -> np.ndarray:
     return _encoding()[(65535 * light + 0.5).astype(np.uint16)]
 
 
-def _frame_in_srgb(frame: Any) -> np.ndarray:
-    """(H, W, 3) uint8 of a frame that PyAV has decoded."""
-    transfer = frame.color_trc
-    # FFmpeg would convert tones, too, of a frame that still says which it has.
-    frame.color_trc = frame.color_primaries = 1
-    return in_srgb(frame.to_ndarray(format="rgb48le"), transfer)
-
-
 @functools.cache
 def _linear(transfer: int) -> np.ndarray:
     """(65536,) float32: light of each number of 16 bits in a signal, 1 is reference white."""
     signal = np.linspace(0, 1, 1 << 16)
-    if _NAMES.get(transfer) == "PQ":
+    if HDR[transfer] == "PQ":
         power = signal ** (1 / 78.84375)
         found = (np.maximum(power - 0.8359375, 0) / (18.8515625 - 18.6875 * power)) ** (1 / 0.1593017578125)
         return (_PQ_PEAK / _PQ_WHITE * found).astype(np.float32)

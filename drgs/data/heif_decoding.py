@@ -16,7 +16,7 @@ import numpy as np
 import pillow_heif
 from PIL import Image, ImageOps, UnidentifiedImageError
 
-from drgs.data.hdr import in_srgb, is_hdr
+from drgs.data.hdr import HDR, in_srgb
 from drgs.data.reader_process import serve
 from drgs.guards import memory
 
@@ -83,7 +83,7 @@ def _shown(path: Path) -> Image.Image:
     if shown.mode not in ("L", "RGB", "RGBA"):
         shown = shown.convert("RGBA" if shown.has_transparency_data else "RGB")
     transfer = (shown.info.get("nclx_profile") or {}).get("transfer_characteristics")  # Pillow tells none of AVIF
-    if is_hdr(transfer):
+    if transfer in HDR:
         converted = Image.fromarray(in_srgb(257 * np.asarray(shown.convert("RGB"), np.uint16), transfer))
         converted.info = shown.info
         return converted
