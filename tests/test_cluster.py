@@ -648,18 +648,25 @@ def _sees_nothing(token: str) -> bool:
 
 @pytest.mark.slow
 def test_workers_end_with_their_client():
-    """However it ends: by itself, by Ctrl-C in the middle of a task, or killed. Dask says nothing of its own."""
+    """However it ends: by itself, while a worker that has died is started anew, by Ctrl-C in the middle of a task, or
+    killed. Dask says nothing of its own.
+    """
     script = (
         "import os, sys, time\n"
         "from drgs.cluster.connect import opened\n"
         "if __name__ == '__main__':\n"
         "    with opened(workers=1) as c:\n"
         "        print(*c.client.run(os.getpid).values(), flush=True)\n"
+        "        if sys.argv[1] == 'ends anew':\n"
+        "            (nanny,) = c._local.workers.values()\n"
+        "            os.kill(nanny.pid, 9)\n"
+        "            while nanny.pid or nanny.process.status.name != 'starting':\n"
+        "                pass\n"
         "        if sys.argv[1] == 'busy':\n"
         "            c.result(c.submit(time.sleep, 60), 'a nap')\n"
         "        time.sleep(60 if sys.argv[1] == 'idle' else 0)\n"
     )
-    for how, number in (("busy", signal.SIGINT), ("idle", signal.SIGKILL), ("ends", None)):
+    for how, number in (("busy", signal.SIGINT), ("idle", signal.SIGKILL), ("ends", None), ("ends anew", None)):
         command = [sys.executable, "-c", script, how]
         environ = {**os.environ, "PYTHONPATH": str(ROOT)}
         process = subprocess.Popen(
@@ -676,5 +683,5 @@ def test_workers_end_with_their_client():
             time.sleep(0.1)
         assert not _runs(pid), how
         assert "distributed" not in said or how == "busy", said  # the traceback of the interrupt names where it was
-        if how == "ends":
+        if how.startswith("ends"):
             assert said == ""

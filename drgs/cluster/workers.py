@@ -48,6 +48,7 @@ WORKER_SECONDS = 60.0
 """Time that a cluster may be without any worker."""
 
 _LOOK = 2.0  # seconds between two looks at the scheduler while nothing comes
+_SPAWNED = 5.0  # seconds within which a process that is being started has a number
 _AHEAD = 2  # views on their way for each worker: one that it computes, and the next one
 _TRIES = 20  # how often a worker may say that it misses something
 _log = logging.getLogger(__name__)
@@ -244,9 +245,14 @@ class Cluster:
         if self._local is not None:
             from distributed.core import Status
 
-            for nanny in list(self._local.workers.values()):
-                pid = nanny.pid
+            nannies = list(self._local.workers.values())
+            for nanny in nannies:
                 nanny.status = Status.closing_gracefully  # else it would start another one
+            until = time.monotonic() + _SPAWNED
+            for nanny in nannies:
+                # One whose worker has died may be starting the next one, which has no number yet.
+                while not (pid := nanny.pid) and nanny.status != Status.closed and time.monotonic() < until:
+                    time.sleep(0.01)
                 if pid:
                     with contextlib.suppress(OSError):
                         os.kill(pid, signal.SIGKILL)
