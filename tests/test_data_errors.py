@@ -589,6 +589,19 @@ def test_absolute_names_of_another_machine(tmp_path, prefix):
     assert train[0].mask().all()
 
 
+@pytest.mark.parametrize("prefix", ["/home/x/images/", "..\\images\\", "D:\\x\\"])
+def test_names_of_another_machine_in_colmap(tmp_path, prefix):
+    """As RealityCapture and others write them; what is in no folder of the data set is refused as before."""
+    images = text_model(tmp_path) / "images.txt"
+    images.write_text(images.read_text().replace(" im", f" {prefix}im"))
+    assert [view.name for view in load(tmp_path).views] == ["im0", "im1", "im2", "im3"]
+    images.write_text(images.read_text().replace(f"{prefix}im", "/etc/im"))
+    for file in (tmp_path / "images").iterdir():
+        file.rename(tmp_path / file.name.replace("im", "x"))
+    with pytest.raises(ValueError, match=r"image 0 must name a file in .*images, got '/etc/im0.png'"):
+        load(tmp_path)
+
+
 def test_what_can_be_read_beside_is_named(tmp_path):
     """Names of another machine, of files that are not here, and a COLMAP model: the command that takes it."""
     write_colmap(tmp_path)

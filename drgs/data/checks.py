@@ -13,7 +13,7 @@ import shutil
 import tempfile
 import unicodedata
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO
 
@@ -23,7 +23,7 @@ from drgs.data.heif import HEIF_SUFFIXES, heif_size, is_heif, read_heif
 from drgs.data.image_headers import can_hold, is_whole, stated_size
 from drgs.guards import memory
 from drgs.guards.camera_checks import check_distance
-from drgs.guards.foreign import refuse_foreign
+from drgs.guards.foreign import is_file, refuse_foreign
 
 __all__ = [
     "IMAGE_SUFFIXES",
@@ -33,6 +33,7 @@ __all__ = [
     "file_inside",
     "inverse_pose",
     "list_images",
+    "names_of_here",
     "native_stderr",
     "read_image",
     "read_npy",
@@ -84,6 +85,42 @@ def file_inside(folder: Path, name: str, where: str) -> Path:
             f"{where} must name a file in {folder}, got {name[:80]!r}; move or link the file there and name it so"
         )
     return folder / name
+
+
+def names_of_here(
+    where: str, folder: Path, names: list[str], is_there: Callable[[Path], bool] = is_file
+) -> Callable[[str], str] | None:
+    """What makes names of files of another machine, or of Windows, relative to a folder of this one.
+
+    Of absolute names the beginning is dropped without which the first one that can be found is a file of the folder;
+    names that begin otherwise stay, for `file_inside` to refuse.
+
+    Args:
+        where: File that has the names, for the message.
+        folder: Folder that they shall be relative to.
+        names: Names of files that must be there.
+        is_there: Whether there is a file of such a path.
+    Returns:
+        A function of a name; None where names need not change.
+    """
+    is_windows = any("\\" in name and not is_there(folder / name) for name in names)
+    slashed = [name.replace("\\", "/") if is_windows else name for name in names]
+    prefix = next((found for name in slashed if (found := _foreign_prefix(folder, name, is_there))), "")
+    if prefix:
+        _log.warning("%s: names files in %s, which are taken from %s", where, prefix, folder)
+    if not prefix and not is_windows:
+        return None
+    return lambda name: (name.replace("\\", "/") if is_windows else name).removeprefix(prefix)
+
+
+def _foreign_prefix(folder: Path, name: str, is_there: Callable[[Path], bool]) -> str:
+    """How a name that leads out of a folder begins, if its end names a file in the folder; else empty."""
+    is_inside = Path(os.path.abspath(folder / name)).is_relative_to(os.path.abspath(folder))
+    if is_inside and not re.match("[A-Za-z]:/", name):
+        return ""
+    places = [match.end() for match in re.finditer("/", name)]
+    ends = (name[at:] for at in places if ".." not in name[at:].split("/"))
+    return next((name[: -len(end)] for end in ends if end and is_there(folder / end)), "")
 
 
 def read_text(path: Path, what: str, largest: int) -> str:

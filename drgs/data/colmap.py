@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera, intrinsics
-from drgs.data.checks import file_inside
+from drgs.data.checks import file_inside, names_of_here
 from drgs.data.colmap_files import MODEL_FILES, MODEL_FOLDERS, find_model, image_folder, model_suffix, point_ply
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
@@ -80,12 +81,16 @@ def load_colmap(
     registered = sorted(reconstruction.reg_image_ids(), key=lambda image_id: reconstruction.images[image_id].name)
     if not registered:
         raise ValueError(f"{model}: must hold at least one registered image, got none; run `drgs sfm` again")
-    folder = image_folder(path, model, [reconstruction.images[image_id].name for image_id in registered])
+    names = [reconstruction.images[image_id].name for image_id in registered]
+    folder = image_folder(path, model, names)
+    of_here = names_of_here(str(model), folder, names)
     for index, image_id in enumerate(registered):
         image = reconstruction.images[image_id]
-        file = file_inside(folder, image.name, f"{model}: image {index}")
-        where = f"{model}: image {index} ({image.name})"
-        view = View(None, str(Path(image.name).with_suffix("")), image_path=file)
+        name = of_here(image.name) if of_here else image.name
+        file = file_inside(folder, name, f"{model}: image {index}")
+        name = os.path.relpath(file, folder)  # without ..
+        where = f"{model}: image {index} ({name})"
+        view = View(None, str(Path(name).with_suffix("")), image_path=file)
         listed.append(view)
         by_id[image_id] = view
         if not is_file(view.image_path):
@@ -93,7 +98,7 @@ def load_colmap(
             continue
         camera = model_camera(reconstruction, image, where)
         view.camera = fit_to_image(camera, view.image_path, where, lazy)
-        view.mask_path = mask_file((path if folder == path else folder.parent) / "masks", image.name)
+        view.mask_path = mask_file((path if folder == path else folder.parent) / "masks", name)
         view.background = background
         view.is_checked = not lazy
         views.append(view)

@@ -4,17 +4,22 @@
 
 from __future__ import annotations
 
-import logging
 import math
-import os
-import re
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
 from drgs.cameras import Camera, c2w_from_opengl, intrinsics
-from drgs.data.checks import IMAGE_SUFFIXES, check_last_row, file_inside, image_size, inverse_pose, repaired_pose
+from drgs.data.checks import (
+    IMAGE_SUFFIXES,
+    check_last_row,
+    file_inside,
+    image_size,
+    inverse_pose,
+    names_of_here,
+    repaired_pose,
+)
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
 from drgs.data.points import read_point_ply
@@ -42,7 +47,6 @@ _DEPTHS = ("depth_file_path", "depth_path")  # nerfstudio's key, and NeRFCapture
 _FILE_KEYS = ("file_path", "mask_path", *_DEPTHS)
 _MILLIMETER = 1e-3
 _DEPTH_SCALE_MAX = 1e9
-_log = logging.getLogger(__name__)
 
 
 def _files(path: Path) -> list[Path]:
@@ -176,39 +180,20 @@ def _frames(file: Path) -> dict:
 
 
 def _with_names_of_here(file: Path, data: dict) -> dict:
-    """The same with names of files of another machine or of Windows made relative to the file's folder.
-
-    Of absolute names the beginning is dropped without which the first one that can be found is a file of this folder;
-    names that begin otherwise stay, and are refused.
-    """
-    names = [frame["file_path"] for frame in data["frames"]]
-    is_windows = any("\\" in name and not is_file(file.parent / name) for name in names)
-    slashed = [name.replace("\\", "/") if is_windows else name for name in names]
-    prefix = next((found for name in slashed if (found := _foreign_prefix(file.parent, name))), "")
-    if not prefix and not is_windows:
+    """The same with names of files of another machine or of Windows made relative to the file's folder."""
+    listed = [frame["file_path"] for frame in data["frames"]]
+    of_here = names_of_here(str(file), file.parent, listed, lambda path: _image_file(path) is not None)
+    if of_here is None:
         return data
-    if prefix:
-        _log.warning("%s: names files in %s, which are taken from %s", file, prefix, file.parent)
 
-    def of_here(value: Any) -> Any:
+    def renamed(value: Any) -> Any:
         if isinstance(value, list):
-            return [of_here(item) for item in value]
-        if not isinstance(value, str):
-            return value
-        return (value.replace("\\", "/") if is_windows else value).removeprefix(prefix)
+            return [renamed(item) for item in value]
+        return of_here(value) if isinstance(value, str) else value
 
-    frames = [frame | {key: of_here(frame[key]) for key in _FILE_KEYS if key in frame} for frame in data["frames"]]
-    lists = ("ply_file_path", *(f"{split}_filenames" for split in _SPLITS))
-    return data | {key: of_here(data[key]) for key in lists if key in data} | {"frames": frames}
-
-
-def _foreign_prefix(folder: Path, name: str) -> str:
-    """How an absolute name begins whose end names an image in a folder; empty if it is none, or there is no such."""
-    if not re.match(r"/|[A-Za-z]:/", name) or Path(os.path.abspath(name)).is_relative_to(os.path.abspath(folder)):
-        return ""
-    places = [match.end() for match in re.finditer("/", name)]
-    ends = (name[at:] for at in places if ".." not in name[at:].split("/"))
-    return next((name[: -len(end)] for end in ends if end and _image_file(folder / end)), "")
+    frames = [frame | {key: renamed(frame[key]) for key in _FILE_KEYS if key in frame} for frame in data["frames"]]
+    others = ("ply_file_path", *(f"{split}_filenames" for split in _SPLITS))
+    return data | {key: renamed(data[key]) for key in others if key in data} | {"frames": frames}
 
 
 def _splits(file: Path, data: dict) -> list[str]:
