@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -497,7 +496,8 @@ def test_a_photograph_counts_once(tmp_path, caplog, twin, lazy):
     save(tmp_path, data)
     dataset = load(tmp_path, test_every=2, lazy=lazy)
     assert [view.name for view in dataset.views] == ["0", "1", "2", "3", "4"]
-    assert f"1 of the 6 photographs are listed again ({Path(name).stem if 'z' in name else '2_2'} is 2)" in caplog.text
+    again = "z" if "z" in name else "2_2"
+    assert f"1 of the 6 photographs are listed again ({again} is the same as 2)" in caplog.text
 
 
 def test_a_photograph_of_two_splits_is_held_out(tmp_path):

@@ -199,7 +199,7 @@ def count_once(dataset: Dataset) -> None:
             listed[first].split = min((splits[first], *named), key=order.index)
         if any(view.split not in ("val", "test") for view in kept):
             break
-    shown = [f"{listed[index].name} is {listed[first].name}" for index, first in copies.items()][:_SHOWN]
+    shown = [f"{listed[index].name} is the same as {listed[first].name}" for index, first in copies.items()][:_SHOWN]
     _log.warning(
         "%s: %d of the %d photographs are listed again (%s); each one counts once, in one split",
         dataset.path,
