@@ -276,3 +276,19 @@ def test_information_of_discs(name):
         assert float(thin.norm()) > 0, group
         assert float((flat - thin).norm() / thin.norm()) < 1e-5, group
     assert found[1]["log_scales"][0, 2] == 0
+
+
+@pytest.mark.parametrize("name", ["exact", "exact on bvh", "integral", "integral on bvh", "gsplat"])
+def test_log_scales_far_below(name):
+    """The logarithm of a scale may be any number: with one of 0 in float64 a Gaussian is a disc, and is seen."""
+    _, quats, means, seen = _discs(1.0)
+    found = []
+    for low in (-46.0, -1e30):
+        log_scales = torch.tensor([[-1.2, -1.6, low], [low, -1.2, -0.9], [-1.6, low, -1.2]], requires_grad=True)
+        g = Gaussians(means, quats, log_scales, torch.tensor([1.4, 0.4, 0.8]), torch.zeros(3, 1, 3))
+        image = render(g, seen, _DISCS[name])
+        (slope,) = torch.autograd.grad(image.alpha.sum(), log_scales)
+        found.append((image.alpha.detach(), slope, fisher.diagonal(g.detach(), seen, _DISCS[name])["log_scales"]))
+    for x, y in zip(*found, strict=True):
+        assert float(x.abs().max()) > 0.1
+        torch.testing.assert_close(y, x, rtol=1e-5, atol=1e-6)

@@ -6,6 +6,7 @@ Everything about Gaussians is per-Gaussian work, done once a view in float64 and
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any, NamedTuple, Protocol
 
 import drjit as dr
@@ -17,6 +18,8 @@ from drgs.tracing.harmonics import sh_basis, sh_color
 from drgs.tracing.records import dot
 
 __all__ = ["Activated", "Lens", "Patch", "Projected", "Ray", "Screen", "SeenColor"]
+
+_THINNEST = math.log(1e-30)  # of log-scales
 
 
 @dataclasses.dataclass
@@ -197,8 +200,9 @@ class Activated:
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
-        # In float32 the square of a scale overflows at a log-scale of 45, which is a legal parameter.
-        self.scale = [dr.exp(Float64(column("log_scales", k, 3))) for k in range(3)]
+        # In float32 the square of a scale overflows at a log-scale of 45, which is a legal parameter. Any scale below
+        # 1e-30 is this one, without a derivative: nobody sees it, and float32 holds its inverse.
+        self.scale = [dr.exp(dr.maximum(Float64(column("log_scales", k, 3)), _THINNEST)) for k in range(3)]
         self.logit = Float64(column("logit_opacities", 0, 1))
         # exp of a non-positive number on both sides: no overflow at any logit. Not of -|logit|, whose derivative at a
         # logit of 0 is 0.
