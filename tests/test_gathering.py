@@ -17,7 +17,7 @@ from test_sfm import write_photo
 from drgs import cli
 from drgs.data import load
 from drgs.data.checks import list_images
-from drgs.data.gathering import FRAMES, gather, joined_frames, named_files, recorded_frames
+from drgs.data.gathering import FRAMES, gather, joined_frames, named_files, recorded_frames, usable_files
 from drgs.guards.outputs import claim
 
 
@@ -129,6 +129,20 @@ def test_what_was_recorded_goes_on(shoot, tmp_path):
     (photos / FRAMES).write_text(json.dumps({**first, "frames": [{"file": 3, "video": "a"}]}))
     with pytest.raises(ValueError, match=r"frames.json: .*frames\[0\]"):
         recorded_frames(photos)
+
+
+def test_a_video_that_is_cut_off_stops_nothing(shoot, tmp_path, caplog):
+    """It is named and left out; one alone is refused."""
+    photos, other = shoot
+    data = (other / "clip.mp4").read_bytes()
+    (other / "clip.mp4").write_bytes(data[: len(data) // 2])
+    pictures, films = named_files([photos, other])
+    found = usable_files(pictures, films, photos, 2)
+    assert found == (pictures, films[:1])
+    (told,) = caplog.messages
+    assert told.startswith(f"left out: {other / 'clip.mp4'}: must ")
+    with pytest.raises(ValueError, match=r"at least 1 videos that can be used, got 0; .*clip.mp4: must "):
+        usable_files([], films[1:], other, 2)
 
 
 def test_too_few_frames_for_the_videos(shoot, tmp_path):

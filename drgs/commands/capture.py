@@ -30,9 +30,8 @@ from drgs.commands.next_views import rank_next
 from drgs.commands.options import Share
 from drgs.commands.report import report_of
 from drgs.data.checks import list_images
-from drgs.data.gathering import gather, named_files
+from drgs.data.gathering import gather, named_files, usable_files
 from drgs.data.held_out import HELD_OUT, write_held_out
-from drgs.data.photo_files import usable_photos
 from drgs.data.registering import register
 from drgs.data.sfm import run_sfm
 from drgs.display.progress import Bar
@@ -330,13 +329,14 @@ class _Capture:
     def _photos(self, photographs: list[Path], videos: list[Path]) -> Outcome:
         """All pictures in one folder."""
         frames = self.args.frames
+        with Bar("photos"):
+            fewest = 1 if self.is_added else _FEWEST
+            photographs, videos = usable_files(photographs, videos, self.args.paths[0], fewest)
         if videos and self.clock.budget is not None:
             frames = plan_frames(videos[0], len(photographs), frames, self.clock.budget)
             if frames < self.args.frames:
                 self._say(f"plan for {duration(self.clock.budget)}: at most {frames} frames of videos, for their poses")
         with claim(self.folder, "capture") as held, Bar("photos") as bar:
-            fewest = 0 if videos else 1 if self.is_added else _FEWEST
-            photographs = usable_photos(photographs, self.args.paths[0], fewest)
             held.remove(self.photos)  # of a command that ended before it could say so
             gathered = gather(photographs, videos, held, self.photos.name, frames, bar.stage)
         names = [path.name for path in list_images(gathered.folder)]

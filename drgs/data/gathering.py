@@ -14,17 +14,27 @@ import cv2
 import numpy as np
 
 from drgs.data.checks import IMAGE_SUFFIXES, list_images
-from drgs.data.photo_files import entry_fault, leave_out, link_or_copy
+from drgs.data.photo_files import entry_fault, leave_out, link_or_copy, usable_photos
 from drgs.data.shooting import Finding
 from drgs.data.video_frames import Picked, examine
-from drgs.data.videos import VIDEO_SUFFIXES, list_videos
+from drgs.data.videos import VIDEO_SUFFIXES, list_videos, read_video
 from drgs.files import SCHEMA
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.json_files import check_json, read_json
 from drgs.guards.outputs import Claim
 from drgs.guards.unfinished import temporary_folder
 
-__all__ = ["FRAMES", "Gathered", "fill", "gather", "joined_frames", "named_files", "recorded_frames", "write_frames"]
+__all__ = [
+    "FRAMES",
+    "Gathered",
+    "fill",
+    "gather",
+    "joined_frames",
+    "named_files",
+    "recorded_frames",
+    "usable_files",
+    "write_frames",
+]
 
 FRAMES = "frames.json"
 """Beside the pictures: which of them are of which video, and of which moment."""
@@ -89,6 +99,32 @@ def named_files(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
             )
     photographs, videos = (leave_out(files, entry_fault, paths[0]) for files in (photographs, videos))
     return _once(photographs), _once(videos)
+
+
+def usable_files(
+    photographs: Sequence[Path], videos: Sequence[Path], where: Path, fewest: int, max_image_size: int = 1600
+) -> tuple[list[Path], list[Path]]:
+    """Those photographs and videos that can be used; all photographs are decoded. The log names the others.
+
+    Args:
+        photographs, videos: Files, as `named_files` lists them.
+        where: What was named, for the message.
+        fewest: How many photographs there must be where there are no videos.
+        max_image_size: Pixels on the longer side that features are found at; 0 for the photographs' own.
+    Raises:
+        ValueError: Fewer are left; the message says what is wrong with the first of the others.
+    """
+    videos = leave_out(videos, _video_fault, where, 0 if photographs else 1, "videos")
+    return usable_photos(photographs, where, 0 if videos else fewest, max_image_size), videos
+
+
+def _video_fault(path: Path) -> str:
+    """Why a video cannot be read, a line that names it; empty where it can."""
+    try:
+        read_video(path)
+    except ValueError as error:
+        return str(error)
+    return ""
 
 
 def _once(files: Sequence[Path]) -> list[Path]:

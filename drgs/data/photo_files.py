@@ -74,12 +74,15 @@ def usable_photos(photos: Sequence[Path], where: Path, fewest: int = 0, max_imag
     return leave_out(photos, lambda photo: photo_fault(photo, max_image_size), where, fewest)
 
 
-def leave_out(photos: Sequence[Path], fault_of: Callable[[Path], str], where: Path, fewest: int = 0) -> list[Path]:
-    """Those photographs that have no fault; the log names the others.
+def leave_out(
+    photos: Sequence[Path], fault_of: Callable[[Path], str], where: Path, fewest: int = 0, what: str = "photos"
+) -> list[Path]:
+    """Those photographs, or other files, that have no fault; the log names the others.
 
     Args:
         photos, where, fewest: The arguments of `usable_photos`.
         fault_of: What is wrong with one, a line that names it; empty where nothing is.
+        what: What they are, for the message.
     Raises:
         ValueError: Fewer are left.
     """
@@ -87,11 +90,11 @@ def leave_out(photos: Sequence[Path], fault_of: Callable[[Path], str], where: Pa
     kept = [photo for photo in photos if not found[photo]]
     faults = [fault for fault in found.values() if fault]
     if faults and len(kept) < fewest:
-        raise ValueError(f"{where}: must hold at least {fewest} photos that can be used, got {len(kept)}; {faults[0]}")
+        raise ValueError(f"{where}: must hold at least {fewest} {what} that can be used, got {len(kept)}; {faults[0]}")
     for fault in faults[:_FAULTS]:
         _log.warning("left out: %s", fault)
     if len(faults) > _FAULTS:
-        _log.warning("%s: %d more photos are left out for such reasons", where, len(faults) - _FAULTS)
+        _log.warning("%s: %d more %s are left out for such reasons", where, len(faults) - _FAULTS, what)
     return kept
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.data.checks import image_size, list_images
-from drgs.data.gathering import fill, named_files, recorded_frames
+from drgs.data.gathering import fill, named_files, recorded_frames, usable_files
 from drgs.data.mapping import PhotoGroups, map_photos, write_model
 from drgs.data.masks import ALPHA_MASKS, feature_mask, masked_photo, masks_of
 from drgs.data.pairing import choose_pairs
@@ -140,7 +140,7 @@ def run_sfm(
             (partial / "models").mkdir()
             gathered = None
             if image_dir is None:
-                photographs = usable_photos(photographs, paths[0], 0 if videos else 2, max_image_size)
+                photographs, videos = usable_files(photographs, videos, paths[0], 2, max_image_size)
                 gathered = fill(partial / "images", photographs, videos, "sfm", frames, report)
                 marks.append(time.perf_counter())
             folder = image_dir or partial / "images"
