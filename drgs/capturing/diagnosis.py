@@ -42,6 +42,7 @@ _EXPOSURE_PIXELS = 20_000
 _BAD = 3.0  # dB below the median of the other held-out views
 _FAR = 1.5  # times the usual angle to the nearest training view
 _ALONE = 3.0  # the same, of the only held-out view, whose PSNR nothing is there to compare with
+_SPACED = 40  # photographs that say how far apart they usually are
 _LOWERED = 1.0  # dB by which a single view lowers the mean of all, that are worth telling
 
 
@@ -224,7 +225,8 @@ def of_views(dataset: Dataset, train: Sequence[str], psnr: Mapping[str, float]) 
     by_name = {view.name: view for view in dataset.views}
     fitted = [by_name[name] for name in train if name in by_name]
     apart = {name: _apart(by_name[name], fitted) for name in psnr if name in by_name}
-    spacing = [_apart(view, [other for other in fitted if other is not view]) for view in fitted]
+    some = fitted[:: -(-len(fitted) // _SPACED)] if fitted else []
+    spacing = [_apart(view, [other for other in fitted if other is not view]) for view in some]
     usual = float(np.median([*spacing, *apart.values()])) if fitted else 0.0
     others = {name: [x for other, x in psnr.items() if other != name] for name in psnr}
     if len(psnr) > 1:
@@ -259,11 +261,9 @@ def _apart(view: View, others: Sequence[View]) -> float:
         return 0.0
     centers = np.stack([other.camera.center for other in others])
     spread = max(float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()), 1e-12)  # all at one place: 0
-    return min(
-        _angle(view.camera.c2w[:3, 2], other.camera.c2w[:3, 2])
-        + 60.0 * float(np.linalg.norm(view.camera.center - other.camera.center)) / spread
-        for other in others
-    )
+    axes = np.stack([other.camera.c2w[:3, 2] for other in others])
+    turned = np.degrees(np.arccos(np.clip(axes @ view.camera.c2w[:3, 2], -1, 1)))
+    return float((turned + 60.0 * np.linalg.norm(centers - view.camera.center, axis=1) / spread).min())
 
 
 def _depth(view: View, points: np.ndarray) -> float | None:
