@@ -488,7 +488,13 @@ def test_colmap_says_which_file_is_wrong(tmp_path, text, name, old, new, told):
 def test_colmap_rigs_that_fit_to_nothing(tmp_path, caplog):
     """Both are named; one alone is left out, as poses are in images.txt, too."""
     target = write_colmap(tmp_path, text=True)
-    rigs = target / "rigs.txt"
+    rigs, images = target / "rigs.txt", target / "images.txt"
+    whole = images.read_text()
+    images.write_text("# none\n")  # frames.txt has four
+    with pytest.raises(ValueError, match=r"rigs.txt and frames.txt must be of one model with images.txt") as error:
+        load(tmp_path)
+    one_line(error)
+    images.write_text(whole)
     rigs.write_text(rigs.read_text().replace("CAMERA", "LIDAR"))
     with pytest.raises(ValueError, match=r"rigs.txt and frames.txt must be of one model .*remove both") as error:
         load(tmp_path)

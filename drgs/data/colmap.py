@@ -270,6 +270,8 @@ def _read(folder: Path, names: list[str], suffix: str) -> Any:
             for name in {"cameras", "images", "points3D"} - set(names):
                 (whole / f"{name}{suffix}").write_bytes(_COUNT.pack(0) if suffix == ".bin" else b"")
             read(str(whole))
+            for image_id in reconstruction.reg_image_ids():  # which refuses images that only frames have
+                reconstruction.images[image_id].cam_from_world()
     except MemoryError:
         raise
     except Exception as error:  # of the library: checks of its own code, and whatever its containers throw
