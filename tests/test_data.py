@@ -479,6 +479,13 @@ def test_depth_by_nerfcapture_keys(tmp_path):
         load(tmp_path)
 
 
+def test_keys_of_depths_and_masks_that_are_not_read(tmp_path, caplog):
+    """Said once a file, not ignored without a word."""
+    write_transforms(tmp_path, extra={"mono_depth_path": "d.npy", "mask": 1, "mask_path": None})
+    load(tmp_path)
+    assert caplog.text.count("the keys 'mask', 'mono_depth_path' of frames are not read") == 1
+
+
 @pytest.mark.parametrize("lazy", [False, True])
 @pytest.mark.parametrize("twin", ["listed again", "link", "bytes", "suffix", "format"])
 def test_a_photograph_counts_once(tmp_path, caplog, twin, lazy):

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -45,8 +46,11 @@ _LENSES = {
 }
 _DEPTHS = ("depth_file_path", "depth_path")  # nerfstudio's key, and NeRFCapture's, SplaTAM's and instant-ngp's
 _FILE_KEYS = ("file_path", "mask_path", *_DEPTHS)
+_DEPTH_SCALES = ("depth_unit_scale_factor", "integer_depth_scale")
+_SHOWN = 40  # characters of a key in a message
 _MILLIMETER = 1e-3
 _DEPTH_SCALE_MAX = 1e9
+_log = logging.getLogger(__name__)
 
 
 def _files(path: Path) -> list[Path]:
@@ -176,6 +180,10 @@ def _frames(file: Path) -> dict:
         raise ValueError(f"{file}: must be an object with a list `frames` of at least one frame; check the file")
     for index, frame in enumerate(frames):
         check_json(f"{file}: frame {index}", frame, {"file_path": str}, "correct it")
+    keys = {key for frame in frames for key in frame if "depth" in key or "mask" in key}
+    if unread := sorted(keys - {*_FILE_KEYS, *_DEPTH_SCALES}):
+        shown = ", ".join(repr(key)[:_SHOWN] for key in unread[:3])
+        _log.warning("%s: the keys %s of frames are not read; see docs/datasets.md, transforms.json", file, shown)
     return _with_names_of_here(file, data)
 
 
@@ -254,11 +262,8 @@ def _fill(
 def _depth_scale(where: str, values: dict, depth: Path | None) -> float:
     """Scene units in one unit of a depth map: what nerfstudio's key states, else NeRFCapture's, which is of images."""
     is_image = depth is None or depth.suffix != ".npy"
-    scales = {
-        key: _number(where, values, key)
-        for key in ("depth_unit_scale_factor", *(["integer_depth_scale"] if is_image else []))
-        if key in values
-    }
+    keys = _DEPTH_SCALES if is_image else _DEPTH_SCALES[:1]
+    scales = {key: _number(where, values, key) for key in keys if key in values}
     for key, scale in scales.items():
         if not 0 < scale < _DEPTH_SCALE_MAX:
             raise ValueError(f"{where}: {key} must be in (0, {_DEPTH_SCALE_MAX:g}), got {scale:g}; correct it")
