@@ -248,12 +248,13 @@ def _picks(account: Account) -> dict[str, Any]:
     criteria = sorted({str(pick["criterion"]) for pick in selection["picks"] if pick.get("criterion")})
     how = ", ".join([*policies, *criteria])
     leak = " Initial points are of the whole data set, views that were not picked included." * selection["pool_leak"]
+    records = [x for x in selection.get("measured") or () if isinstance(x, dict) and isinstance(x.get("mean"), dict)]
+    is_cut_out = any("psnr_object" in record["mean"] for record in records)
+    names = (*(OBJECT if is_cut_out else ("psnr",)), "cc_psnr", "ssim", "flip")
     measured = []
-    names = ("psnr", "cc_psnr", "ssim", "flip")
-    for row in selection.get("measured") or ():
-        if isinstance(row, dict) and isinstance(row.get("mean"), dict):
-            values = [row["mean"].get(name) for name in names]
-            measured.append((row.get("views"), *(f"{x:.3f}" if isinstance(x, int | float) else "-" for x in values)))
+    for record in records:
+        values = [record["mean"].get(name) for name in names]
+        measured.append((record.get("views"), *(f"{x:.3f}" if isinstance(x, int | float) else "-" for x in values)))
     head = ("", "view", "largest part", "score", "margin to the next", "step", "candidates", "seconds")
     return {
         "picks": rows,
