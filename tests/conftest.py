@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import atexit
 import gc
+import logging
 import os
 import random
 import shutil
@@ -89,12 +90,15 @@ def _isolated(request):
     if "torch" in sys.modules:
         sys.modules["torch"].manual_seed(seed)
     environ, directory, path = dict(os.environ), os.getcwd(), list(sys.path)
+    logger = logging.getLogger("drgs")  # of which a command sets the level
+    level = logger.level
     flags = _flags()
     yield
     os.environ.clear()
     os.environ.update(environ)
     os.chdir(directory)
     sys.path[:] = path
+    logger.setLevel(level)
     if "drjit" in sys.modules:
         # A kernel still running would write into buffers that the next test reuses.
         sys.modules["drjit"].sync_thread()
