@@ -76,7 +76,7 @@ class HdrReader:
 
     Args:
         path: The video.
-        transfer: As `hdr_transfer` says.
+        transfer: Number in `HDR`, as `hdr_transfer` says.
         stamps: Milliseconds at which each frame is shown; empty where the file does not say.
     Raises:
         OSError, ValueError: PyAV cannot open it.
@@ -157,7 +157,7 @@ def in_srgb(signal: np.ndarray, transfer: int) -> np.ndarray:
 
     Args:
         signal: (H, W, 3) uint16, RGB as it is coded, of 65535.
-        transfer: Its number in `HDR`.
+        transfer: Number of its tones in `HDR`.
     """
     import cv2
 
