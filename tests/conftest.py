@@ -29,7 +29,7 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "DRGS_TH
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # OpenMP threads that spin take cores from Dr.Jit's
 os.environ.setdefault("DRGS_VARIANT", "llvm_ad_rgb")
 
-# Matches that fits keep are those of this run of the suite, and leave nothing behind; the viewer's code is the user's.
+# Matches that fits keep are those of one test, and leave nothing behind; the viewer's code is the user's.
 _cache = Path(tempfile.mkdtemp(prefix="drgs-cache-"))
 atexit.register(shutil.rmtree, _cache, ignore_errors=True)
 (_cache / "drgs").mkdir()
@@ -89,6 +89,7 @@ def _isolated(request):
     random.seed(seed)
     if "torch" in sys.modules:
         sys.modules["torch"].manual_seed(seed)
+    shutil.rmtree(_cache / "drgs" / "matches", ignore_errors=True)
     environ, directory, path = dict(os.environ), os.getcwd(), list(sys.path)
     logger = logging.getLogger("drgs")  # of which a command sets the level
     level = logger.level
