@@ -7,12 +7,13 @@ import re
 import numpy as np
 import pytest
 import torch
-from test_active_unknowns import VIEWS, write_photographs
+from test_active_unknowns import GAINS, VIEWS, write_photographs
 from test_train import config, dataset  # noqa: F401 (a fixture)
 
 from drgs.cameras import orbit
 from drgs.data import load
 from drgs.files import load_state
+from drgs.fitting import start
 from drgs.fitting.exposure import Exposure, estimate_exposure, exposure_network
 from drgs.fitting.frames import Frame
 from drgs.fitting.records import fit_record
@@ -97,8 +98,8 @@ def test_one_photograph_at_half_brightness_is_recovered():
     found = estimate_exposure(*_photographs(gains, 0.1))
     relative = np.exp(found.log_gains - np.delete(found.log_gains, 3, axis=0).mean(axis=0))
     assert np.abs(relative - gains).max() < 0.02
-    assert found.used[3]
-    assert found.is_clear
+    assert found.is_confirmed.all()
+    assert found.is_sound
     assert found.lowered > 0.5
 
 
@@ -112,10 +113,13 @@ def test_light_from_one_side_is_no_gain():
         center = rng.uniform(0, 300)
         frame.pixels *= torch.exp(-(((torch.arange(300) - center) / 150) ** 2))[None, :, None]
     found = estimate_exposure(frames, points)
-    assert found.lowered < 0.05
-    assert not found.is_clear
+    assert found.is_clear
+    assert not found.is_sound
     assert not found.warning()
-    assert "not used" in found.words()
+    assert not found.is_confirmed.all()
+    kept = found.confirmed()
+    assert not kept.log_gains[~found.is_confirmed].any()
+    assert np.abs(kept.log_gains.mean(axis=0)).max() < 1e-12
 
 
 def test_pixels_that_show_nothing_are_not_compared():
@@ -161,6 +165,19 @@ def test_a_fit_without_gains_says_that_photographs_differ(tmp_path, capsys, gain
     assert len(lines) == told
     assert not told or float(re.search(r"differ by (\S+)", lines[0])[1]) == pytest.approx(0.5, abs=0.03)
     assert "exposure" not in run.config()
+
+
+def test_auto_is_as_photographs_that_short_fits_did_not_see_say(tmp_path, monkeypatch, capsys):
+    """Gains that are clear by points are fitted if, and only if, such photographs gain; line and record say it."""
+    monkeypatch.setitem(start._TRIAL, "max_steps", 20)
+    write_photographs(tmp_path / "data", GAINS)
+    settings = config(max_steps=1, exposure="auto")
+    run = fit(load(tmp_path / "data"), tmp_path / "run", settings, progress=True).run
+    found = run.config()["exposure"]
+    assert found["lowered"] > 0.05
+    assert (found["gained"] > 0) == ("estimated" in run.config())
+    said = "each has its own" if found["gained"] > 0 else "off, all have the same"
+    assert f"change by {found['gained']:+.2f} dB; {said}" in capsys.readouterr().err
 
 
 def test_learned_gains_keep_zero_mean_and_held_ones_stay():

@@ -197,7 +197,7 @@ def of_exposure(dataset: Dataset, seed: int = 0) -> list[Finding]:
         return []
     points, seen = compared
     estimate = estimate_exposure(load_frames(views, _EXPOSURE_PIXELS), points, seed, seen)
-    if not estimate.is_clear:
+    if not estimate.is_sound:
         return []
     stops = estimate.log_gains / math.log(2)
     order = np.argsort(-np.abs(stops).max(axis=1), kind="stable")[:_SHOWN]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +60,7 @@ def initial_points(
     max_points: int = 100_000,
     progress: Callable[[str, int, int], None] | None = None,
     matches: Matches | None = None,
+    train: list[View] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """Points to start Gaussians from, by the first way that works.
 
@@ -76,6 +77,8 @@ def initial_points(
         max_points: Number of points at most.
         progress: Called with (stage, done, total) while triangulating.
         matches: Gets the features and matches, if there are any, which `shared_points` goes on with.
+        train: Views for guesses along rays of pixels that have none of the data set's own points near, where it has
+            their tracks; None: there are none.
     Returns:
         points (P,3) float64, colors (P,3) float32 in [0,1], and where they come from, one line.
     """
@@ -85,6 +88,14 @@ def initial_points(
         raise ValueError("initial_points: there must be at least one view, got none; pass the training views")
     if isinstance(data, Dataset) and data.points is not None and len(data.points):
         colors = data.colors if data.colors is not None else np.full(data.points.shape, 0.5, dtype=np.float32)
+        if train and data.tracks is not None:
+            places, shown = _tracked(data.points, data.tracks, train)
+            if len(places) >= _MIN_TRIANGULATED:
+                hull = Hull.of(train, progress)
+                points, colors = _with_guesses(
+                    train, data.points, colors, shown, max_points, hull, rng, progress, places
+                )
+                return points, colors, f"{data.point_source}; {len(points)} with guesses where there are none"
         keep = subset(len(data.points), max_points, rng)
         note = "" if len(keep) == len(data.points) else f", {len(keep)} kept"
         return data.points[keep], colors[keep], f"{data.point_source}{note}"
@@ -97,7 +108,7 @@ def initial_points(
     if len(views) >= 2 and all(view.has_image for view in views):
         matches = matches or Matches()
         triangulated = found_once(views, lambda: _triangulated(views, matches, progress))
-        points, colors, found = _with_guesses(views, seed, max_points, *triangulated, progress)
+        points, colors, found = _completed(views, seed, max_points, *triangulated, progress)
         if len(points):
             source = f"triangulated from {len(views)} given poses, {found} points"
             return points, colors, f"{source}; {len(points)} with guesses where there are none"
@@ -130,10 +141,10 @@ def triangulated_points(
         as far away as those beside; no point at all, if fewer than 50 are triangulated. Third, how many are, before any
         is left out.
     """
-    return _with_guesses(views, seed, max_points, *_triangulated(views, matches, progress), progress)
+    return _completed(views, seed, max_points, *_triangulated(views, matches, progress), progress)
 
 
-def _with_guesses(
+def _completed(
     views: list[View],
     seed: int,
     max_points: int,
@@ -152,20 +163,43 @@ def _with_guesses(
         # Two photographs agreed about what others say is not there.
         there = ~hull.is_denied(points)
         points, colors, shown = points[there], colors[there], shown[:, there]
+    return *_with_guesses(views, points, colors, shown, max_points, hull, rng, progress), found
+
+
+def _with_guesses(
+    views: list[View],
+    points: np.ndarray,
+    colors: np.ndarray,
+    shown: np.ndarray,
+    max_points: int,
+    hull: Hull | None,
+    rng: np.random.Generator,
+    progress: Callable[[str, int, int], None] | None,
+    places: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points and colors, at most `max_points`, and where images have none of them, guesses as far away as those beside.
+
+    Args:
+        views: V views.
+        points, colors: (P, 3) each.
+        shown: (V, N) which views show which points.
+        places: (N, 3) points that `shown` is about, if these are not all `points`.
+    """
+    places = points if places is None else places
     # What no two views show would stay empty: density control does not leave what there is. Guesses are as dense as
     # what is triangulated, at most as many, but together they are enough; and the budget is shared by area.
-    share = empty_share(views, points, shown)
+    share = empty_share(views, places, shown)
     # Where all is empty, the share of what is not is 0.
     as_dense = len(points) * min(1.0, share / max(1 - share, 1e-9))
     guesses = round(min(max(_ENOUGH - len(points), as_dense), share * max_points))
     keep = subset(len(points), max_points - guesses, rng)
     room = None if hull is None else hull.points(guesses, rng, progress)
-    more, more_colors = room or points_beside(views, points, shown, guesses, rng)
-    return np.concatenate([points[keep], more]), np.concatenate([colors[keep], more_colors]), found
+    more, more_colors = room or points_beside(views, places, shown, guesses, rng)
+    return np.concatenate([points[keep], more]), np.concatenate([colors[keep], more_colors])
 
 
 def shared_points(
-    dataset: Dataset | None,
+    dataset: Dataset,
     views: list[View],
     seed: int = 0,
     matches: Matches | None = None,
@@ -177,7 +211,7 @@ def shared_points(
     By the first way that there is: tracks of the data set, depth maps, features that are matched.
 
     Args:
-        dataset: The data set, for its tracks; None: nothing but views is read.
+        dataset: The data set, for its tracks.
         views: V views of it, still, with images; nothing of others is read.
         seed: Seed of the pixels that are drawn from depth maps.
         matches: Matches between these views, as `initial_points` filled them; empty ones are made here, which takes
@@ -186,13 +220,8 @@ def shared_points(
     Returns:
         Points (P, 3) and (V, P) bool; None where nothing says what hides them.
     """
-    if dataset is not None and dataset.tracks is not None and dataset.points is not None:
-        tracks = [dataset.tracks.get(view.name, np.empty(0, np.int64)) for view in views]
-        kept = np.unique(np.concatenate(tracks))
-        shown = np.zeros((len(views), len(kept)), bool)
-        for row, track in enumerate(tracks):
-            shown[row, np.searchsorted(kept, track)] = True
-        return _shown_beside(views, dataset.points[kept], shown)
+    if dataset.tracks is not None and dataset.points is not None:
+        return _shown_beside(views, *_tracked(dataset.points, dataset.tracks, views))
     if any(view.depth_path is not None for view in views):
         return _shown_by_depth(views, np.random.default_rng(seed))
     if matches is None or len(views) < 2:
@@ -354,6 +383,16 @@ def _from_depth(views: list[View], limit: int, rng: np.random.Generator) -> tupl
     if not points:
         return np.empty((0, 3)), np.empty((0, 3), dtype=np.float32)
     return np.concatenate(points)[:limit], np.concatenate(colors)[:limit]
+
+
+def _tracked(points: np.ndarray, tracks: Mapping[str, np.ndarray], views: list[View]) -> tuple[np.ndarray, np.ndarray]:
+    """The (N, 3) of the points that tracks say one of V views shows, and which views show them, (V, N) bool."""
+    mine = [tracks.get(view.name, np.empty(0, np.int64)) for view in views]
+    kept = np.unique(np.concatenate(mine))
+    shown = np.zeros((len(views), len(kept)), bool)
+    for row, track in enumerate(mine):
+        shown[row, np.searchsorted(kept, track)] = True
+    return points[kept], shown
 
 
 def _shown_beside(views: list[View], points: np.ndarray, shown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -207,18 +207,22 @@ class ActiveViews:
         Args:
             given: (P, 3) points of the data set; None where it has none, or they are not read.
         Returns:
-            (P, 3) points and which of the V photographs show which, (V, P) bool; None where that is not known.
+            (P, 3) points and, of those that are triangulated, which of the V photographs show which, (V, P) bool; else
+            None.
         """
-        from drgs.data import shared_points
+        from drgs.data import initial_points, matched_points
 
         if self.pool_leak and given is not None:
             return given, None
         seen = [self.views[i] for i in self.chosen]
         with Bar("points of all views") as bar:
-            if len(seen) > 1 and all(view.depth_path is None for view in seen):
-                self._count_start(bar)  # before there are more pictures
-            found = shared_points(None, seen, self._config.seed, self._matches, bar.stage)
-            return found or (np.empty((0, 3)), None)
+            if any(view.depth_path is not None for view in seen):
+                most = self._config.density.max_gaussians
+                return initial_points(seen, self._config.seed, most, bar.stage)[0], None
+            if len(seen) < 2:
+                return np.empty((0, 3)), None
+            self._count_start(bar)  # before there are more pictures
+            return matched_points(seen, self._matches, bar.stage)
 
     def _count_start(self, bar: Bar) -> int:
         """How many points are triangulated with the initial views alone; what is matched here is kept."""

@@ -5,7 +5,8 @@ a channel. Where several photographs show one point, log c = log gain of the pho
 noise, on the values of the photographs as they are (sRGB), in which renderings are compared with them. Which
 photographs show a point must be known (`drgs.data.shared_points`): where half of the points are hidden by others, no
 robust weight finds the gains. What depends on the direction, like the light on a thing that is turned, looks like a
-gain, too; so a gain is used only if it lowers the error of the half of its photograph that it was estimated without.
+gain, too; so `auto` uses a gain only if it lowers the error of the half of its photograph that it was estimated
+without.
 """
 
 from __future__ import annotations
@@ -47,15 +48,15 @@ class ExposureEstimate:
     """What points say of the gains of V photographs.
 
     Attributes:
-        log_gains: (V, 3) float64 natural logarithms; 0 where not `used`, of zero mean over the photographs of a
-            component, each channel.
+        log_gains: (V, 3) float64 natural logarithms; of zero mean over the photographs of a component, each channel.
         errors: (V, 3) their standard errors.
         observations: How many colors of points were compared.
         components: Sets of photographs that share points; each is centered by itself, for nothing compares them.
         labels: (V,) int64, the set of each photograph: the index of its first one.
         lowered: Share of the error in halves of photographs that gains lower which were estimated without them;
             negative where they raise it.
-        used: (V,) bool, whose gains lower it; the others keep gain 1.
+        is_confirmed: (V,) bool, whose gains lower it.
+        gained: By how many dB gains change photographs that short fits did not see; None where that was not tried.
     """
 
     log_gains: np.ndarray
@@ -64,7 +65,8 @@ class ExposureEstimate:
     components: int
     labels: np.ndarray
     lowered: float
-    used: np.ndarray
+    is_confirmed: np.ndarray
+    gained: float | None = None
 
     @property
     def spread(self) -> tuple[float, float, float]:
@@ -73,12 +75,22 @@ class ExposureEstimate:
 
     @property
     def is_clear(self) -> bool:
-        """Whether the gains differ by more than points can be wrong about, in one channel at least, and lower the error
-        of what is held out.
-        """
-        return self.lowered > _LOWERED and any(
-            x**2 - e**2 > _CLEAR**2 for x, e in zip(self.spread, self.noise, strict=True)
-        )
+        """Whether the gains differ by more than points can be wrong about: in one channel at least."""
+        return any(x**2 - e**2 > _CLEAR**2 for x, e in zip(self.spread, self.noise, strict=True))
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether the gains are clear and lower the error of what is held out."""
+        return self.is_clear and self.lowered > _LOWERED
+
+    def confirmed(self) -> ExposureEstimate:
+        """With gain 1 for photographs whose own does not lower the error of what is held out of them."""
+        gains, good = self.log_gains.copy(), self.is_confirmed
+        for label in np.unique(self.labels[good]):
+            mine = self.labels == label
+            gains[mine] -= gains[mine & good].mean(axis=0)
+        gains[~good] = 0
+        return dataclasses.replace(self, log_gains=gains)
 
     def words(self) -> str:
         """What was found, in one line."""
@@ -93,17 +105,20 @@ class ExposureEstimate:
         """What was found on halves of photographs that are held out."""
         change = f"{'lower' if self.lowered >= 0 else 'raise'} the error of held-out halves of photographs by "
         change += f"{100 * abs(self.lowered):.0f} %"
-        unused = int((~self.used).sum())
-        return f"they {change}" + (f", {unused} of {len(self.used)} do not and are not used" if unused else "")
+        others = int((~self.is_confirmed).sum())
+        tried = "" if self.gained is None else f"; photographs held out of short fits change by {self.gained:+.2f} dB"
+        left = f" (those of {others} of {len(self.is_confirmed)} do not)" if others else ""
+        return f"they {change}{left}{tried}"
 
     def warning(self) -> str:
         """What a fit without gains is to say of photographs that differ, in one line; empty where they do not."""
-        if not self.is_clear:
+        if not self.is_sound:
             return ""
         spread = " ".join(f"{x:.2f}" for x in self.spread)
         return (
             f"exposure: photographs differ by {spread} stops in R G B (standard deviation, {self.observations} colors "
-            "of shared points), and so will held-out views; --exposure auto gives each photograph its own gain"
+            "of shared points), and held-out views as much: see cc_psnr; --exposure auto gives each photograph its own "
+            "gain if that helps"
         )
 
     def to_json(self, names: list[str]) -> dict:
@@ -115,7 +130,8 @@ class ExposureEstimate:
             "observations": self.observations,
             "components": self.components,
             "lowered": self.lowered,
-            "unused": [name for name, used in zip(names, self.used, strict=True) if not used],
+            "gained": self.gained,
+            "unconfirmed": [name for name, good in zip(names, self.is_confirmed, strict=True) if not good],
             "gains": gains,
         }
 
@@ -150,15 +166,9 @@ def estimate_exposure(
     there &= (there.any(axis=2).sum(axis=0) >= 2)[None, :, None]  # a point that one photograph shows compares nothing
     gains, errors, label = _robust(logs, there)
     before, after = _held_out_errors(logs, there, columns)
-    used = after < before
-    for component in np.unique(label):
-        mine = label == component
-        if (mine & used).any():
-            gains[mine] -= gains[mine & used].mean(axis=0)
-    gains[~used] = 0
     lowered = 1 - float(after.sum() / before.sum()) if before.any() else 0.0
     observations = int(there.any(axis=2).sum())
-    return ExposureEstimate(gains, errors, observations, len(np.unique(label)), label, lowered, used)
+    return ExposureEstimate(gains, errors, observations, len(np.unique(label)), label, lowered, after < before)
 
 
 class Exposure(torch.nn.Module):
@@ -286,7 +296,7 @@ def _robust(logs: np.ndarray, there: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _held_out_errors(logs: np.ndarray, there: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(V,) sums of absolute errors of each photograph's colors, as other photographs of the same points predict them,
+    """(V,) sums of absolute errors of each photograph's colors, as other photographs of the same points predict them:
     without gains and with gains that were estimated without this half of it.
 
     Halves are left and right of the median point: light that falls on a thing from one side, or a point that is taken
@@ -296,16 +306,15 @@ def _held_out_errors(logs: np.ndarray, there: np.ndarray, columns: np.ndarray) -
     for row, across in enumerate(columns):
         mine = across[there[row].any(axis=1)]
         is_right[row] = across > (np.median(mine) if len(mine) else 0.0)
-    odd = np.arange(len(logs))[:, None] % 2 == 1  # neighbors show the same in the same half
+    others = np.maximum(there.sum(axis=0) - 1, 1)
     errors = np.zeros((2, len(logs)))
     for fold in (False, True):
-        held_out = there & (is_right ^ odd ^ fold)[..., None]
+        held_out = there & (is_right ^ fold)[..., None] & (there.sum(axis=0) > 1)
         rest = there & ~held_out
-        count = rest.sum(axis=0)
         gains = _robust(logs, rest & (rest.any(axis=2).sum(axis=0) >= 2)[None, :, None])[0][:, None]
-        held_out &= count > 0
         for sums, shift in zip(errors, (np.zeros_like(gains), gains), strict=True):
-            predicted = (rest * (logs - shift)).sum(axis=0) / np.maximum(count, 1) + shift
+            colors = there * (logs - shift)
+            predicted = (colors.sum(axis=0) - colors) / others + shift
             sums += (held_out * np.abs(np.exp(predicted) - np.exp(logs))).sum(axis=(1, 2))
     return errors[0], errors[1]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from typing import TYPE_CHECKING
 
@@ -11,12 +12,16 @@ import torch
 from drgs.data import initial_points, scene_extent, shared_points
 from drgs.data.guided import Matches
 from drgs.display.progress import Bar
+from drgs.ellipsoids import Y_00
+from drgs.fitting.frames import frames_for
 from drgs.fitting.going_on import begin_with
+from drgs.fitting.losses import psnr_of
 from drgs.fitting.parts import parts_of, with_exposure, with_poses
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.skybox import RADIUS, SHARE, Skybox, SkyboxChoice, far_evidence, why_not
 from drgs.fitting.stages import first_time, times_of
 from drgs.fitting.trainer import Trainer
+from drgs.integrator import render
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -33,6 +38,10 @@ if TYPE_CHECKING:
 __all__ = ["motion_of", "start"]
 
 _log = logging.getLogger("drgs.train")
+
+_TRIAL = {"max_steps": 200, "max_gaussians": 8_000, "num_downscales": 0}
+_TRIAL_PIXELS = 12_000  # of a photograph; two fits of 200 steps take 10 to 20 s on one core
+_TRIAL_EVERY = 5  # photographs of which one is held out
 
 
 def motion_of(config: FitConfig, train: list[View], test: list[View]) -> Motion | None:
@@ -137,7 +146,11 @@ def start(
     with Bar("initial points") as bar:
         seen = views if motion is None else first_time(views)
         points, colors, source = initial_points(
-            dataset if given else seen, config.seed, config.density.max_gaussians - reserved - room, bar.stage, matches
+            dataset if given else seen,
+            config.seed,
+            config.density.max_gaussians - reserved - room,
+            bar.stage,
+            matches,
         )
         bar.note(f"initial points: {source}")
     extent = scene_extent([frame.camera for frame in frames], points)
@@ -182,7 +195,8 @@ def start(
     if parts is None:
         if motion is None and not strict:
             compared = _compared(dataset, views, config, None if given else matches)
-        made, found, evidence = _unknowns(dataset, frames, config, made, extent, points, compared, strict)
+        trial = None if compared is None or strict else (views, model)
+        made, found, evidence = _unknowns(dataset, frames, config, made, extent, points, compared, strict, trial)
     return Trainer(config, frames, model, extent, made, motion), source, found, evidence, choice
 
 
@@ -202,6 +216,57 @@ def _compared(
         return shared_points(dataset, views, config.seed, matches, bar.stage)
 
 
+def _trial(views: list[View], model: GaussianRows, config: FitConfig, extent: float, found: ExposureEstimate) -> float:
+    """By how many dB gains change photographs that two short fits, with them and without, did not see: the
+    mean of what they change at gain 1, as held-out views are shown, and at the gain that suits each photograph best.
+    Points say nothing of a white wall, which has none.
+
+    Args:
+        views: V views.
+        model: Gaussians that the fit begins with.
+        config, extent: Of the fit.
+        found: What points say of the gains of the V photographs.
+    """
+    frames = frames_for(views, config.data, min(_TRIAL_PIXELS, config.data.max_pixels))
+    held_out = frames[_TRIAL_EVERY // 2 :: _TRIAL_EVERY]
+    rest = [row for row in range(len(frames)) if row % _TRIAL_EVERY != _TRIAL_EVERY // 2]
+    if not held_out:
+        return 0.0
+    short = config.replace(**_TRIAL, max_pixels=_TRIAL_PIXELS)
+    start = model.gaussians().detach()  # where both begin
+    kept = torch.randperm(len(start) - model.skybox, generator=torch.Generator().manual_seed(config.seed))
+    kept = kept[: short.density.max_gaussians] + model.skybox
+    colors = (0.5 + Y_00 * start.sh[kept, 0]).clamp(0, 1)
+    errors = []
+    with Bar("whether exposure is of use", 2 * short.max_steps) as bar:
+        for use in (False, True):
+            rows = GaussianRows.from_points(start.means[kept], colors, *short.density.start_of(False))
+            parts = parts_of(short, extent)
+            seen = [frames[row] for row in rest]
+            if use:
+                gains = found.log_gains[rest] - found.log_gains[rest].mean(axis=0)
+                parts = with_exposure(parts, seen, short, dataclasses.replace(found, log_gains=gains))
+            trainer = Trainer(short, seen, rows, extent, parts)
+            for _ in range(short.max_steps):
+                trainer.step()
+                bar.advance()
+            errors.append([_psnr(trainer, frame, short, suited) for frame in held_out for suited in (False, True)])
+    return float(np.mean(errors[1]) - np.mean(errors[0]))
+
+
+def _psnr(trainer: Trainer, frame: Frame, config: FitConfig, suited: bool) -> float:
+    """Of a photograph that the trainer has not seen, in dB; `suited`: with gains of R, G and B that suit it best."""
+    with torch.no_grad():  # a measure
+        rgb = render(trainer.scene(), frame.camera, config.settings, outputs=()).rgb.cpu().clamp(0, 1)
+    target = frame.image()
+    weight = torch.ones_like(target) if frame.mask is None else frame.mask[..., None].expand_as(target)
+    if suited:
+        gain = (weight * rgb * target).sum(dim=(0, 1)) / (weight * rgb * rgb).sum(dim=(0, 1)).clamp(min=1e-12)
+        rgb = (gain * rgb).clamp(max=1)
+    error = (rgb - target).square()
+    return psnr_of(float((weight * error).sum() / weight.sum().clamp(min=1e-12)))
+
+
 def _unknowns(
     dataset: Dataset,
     frames: list[Frame],
@@ -211,6 +276,7 @@ def _unknowns(
     points: np.ndarray,
     compared: tuple[np.ndarray, np.ndarray | None] | None = None,
     strict: bool = False,
+    trial: tuple[list[View], GaussianRows] | None = None,
 ) -> tuple[Parts, ExposureEstimate | None, PoseEvidence | None]:
     """Parts with what is unknown of photographs, exposure and poses, where that is asked for or clear; and what is
     known of both.
@@ -221,6 +287,7 @@ def _unknowns(
         points: Initial points (P, 3).
         compared: Points (P, 3) by which photographs are compared, and (V, P) bool, which photograph shows which; None
             for the initial points, each of which all may show.
+        trial: Views and Gaussians for short fits that say whether gains are of use; None: there are none.
     """
     found = evidence = None
     if config.data.exposure == "off" and compared is not None:
@@ -235,7 +302,11 @@ def _unknowns(
         with Bar("exposure") as bar:
             by, shown = compared or (points, None)
             found = estimate_exposure(frames, by, config.seed, shown)
-            is_on = config.data.exposure != "auto" or found.is_clear
+            is_on = config.data.exposure != "auto" or (found.is_clear if trial is None else found.is_sound)
+            if trial is not None and config.data.exposure == "auto" and is_on:
+                found = found.confirmed()
+                gained = _trial(*trial, config, extent, found)
+                found, is_on = dataclasses.replace(found, gained=gained), gained > 0
             said = "each has its own" if is_on else "off, all have the same"
             now = " for now" if strict and config.data.exposure == "auto" else ""
             bar.note(f"exposure: {found.words()}; {said}{now}")
