@@ -517,7 +517,7 @@ def test_depth_maps_say_what_is_hidden(tmp_path, rng):
     """A square that five depth maps agree about, and one map that sees something nearer in front of all of it."""
     views = plane_views(tmp_path, rng, depth=True)
     views[2].depth_scale /= 2
-    points, shown = shared_points(None, views)
+    points, shown = shared_points(Dataset(tmp_path, "transforms", views), views)
     nearer = np.abs(points[:, 2]) > 0.5
     assert 0.1 < nearer.mean() < 0.3
     assert not shown[2, ~nearer].any()
@@ -529,4 +529,26 @@ def test_nothing_is_shared_where_nobody_knows(tmp_path, rng):
     """Points without tracks, as of a PLY file, and no matches: photographs are not compared by what may be hidden."""
     views = plane_views(tmp_path, rng, count=2)
     assert shared_points(Dataset(tmp_path, "transforms", views, np.zeros((3, 3))), views) is None
-    assert shared_points(None, views, matches=Matches())[1].sum() > 50
+    assert shared_points(Dataset(tmp_path, "llff", views), views, matches=Matches())[1].sum() > 50
+
+
+def test_given_points_get_guesses_where_there_are_none(tmp_path, rng):
+    """Of a square whose model has points on its left alone, as of a clock on a white wall: guesses on its right, as far
+    away, from the training views; without tracks, or views that may be read, the model's points are all there is.
+    """
+    views = plane_views(tmp_path, rng)
+    points = np.stack([rng.uniform(-1.5, -0.2, 300), rng.uniform(-1, 1, 300), np.zeros(300)], axis=1)
+    model = Dataset(
+        tmp_path, "colmap", views, points, point_source="model", tracks={v.name: np.arange(300) for v in views}
+    )
+    got, colors, source = initial_points(model, max_points=3000, train=views[1:])
+    assert len(got) == len(colors)
+    np.testing.assert_array_equal(got[:300], points)
+    right = got[300:][got[300:, 0] > 0]
+    assert len(right) > 300
+    assert np.median(np.abs(right[:, 2])) < 0.3
+    assert source == f"model; {len(got)} with guesses where there are none"
+    few = initial_points(model, max_points=100, train=views)[0]
+    assert len(few) <= 100
+    model.tracks = None
+    np.testing.assert_array_equal(initial_points(model, max_points=3000, train=views)[0], points)

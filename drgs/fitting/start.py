@@ -151,6 +151,7 @@ def start(
             config.density.max_gaussians - reserved - room,
             bar.stage,
             matches,
+            None if strict else seen,
         )
         bar.note(f"initial points: {source}")
     extent = scene_extent([frame.camera for frame in frames], points)
