@@ -20,6 +20,7 @@ from drgs.data.multicamera import frame_folders
 from drgs.data.points import (
     added_points,
     initial_points,
+    matched_points,
     shared_points,
     triangulated_count,
     triangulated_points,
@@ -42,6 +43,7 @@ __all__ = [
     "added_points",
     "initial_points",
     "load",
+    "matched_points",
     "scene_extent",
     "shared_points",
     "triangulated_count",

@@ -29,6 +29,7 @@ from drgs.guards.ply_headers import ply_source
 __all__ = [
     "added_points",
     "initial_points",
+    "matched_points",
     "read_point_ply",
     "shared_points",
     "triangulated_count",
@@ -196,6 +197,16 @@ def _with_guesses(
     room = None if hull is None else hull.points(guesses, rng, progress)
     more, more_colors = room or points_beside(views, places, shown, guesses, rng)
     return np.concatenate([points[keep], more]), np.concatenate([colors[keep], more_colors])
+
+
+def matched_points(
+    views: list[View], matches: Matches, progress: Callable[[str, int, int], None] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """(P, 3) points that two or more of V views show, as far as they are triangulated, and (V, P) bool of which show
+    which; arguments as of `triangulated_points`.
+    """
+    points, _, shown = _triangulated(views, matches, progress)
+    return points, shown
 
 
 def shared_points(
