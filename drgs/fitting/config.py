@@ -101,8 +101,9 @@ class DataConfig(Record):
         undistort: Undistort photographs (on), or fit them as they were taken (off), with renderers along rays (--for
             drgs, exact, fast or 3dgut); auto: off for these renderers if undistorting would crop more than a fifth of
             the picture.
-        exposure: Multiply the rendering of each photograph by gains of R, G and B: none (off), estimated from the
-            initial points (points), then optimized (learned); auto: points, if gains clearly differ.
+        exposure: Multiply the rendering of each photograph by gains of R, G and B: none (off), estimated from points
+            that several show (points), then optimized (learned); auto: points, if gains clearly differ and lower the
+            error of held-out photographs in short fits.
         poses: Keep the cameras of training photographs (fixed), or optimize them (refined); auto: refined if
             reprojection errors of a COLMAP model are large.
         skybox: Place a tenth of the Gaussians far around the scene, for the sky and the far background: if photographs
