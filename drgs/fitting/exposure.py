@@ -56,7 +56,7 @@ class ExposureEstimate:
         lowered: Share of the error in halves of photographs that gains lower which were estimated without them;
             negative where they raise it.
         is_confirmed: (V,) bool, whose gains lower it.
-        gained: By how many dB gains change photographs that short fits did not see; None where that was not tried.
+        gained: What gains add, in dB, to photographs that short fits did not see; None where that was not tried.
     """
 
     log_gains: np.ndarray

@@ -225,7 +225,7 @@ def _trial(views: list[View], model: GaussianRows, config: FitConfig, extent: fl
     Args:
         views: V views.
         model: Gaussians that the fit begins with.
-        config, extent: Of the fit.
+        config, extent: Configuration of the fit, and extent of the scene.
         found: What points say of the gains of the V photographs.
     """
     frames = frames_for(views, config.data, min(_TRIAL_PIXELS, config.data.max_pixels))
