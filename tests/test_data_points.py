@@ -506,7 +506,7 @@ def test_what_is_hidden_is_not_shared(tmp_path, rng):
         views.append(View(camera, f"{i}"))
     points = np.concatenate([rng.uniform(-1, 1, (400, 2)), np.repeat([0.5, -0.5], 200)[:, None]], axis=1)
     tracks = {f"{i}": np.arange(0, 200, 1 + i % 3) + (0 if i < 3 else 200) for i in range(6)}
-    got, shown = shared_points(Dataset(tmp_path, "colmap", views, points, tracks=tracks), views)
+    got, shown = shared_points(Dataset(tmp_path, "colmap", views, points, tracks=(points, tracks)), views)
     np.testing.assert_array_equal(got, points)
     assert min(shown[:3, :200].mean(), shown[3:, 200:].mean()) > 0.75  # their own tracks: 0.61
     assert not shown[:3, 200:].any()
@@ -539,7 +539,12 @@ def test_given_points_get_guesses_where_there_are_none(tmp_path, rng):
     views = plane_views(tmp_path, rng)
     points = np.stack([rng.uniform(-1.5, -0.2, 300), rng.uniform(-1, 1, 300), np.zeros(300)], axis=1)
     model = Dataset(
-        tmp_path, "colmap", views, points, point_source="model", tracks={v.name: np.arange(300) for v in views}
+        tmp_path,
+        "colmap",
+        views,
+        points,
+        point_source="model",
+        tracks=(points, {v.name: np.arange(300) for v in views}),
     )
     got, colors, source = initial_points(model, max_points=3000, train=views[1:])
     assert len(got) == len(colors)

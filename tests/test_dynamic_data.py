@@ -414,13 +414,13 @@ def test_a_model_says_which_photographs_show_a_point(tmp_path):
     for name in names:
         cv2.imwrite(str(tmp_path / "images" / name), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     data = load(tmp_path)
-    assert {name: list(shown) for name, shown in data.tracks.items()} == {
+    assert {name: list(shown) for name, shown in data.tracks[1].items()} == {
         "c": [0, 2],
         "a": [0, 1, 2],
         "b": [1, 2],
         "d": [],
     }
-    np.testing.assert_allclose(data.points[:, 0], [0, 1, 2])
+    np.testing.assert_allclose(data.tracks[0], data.points)
     assert load(tmp_path, points=False).tracks is None
 
 

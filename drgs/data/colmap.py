@@ -122,15 +122,17 @@ def load_colmap(
 COLMAP = Format(lambda path: find_model(path) is not None, load_colmap, MODEL_FOLDERS)
 
 
-def _tracks(reconstruction: Any, by_id: dict[int, View]) -> dict[str, np.ndarray] | None:
-    """View name -> indices of points that it shows, of the order of `model_points`; None where no point has a track."""
+def _tracks(reconstruction: Any, by_id: dict[int, View]) -> tuple[np.ndarray, dict[str, np.ndarray]] | None:
+    """Points, and view name -> indices of those that it shows; None where no point has a track."""
     keys = sorted(reconstruction.point3D_ids())
+    points = [reconstruction.points3D[key] for key in keys[:: -(-len(keys) // _MOST_TRACKS) or 1]]
     found: dict[str, list[int]] = {view.name: [] for view in by_id.values()}
-    for index in range(0, len(keys), -(-len(keys) // _MOST_TRACKS) or 1):
-        images = {element.image_id for element in reconstruction.points3D[keys[index]].track.elements}
-        for image_id in images & by_id.keys():
+    for index, point in enumerate(points):
+        for image_id in {element.image_id for element in point.track.elements} & by_id.keys():
             found[by_id[image_id].name].append(index)
-    return {name: np.array(x, np.int64) for name, x in found.items()} if any(found.values()) else None
+    if not any(found.values()):
+        return None
+    return np.array([point.xyz for point in points]), {name: np.array(x, np.int64) for name, x in found.items()}
 
 
 def _reprojection(reconstruction: Any) -> float | None:

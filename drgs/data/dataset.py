@@ -40,8 +40,8 @@ class Dataset:
             where there are no synchronous cameras.
         reprojection: Median angle in radians between observations of the data set's points and where its cameras see
             these points; None where it states none.
-        tracks: View name -> (N,) int64 indices of points that this view was found to show, among 20,000 at most; None
-            where the data set does not say.
+        tracks: Points (N, 3), 20,000 of the data set's own at most, and view name -> int64 indices of those that this
+            view was found to show; None where the data set does not say.
     """
 
     path: Path
@@ -57,7 +57,7 @@ class Dataset:
     test_cameras: tuple[str, ...] | None = None
     frames: tuple[int, ...] = ()
     reprojection: float | None = None
-    tracks: Mapping[str, np.ndarray] | None = None
+    tracks: tuple[np.ndarray, Mapping[str, np.ndarray]] | None = None
 
     @property
     def times(self) -> tuple[float, ...]:

@@ -90,7 +90,7 @@ def initial_points(
     if isinstance(data, Dataset) and data.points is not None and len(data.points):
         colors = data.colors if data.colors is not None else np.full(data.points.shape, 0.5, dtype=np.float32)
         if train and data.tracks is not None:
-            places, shown = _tracked(data.points, data.tracks, train)
+            places, shown = _tracked(*data.tracks, train)
             if len(places) >= _MIN_TRIANGULATED:
                 hull = Hull.of(train, progress)
                 points, colors = _with_guesses(
@@ -231,8 +231,8 @@ def shared_points(
     Returns:
         Points (P, 3) and (V, P) bool; None where nothing says what hides them.
     """
-    if dataset.tracks is not None and dataset.points is not None:
-        return _shown_beside(views, *_tracked(dataset.points, dataset.tracks, views))
+    if dataset.tracks is not None:
+        return _shown_beside(views, *_tracked(*dataset.tracks, views))
     if any(view.depth_path is not None for view in views):
         return _shown_by_depth(views, np.random.default_rng(seed))
     if matches is None or len(views) < 2:
