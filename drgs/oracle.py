@@ -78,8 +78,10 @@ class OracleScene:
         means: (N, 3) world units.
         axes: (N, 3, 3), columns are the semi-axes R S.
         whiten: (N, 3, 3) S^-1 R^T, from world axes to the local frame.
-        adjugate: (N, 3, 3) s_1 s_2 s_3 S^-1 R^T, of products of scales: right for discs, which `whiten` is not.
-        volume: (N,) s_1 s_2 s_3.
+        width: (N,) largest scale, a number: relative to it products of scales do not underflow.
+        adjugate: (N, 3, 3) s_1 s_2 s_3 S^-1 R^T of scales relative to `width`, of their products: right for discs,
+            which `whiten` is not.
+        volume: (N,) s_1 s_2 s_3 of scales relative to `width`.
         logits: (N,) raw opacities.
         softplus: (N,) softplus(logit), the optical depth of a full pass through the center.
         sh: (N, K, 3) coefficients.
@@ -96,6 +98,7 @@ class OracleScene:
     means: torch.Tensor
     axes: torch.Tensor
     whiten: torch.Tensor
+    width: torch.Tensor
     adjugate: torch.Tensor
     volume: torch.Tensor
     logits: torch.Tensor
@@ -196,13 +199,16 @@ def activate(g: Any, s: RenderSettings) -> OracleScene:
         # The N tails beyond these radii add up to at most N alpha exp(-extent^2 / 2) = 1e-5. No derivative: a cut-off.
         extent = (2 * torch.log((torch.sigmoid(logits.detach()) * n / 1e-5).clamp(min=1))).sqrt()
     scales = log_scales.exp()
-    others = scales[:, [1, 2, 0]] * scales[:, [2, 0, 1]]
+    width = scales.detach().amax(1)
+    relative = scales / width[:, None]
+    others = relative[:, [1, 2, 0]] * relative[:, [2, 0, 1]]
     return OracleScene(
         means=means,
         axes=rotation * scales[:, None, :],
         whiten=(-log_scales).exp()[:, :, None] * rotation.transpose(1, 2),
+        width=width,
         adjugate=others[:, :, None] * rotation.transpose(1, 2),
-        volume=scales.prod(1),
+        volume=relative.prod(1),
         logits=logits,
         softplus=torch.logaddexp(logits, torch.zeros_like(logits)),
         sh=sh,

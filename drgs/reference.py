@@ -379,8 +379,10 @@ class _Peak:
         local = torch.einsum("nij,pnj->pni", scene.adjugate, away)
         slope = torch.einsum("nij,pj->pni", scene.adjugate, d)
         crossed = torch.einsum("nji,pnj->pni", scene.axes, torch.linalg.cross(away, d[:, None, :].expand_as(away)))
+        crossed = crossed / scene.width[:, None] / scene.width[:, None]
         length2 = slope.square().sum(-1)
-        return crossed.square().sum(-1) / length2, (local * slope).sum(-1) / length2, length2.sqrt() / scene.volume
+        length = length2.sqrt() / scene.volume / scene.width
+        return crossed.square().sum(-1) / length2, (local * slope).sum(-1) / length2, length
 
     def opacity(self, scene: OracleScene, rho2: Tensor, t: Tensor, length: Tensor) -> tuple:
         """a and 1 - a, neither by a difference that cancels."""
