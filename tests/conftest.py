@@ -46,8 +46,10 @@ def pytest_addoption(parser):
     parser.addoption("--slow", action="store_true", help="run tests marked slow")
 
 
-def pytest_collection_modifyitems(items):
-    """Cases of a test that is marked `every(n)` are slow but for each n-th, counted from the first."""
+def pytest_collection_modifyitems(config, items):
+    """Cases of a test that is marked `every(n)` are slow but for each n-th, counted from the first; slow tests are
+    skipped before their fixtures are made.
+    """
     counts: dict[str, int] = {}
     for item in items:
         marker = item.get_closest_marker("every")
@@ -56,6 +58,8 @@ def pytest_collection_modifyitems(items):
             count = counts[name] = counts.get(name, -1) + 1
             if count % marker.args[0]:
                 item.add_marker("slow")
+        if item.get_closest_marker("slow") and not config.getoption("--slow"):
+            item.add_marker(pytest.mark.skip(reason="slow: run with --slow"))
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -70,8 +74,6 @@ def pytest_xdist_make_scheduler(config, log):
 
 @pytest.fixture(autouse=True)
 def _skip_by_marker(request):
-    if request.node.get_closest_marker("slow") and not request.config.getoption("--slow"):
-        pytest.skip("slow: run with --slow")
     if request.node.get_closest_marker("same_bits") and os.environ["DRGS_VARIANT"] == "cuda_ad_rgb":
         pytest.skip("on a card the order of sums, and so their last bits, is another in each run")
     if request.node.get_closest_marker("cuda"):

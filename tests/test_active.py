@@ -571,7 +571,7 @@ def test_killed_run_picks_the_same_views(still, tmp_path, monkeypatch, policy, m
     monkeypatch.undo()
     header = load_state(tmp_path / "b/state.safetensors")[1]
     assert (header["step"], len(header["active"]["picks"])) == (8, 2 if moment == "between picks" else 1)
-    assert len(without_times(tmp_path / "b/selection.json")["picks"]) == 2
+    assert len(without_times(tmp_path / "b/selection.json")["picks"]) == len(header["active"]["picks"])
     fit(lazily(still), tmp_path / "b", cfg.replace(selection=active), resume=True, progress=False)
     assert without_times(tmp_path / "a/selection.json") == without_times(tmp_path / "b/selection.json")
     assert (tmp_path / "a/point_cloud.ply").read_bytes() == (tmp_path / "b/point_cloud.ply").read_bytes()

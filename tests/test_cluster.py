@@ -621,6 +621,7 @@ def test_cells_that_fail_or_are_taken(cluster, still_folder, tmp_path, monkeypat
         run_cells_on(cluster, study, cells, tmp_path, tmp_path / "rows.jsonl", said.append)
 
 
+@pytest.mark.slow
 def test_a_cell_is_not_bound_to_workers_that_end(cluster, still_folder, tmp_path, monkeypatch):
     """The lock of a cell names another machine, whose only worker ends before it takes the cell: another worker has it
     then, and says that it is taken.

@@ -409,7 +409,7 @@ def test_crops_show_something():
     assert "a crop of 32x32 pixels of 2 views (1 more show nothing) of 160x128, at (" in text
 
 
-@pytest.mark.every(3)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "fields",
     [{"response": "integral"}, {"order": "center", "extent": 3.0}, {"traversal": "bvh", "sh_direction": "ray"}],

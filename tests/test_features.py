@@ -133,7 +133,7 @@ def everything(g, cam, settings, **options):
     }
 
 
-@pytest.mark.every(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [128, 1])
 def test_blocks_of_weights(rng, width, monkeypatch):
     """Weights that are held for a few tiles at a time give the same, and are never more than the bound."""

@@ -138,7 +138,7 @@ KINDS = [
 ]
 
 
-@pytest.mark.every(5)
+@pytest.mark.every(7)
 @pytest.mark.parametrize(("name", "fields"), KINDS, ids=lambda f: f if isinstance(f, str) else "-".join(map(str, f)))
 def test_images_and_derivatives(rng, name, fields):
     """Images, adjoint and forward mode, the pose's among them, within the tolerances of pinholes."""

@@ -401,6 +401,7 @@ def test_sizes_are_those_of_the_paper():
     assert SIZES["dynamic", "paper"].fit.max_steps == 17_000
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_is_not_there(tmp_path, capsys):
     """One line, before anything is made."""
     pytest.importorskip("distributed")

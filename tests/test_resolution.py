@@ -204,6 +204,7 @@ def test_everything_goes_on_with_the_same_bits(dataset):  # noqa: F811
     assert {name.split(".")[0] for name in ends[0]} >= {"exposure", "poses", "filter_3d"}
 
 
+@pytest.mark.slow
 def test_reach_and_information_of_poses_are_of_the_full_size(dataset, seen):  # noqa: F811
     """Refinement that begins while steps see small pictures begins with the same numbers as without; only the step
     itself is small."""

@@ -266,6 +266,7 @@ def test_render_and_query(place):
     check("query.json", _read(place / "found/query.json"))
 
 
+@pytest.mark.slow
 def test_crossval_tradeoff_and_stress(tmp_path, monkeypatch):
     """Of a rasterizer that is wrong forward, with its ladder, and of one with another convention; of a small scene; of
     a case.

@@ -182,8 +182,8 @@ def test_maps_are_of_photographs_as_they_are(capture, model, capsys):
     torch.testing.assert_close(read_map(view.teacher_path).float(), want, rtol=2e-3, atol=2e-3)  # half precision
     assert float((view.teacher().float() - want).abs().max()) > 0.05
     assert view.teacher_path.parent.name == PurePosixPath(view.name).parent.name
-    shutil.copy(capture / "images/view_1.png", capture / "images/view_1.jpg")
-    poses["frames"].append(poses["frames"][1] | {"file_path": "images/view_1.jpg"})
+    shutil.copy(capture / "images/view_2.png", capture / "images/view_1.jpg")
+    poses["frames"][2]["file_path"] = "images/view_1.jpg"
     path.write_text(json.dumps(poses))
     assert teach(capture, model) == 2
     assert "must have a name of its own" in capsys.readouterr().err

@@ -238,7 +238,8 @@ class Session:
         self._ask_later()
 
     async def _time_chosen(self, _: Any) -> None:
-        assert self._slider is not None
+        if self._slider is None:  # what the browser sent before it knew that nothing moves any longer
+            return
         wanted = self.subject.moment(float(self._slider.value))
         if wanted != self.time:
             self.time = wanted
@@ -247,7 +248,8 @@ class Session:
             self._ask_later()
 
     async def _play_clicked(self, _: Any) -> None:
-        assert self._button is not None
+        if self._button is None:  # as above
+            return
         if self._playing is not None:
             self._stop_playing()
             self._ask_later()
