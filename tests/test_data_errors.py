@@ -225,6 +225,23 @@ def test_absent_images_are_named_and_left_out(tmp_path, caplog, write, lazy):
     one_line(error)
 
 
+@pytest.mark.parametrize("write", [write_transforms, write_colmap])
+def test_damaged_images_are_named_and_left_out(tmp_path, caplog, write):
+    """As absent ones are, and as `drgs sfm` and `drgs capture` do: cut off, empty, or no image."""
+    write(tmp_path, count=10)
+    images = [view.image_path for view in load(tmp_path, test_every=3).views]
+    data = images[1].read_bytes()
+    for k, damaged in ((1, data[: len(data) // 2]), (3, b""), (5, b"no image")):
+        images[k].write_bytes(damaged)
+    left = load(tmp_path, test_every=3)
+    told = f"3 of the 10 images that it lists are damaged ({images[1]}, {images[3]}, {images[5]}); going on with"
+    assert told in caplog.text
+    assert [view.image_path for view in left.views] == [path for k, path in enumerate(images) if k not in (1, 3, 5)]
+    images[7].unlink()
+    with pytest.raises(FileNotFoundError, match="4 of the 10 images that it lists are not there or damaged .*; all"):
+        load(tmp_path, strict=True)
+
+
 def test_transforms_rounded_poses_are_repaired(tmp_path):
     """Three digits are enough for a rotation."""
     data = write_transforms(tmp_path)

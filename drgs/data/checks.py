@@ -30,6 +30,7 @@ __all__ = [
     "check_last_row",
     "check_npz",
     "image_size",
+    "is_damaged",
     "file_inside",
     "inverse_pose",
     "list_images",
@@ -270,6 +271,15 @@ def image_size(path: Path) -> tuple[int, int]:
             f"header says {width}x{height}; it is damaged, copy it again"
         )
     return width, height
+
+
+def is_damaged(path: Path) -> bool:
+    """Whether an image file that is there can be no photograph of a data set: not an image, empty, or cut off."""
+    try:
+        image_size(path)
+    except ValueError:
+        return True
+    return False
 
 
 def read_image(path: Path) -> np.ndarray:

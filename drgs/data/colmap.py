@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera, intrinsics
-from drgs.data.checks import file_inside, names_of_here
+from drgs.data.checks import file_inside, is_damaged, names_of_here
 from drgs.data.colmap_files import MODEL_FILES, MODEL_FOLDERS, find_model, image_folder, model_suffix, point_ply
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
@@ -93,7 +93,7 @@ def load_colmap(
         view = View(None, str(Path(name).with_suffix("")), image_path=file)
         listed.append(view)
         by_id[image_id] = view
-        if not is_file(view.image_path):
+        if not is_file(view.image_path) or (not lazy and is_damaged(view.image_path)):
             absent.append(view)
             continue
         camera = model_camera(reconstruction, image, where)

@@ -18,6 +18,7 @@ from drgs.data.checks import (
     file_inside,
     image_size,
     inverse_pose,
+    is_damaged,
     names_of_here,
     repaired_pose,
 )
@@ -96,7 +97,7 @@ def load_transforms(
     source = ""
     read = {file: _frames(file) for file in files}
     dataset = Dataset(path, "transforms", [])
-    rows = _listed(read, dataset)
+    rows = _listed(read, dataset, lazy)
     go_on_without(path, [view.image_path for view in dataset.absent], len(dataset.views), strict)
     _name_cameras(dataset, [frame.get("time") for data in read.values() for frame in data["frames"]])
     first = _FirstImage(dataset, test_every, test_offset, test_cameras) if lazy else None
@@ -150,8 +151,9 @@ def _name_cameras(dataset: Dataset, times: list[Any]) -> None:
         dataset.test_cameras = (names[0],)
 
 
-def _listed(read: dict[Path, dict], dataset: Dataset) -> dict[Path, list[View | None]]:
-    """Name, split and image of every frame, put into `dataset.views`, or into `absent` where there is no image.
+def _listed(read: dict[Path, dict], dataset: Dataset, lazy: bool) -> dict[Path, list[View | None]]:
+    """Name, split and image of every frame, put into `dataset.views`, or into `absent` where there is no image or a
+    damaged one, for which none is opened if `lazy`.
 
     Returns:
         The view of every frame of every file, None where it is absent.
@@ -166,8 +168,9 @@ def _listed(read: dict[Path, dict], dataset: Dataset) -> dict[Path, list[View | 
             image = _image_file(path)
             view = View(None, _view_name(name), image_path=image or path, split=split)
             listed.append(view)
-            (dataset.absent if image is None else dataset.views).append(view)
-            rows[file].append(None if image is None else view)
+            is_there = image is not None and (lazy or not is_damaged(image))
+            (dataset.views if is_there else dataset.absent).append(view)
+            rows[file].append(view if is_there else None)
     make_unique(listed)
     return rows
 

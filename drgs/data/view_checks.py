@@ -15,6 +15,7 @@ import numpy as np
 from drgs.data.checks import read_image, unit_range
 from drgs.data.image_headers import png_has_alpha
 from drgs.data.resizing import resize_area
+from drgs.guards.foreign import is_file
 
 if TYPE_CHECKING:
     from drgs.data.dataset import Dataset
@@ -47,11 +48,11 @@ _log = logging.getLogger(__name__)
 
 
 def go_on_without(where: Path, missing: list[Path], left: int, strict: bool) -> None:
-    """Say which images of a data set are not there, or refuse the data set.
+    """Say which images of a data set are not there, or damaged, or refuse the data set.
 
     Args:
         where: The file that lists them.
-        missing: The images that are not there; nothing is done if there are none.
+        missing: The images that are not there or damaged; nothing is done if there are none.
         left: How many are there.
         strict: Refuse whatever is left.
     Raises:
@@ -62,7 +63,9 @@ def go_on_without(where: Path, missing: list[Path], left: int, strict: bool) -> 
     names = [str(path)[:_LONGEST] for path in missing]
     count = len(missing) + left
     shown = ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
-    told = f"{where}: {len(names)} of the {count} images that it lists are not there ({shown})"
+    damaged = sum(is_file(path) for path in missing)
+    state = "not there" if not damaged else "damaged" if damaged == len(missing) else "not there or damaged"
+    told = f"{where}: {len(names)} of the {count} images that it lists are {state} ({shown})"
     if strict or left < _FEWEST:
         rule = "all must be there" if strict else f"at least {_FEWEST} must be there"
         hint = ", or drop --strict (strict=True) to go on without them" if strict and left >= _FEWEST else ""
@@ -71,7 +74,7 @@ def go_on_without(where: Path, missing: list[Path], left: int, strict: bool) -> 
     if len(names) > _SHOWN:
         others = [path.name[:_LONGEST] for path in missing[_SHOWN : _SHOWN + _ALSO]]
         more = len(names) - _SHOWN - len(others)
-        _log.info("also not there: %s%s", ", ".join(others), f" and {more} more" if more else "")
+        _log.info("also %s: %s%s", state, ", ".join(others), f" and {more} more" if more else "")
 
 
 def check_parallax(views: list[View]) -> None:
