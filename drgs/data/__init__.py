@@ -121,8 +121,8 @@ def load(
         points: False reads no points and no observations of images: those of a COLMAP model, or of a named PLY, come
             from all its images; of a model of synchronous cameras, those are read that two cameras show which are not
             held out.
-        strict: Refuse a data set that lists images which are not there or damaged. By default at least 3 must be left; the
-            missing ones are named in the log and held in `Dataset.absent`.
+        strict: Refuse a data set that lists images which are not there or damaged. By default at least 3 must be left;
+            those are named in the log and held in `Dataset.absent`.
         semantics: Look for a teacher's maps and for labels (`drgs.data.sidecars`); False leaves them alone.
         times: How many frames of synchronous cameras are used: of every camera the same, evenly over the sequence, all
             if there are no more; `Dataset.frames` says which. D-NeRF's photographs are all used.
