@@ -335,6 +335,7 @@ def test_auto_begins_when_a_photograph_differs(even, tmp_path, capsys):
     same_run(tmp_path / "run", tmp_path / "again")
 
 
+@pytest.mark.slow
 def test_auto_ends_when_more_photographs_say_otherwise(even, tmp_path, monkeypatch, capsys):
     """What the first few points said is taken back: gains and their network go, and nothing is eliminated any more;
     resumed after that, the fit ends in the same bits.
@@ -408,6 +409,7 @@ def test_a_killed_fit_goes_on_with_gains_and_poses(uneven, tmp_path, moment):
     assert header["networks"] == ["exposure", "poses"]
 
 
+@pytest.mark.slow
 def test_everybody_sees_what_an_active_fit_has_refined(uneven, tmp_path, capsys):
     """refined_cameras.json has all photographs that are in, and no other; eval, report, select and fisher take it."""
     run = tmp_path / "run"

@@ -213,6 +213,7 @@ def test_what_is_told(captured, capsys):
     assert "drgs capture --more -o" in lines[-1]
 
 
+@pytest.mark.slow
 def test_further_photographs(joined, captured):
     """They join the world that was there; held-out views stay the same; the fit begins with the Gaussians that exist,
     and knows more afterwards.

@@ -140,7 +140,7 @@ def test_no_false_alarm(seed, preset):
     assert result.report["image"]["after"] < 1e-5
 
 
-@pytest.mark.every(4)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["early_stop", "quaternion_order", "opacity_detached", "pixel_center"])
 def test_preset_is_found_beside_a_defect(name):
     """What a rasterizer claims to be need not be said."""
@@ -347,7 +347,7 @@ def test_our_own_presets_agree_with_the_oracle(preset):
     assert result.report["preset"] == preset
 
 
-@pytest.mark.every(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("contrast", [0.05, 0.0])
 def test_near_ties_are_no_difference(contrast, monkeypatch):
     """Where depths tie within float32 either order is right: it is no convention, and no other model.
@@ -381,6 +381,7 @@ def test_near_ties_are_no_difference(contrast, monkeypatch):
     assert bool(found.findings) == (contrast > 0)
 
 
+@pytest.mark.slow
 def test_crops_show_something():
     """Of a scene too large for the oracle, each view is looked at where most is seen, and the report says so."""
     g, (camera,) = random_scene(0)

@@ -215,6 +215,7 @@ def test_boxes_of_the_unscented_transform():
     assert crossval(ours(whole, "whole"), g, [camera], "3dgut", FIELDS).verdict == "agreement"
 
 
+@pytest.mark.slow
 def test_projected_instead_of_along_rays():
     """A rasterizer of the other kind than its preset is named so, and not by what follows from it."""
     g, camera = _made(0)
@@ -305,6 +306,7 @@ def test_command_through_a_lens(tmp_path, lens):
         del sys.modules["taken_down"]
 
 
+@pytest.mark.slow
 def test_the_ladder_goes_through_a_lens():
     """From `3dgut` to `exact`, and from `gsplat` with `3dgut` on the way, the image's shares sum to one."""
     g, camera = _made(0, "opencv")

@@ -73,6 +73,7 @@ def settings(**fields):
     return config(max_gaussians=140, **fields)
 
 
+@pytest.mark.slow
 def test_each_frame_has_its_own_gain(dataset, tmp_path):
     """Gains of four cameras at three times come back within 0.03, though something moved; the scene is fitted with
     them, and the run says so.
@@ -100,7 +101,7 @@ def test_photographs_fit_better_with_gains(dataset, tmp_path):
     assert last[1] > last[0] + 0.5
 
 
-@pytest.mark.every(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("at", [3, 9], ids=["static", "dynamic"])
 @pytest.mark.same_bits
 def test_learned_gains_go_on_in_either_stage(dataset, whole_and_resumed, at):

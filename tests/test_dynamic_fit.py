@@ -108,6 +108,7 @@ def test_two_cameras_are_told_of_before_the_first_step(dataset, tmp_path, caplog
         assert told[0] == expected
 
 
+@pytest.mark.slow
 def test_renderers_are_taken_in_turn_in_the_dynamic_stage(dataset, tmp_path, rendered):
     """What moves is fitted with all of them; the run is measured in each."""
     result = fit(dataset, tmp_path / "run", config(renderers=("any",)), progress=False)

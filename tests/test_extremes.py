@@ -45,13 +45,13 @@ def _check(row):
 
 
 def _rows():
-    """Every case of the default model on tiles; of the other models and of bvh each fourth, the rest are slow."""
+    """Every case of the default model on tiles; of the other models and of bvh each sixth, the rest are slow."""
     others = 0
     for case in CASES:
         for traversal in case.traversals:
             is_repeated = False
             if traversal == "bvh" or case.settings.response != "peak":
-                is_repeated = others % 4 > 0
+                is_repeated = others % 6 > 0
                 others += 1
             yield pytest.param(case.name, traversal, marks=[pytest.mark.slow] if is_repeated else [])
 

@@ -97,7 +97,7 @@ def test_a_fit_through_the_lens(bent, tmp_path, whole_and_resumed):
         )
 
 
-@pytest.mark.every(2)
+@pytest.mark.slow
 def test_wide_lenses_are_kept_where_renderers_can(wide, tmp_path):
     """Auto fits what no pinhole holds through its lens, learns, and says why; where it cannot, it says what would."""
     result = fit(wide, tmp_path / "run", config(max_steps=200), progress=False)

@@ -72,6 +72,7 @@ def test_a_ball_of_exact_depth_is_closed_and_where_it_is():
     assert mesh.areas().sum() == pytest.approx(4 * np.pi * RADIUS**2, rel=0.02)
 
 
+@pytest.mark.slow
 def test_bricks_meet_without_a_seam():
     """Voxels so small that the ball is in many bricks, or so large that it is in one: the same ball."""
     views = [ball_view(camera) for camera in around(size=96)]

@@ -85,6 +85,7 @@ def half_seen(tmp_path_factory):
     return folder / "run"
 
 
+@pytest.mark.slow
 def test_the_first_place_looks_at_the_hole(half_seen, capsys):
     """It stands where no photograph was taken from and looks at the ball; the words say the way there."""
     assert cli.main(["capture", "--more", "-k", "4", "-o", str(half_seen)]) == 0

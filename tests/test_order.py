@@ -64,7 +64,7 @@ def test_information_of_rays_walked_three_times(rng, monkeypatch, direction):
         assert dense.error(fisher.blocks(g, cam, settings), torch.einsum("pni,pnj->nij", rows, rows)) <= 1e-4
 
 
-@pytest.mark.every(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [0, 3])
 def test_tables_of_few_tiles(rng, monkeypatch, width):
     """Derivatives whose tables are filled for a few tiles at a time are the same, whatever orders are held."""

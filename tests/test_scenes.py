@@ -148,6 +148,7 @@ def test_images_show_what_the_geometry_says(views):
     assert max(map(abs, shifts[green.argmax()])) == 0
 
 
+@pytest.mark.slow
 def test_same_parameters_are_reused_and_others_replace(made, tmp_path, monkeypatch):
     """A finished folder is kept, another seed replaces it, the first seed gives the same bits."""
     with monkeypatch.context() as patch:

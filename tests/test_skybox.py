@@ -183,6 +183,7 @@ def test_nothing_speaks_against_photographs():
     assert why_not(masked, (0.0, 0.0, 0.0)) is None
 
 
+@pytest.mark.slow
 def test_held_out_views_are_better_and_the_file_has_it(tmp_path):
     """In fast and gsplat, by 2 dB and more; what is read from the PLY looks the same; all is recorded."""
     dataset = dataset_of(photographs(), tmp_path)

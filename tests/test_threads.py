@@ -36,6 +36,7 @@ def everything(seed: int) -> list[torch.Tensor]:
     return [out.rgb.detach(), pushed.rgb, cam.w2c.grad, *(x.grad for x in g.parameters().values())]
 
 
+@pytest.mark.slow
 def test_two_workers(two_threads):
     """With two threads of Dr.Jit images, gradients, tangents and information are those of one, to rounding."""
     rng = np.random.default_rng(3)
