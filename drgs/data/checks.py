@@ -274,7 +274,12 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def is_damaged(path: Path) -> bool:
-    """Whether an image file that is there can be no photograph of a data set: not an image, empty, or cut off."""
+    """Whether an image file that is there can be no photograph of a data set: not an image, empty, or cut off.
+
+    Raises:
+        ValueError: The file is of another kind, of which it is said what to do, e.g. a Git LFS pointer.
+    """
+    refuse_foreign(path, "an image")
     try:
         image_size(path)
     except ValueError:
