@@ -279,7 +279,8 @@ def is_damaged(path: Path) -> bool:
     Raises:
         ValueError: The file is of another kind, of which it is said what to do, e.g. a Git LFS pointer.
     """
-    refuse_foreign(path, "an image")
+    if not is_heif(path):  # which is an image here
+        refuse_foreign(path, "an image")
     try:
         image_size(path)
     except ValueError:
