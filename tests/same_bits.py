@@ -13,6 +13,7 @@ import hashlib
 import json
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,8 @@ ENVIRONMENT = {
 }
 RECORD = Path(__file__).with_name("same_bits.json")
 WIDTH, HEIGHT, VIEWS, CHANNELS = 32, 24, 9, 5
+EVERYTHING = ["--exposure", "learned", "--poses", "refined", "--skybox", "on", "--transients", "mask"]
+EVERYTHING += ["--filter-3d", "on", "--num-downscales", "1", "--save-every", "50"]
 _CLOCK = ("seconds", "minutes", "date", "when", "version", "machine", "commit", "command", "path", "file", "memory")
 
 
@@ -59,14 +62,23 @@ def made(folder: Path) -> dict:
     quick = ["--deterministic", "--max-steps", "24", "--max-gaussians", "80", "--test-every", "4", "--quiet"]
     quick += ["--no-report", "--sh-degree", "1"]
 
-    def run(*arguments: str) -> None:
-        if code := cli.main([*arguments]):
-            raise SystemExit(f"{' '.join(arguments)}: {code}")
+    def run(*arguments: str, code: int = 0) -> None:
+        if (ended := cli.main([*arguments])) != code:
+            raise SystemExit(f"{' '.join(arguments)}: {ended}")
 
     run("fit", "still", "-o", "run", *quick, "--feature-width", "4", "--for", "fast")
     run("fit", "moving", "-o", "moved", *quick, "--static-share", "0.4", "--for", "fast")
     active = ["--views", "active", "--initial", "3", "--add", "2", "--every", "6"]
     run("fit", "still", "-o", "picked", *quick, *active, "--preset", "exact", "--feature-width", "4")
+    # All that a fit can have besides photographs and Gaussians, 200 steps long, in one go and in two.
+    every = [*EVERYTHING, *quick]
+    every[every.index("--max-steps") + 1] = "200"
+    run("fit", "still", "-o", "everything", *every)
+    stop_at(130, run, "fit", "still", "-o", "stopped", *every)
+    run("fit", "still", "-o", "stopped", *every, "--resume")
+    run("fit", "still", "-o", "joined", *quick, *active, "--exposure", "learned", "--poses", "refined", "--for", "fast")
+    stop_at(15, run, "fit", "moving", "-o", "moved again", *quick, "--static-share", "0.4", "--for", "fast")
+    run("fit", "moving", "-o", "moved again", *quick, "--static-share", "0.4", "--for", "fast", "--resume")
     ask = ["run", "--candidates", "around.json", "-k", "2", "--quiet"]
     run("select", *ask, "-o", "default.json")
     run("select", *ask, "--criterion", "eig", "--blocks", "geometry,backdrop", "-o", "eig.json")
@@ -74,6 +86,9 @@ def made(folder: Path) -> dict:
     run("select", "moved", "--candidates", "around.json", "--time", "0.5", "--quiet", "-o", "moved.json")
     run("fisher", "run", "--limit", "1", "--pose", "--quiet", "-o", "fisher")
     run("crossval", "run", "--rasterizer", "drgs:gsplat", "--limit", "1", "--quiet", "-o", "crossval")
+    sys.path.insert(0, str(Path(__file__).parent))
+    broken = "same_bits:broken_rasterizer"
+    run("crossval", "run", "--rasterizer", broken, "--limit", "1", "--quiet", "-o", "broken", code=1)
     run(
         "render",
         "run",
@@ -88,7 +103,7 @@ def made(folder: Path) -> dict:
         "drawn",
     )
     found = {"control": control()}
-    for name in ("run", "moved", "picked"):
+    for name in ("run", "moved", "picked", "everything", "stopped", "joined", "moved again"):
         found[f"{name}: Gaussians"] = of_arrays(safetensors(Path(name) / "state.safetensors"))
         found[f"{name}: metrics"] = of_json(Path(name) / "metrics.json")
     for name in ("default", "eig", "fisherrf", "moved"):
@@ -96,8 +111,55 @@ def made(folder: Path) -> dict:
     found["fisher"] = of_arrays(safetensors(Path("fisher/information.safetensors")))
     found["fisher.json"] = of_json(Path("fisher/fisher.json"))
     found["crossval"] = of_json(Path("crossval/crossval.json"))
+    found["broken"] = of_json(Path("broken/crossval.json"))
+    found["gradients"] = gradients(Path("run/point_cloud.ply"), Path("around.json"))
     found["render"] = of_arrays({path.name: picture(path) for path in sorted(Path("drawn").glob("*.*[gr]"))})
     return found
+
+
+def stop_at(step: int, run: Callable[..., None], *arguments: str) -> None:
+    """Run a fit that is interrupted before a step."""
+    from drgs.train import Trainer
+
+    whole = Trainer.step
+
+    def until(self: Trainer) -> Any:
+        if self.step_index == step:
+            raise KeyboardInterrupt
+        return whole(self)
+
+    Trainer.step = until
+    try:
+        run(*arguments, code=130)
+    finally:
+        Trainer.step = whole
+
+
+def broken_rasterizer(means: Any, quats: Any, scales: Any, *rest: Any, **options: Any) -> Any:
+    """gsplat's `rasterization` as drgs has it, whose gradient of the quaternions has the wrong sign."""
+    from drgs.rasterize import rasterization
+
+    return rasterization(means, 2 * quats.detach() - quats, scales, *rest, **options)
+
+
+def gradients(scene: Path, around: Path) -> dict:
+    """Of each parameter and of the camera's pose, in three presets and two traversals."""
+    import torch
+
+    from drgs.data.camera_lists import load_cameras_json
+    from drgs.ellipsoids import Gaussians
+    from drgs.files import load_ply
+    from drgs.integrator import render
+    from drgs.settings import RenderSettings
+
+    camera = load_cameras_json(around)[0]
+    arrays = {}
+    for preset, change in (("exact", {}), ("exact", {"traversal": "bvh"}), ("fast", {}), ("mitsuba", {})):
+        parameters = {name: x.requires_grad_() for name, x in load_ply(scene).parameters().items()}
+        out = render(Gaussians(**parameters), camera, RenderSettings.preset(preset, **change))
+        ((out.rgb * torch.linspace(-1, 1, out.rgb.numel()).reshape(out.rgb.shape)).sum() + out.alpha.sum()).backward()
+        arrays |= {f"{preset}{change}{name}": x.grad.numpy() for name, x in parameters.items()}
+    return of_arrays(arrays)
 
 
 def write_photographs(folder: Path, times: int = 1) -> None:

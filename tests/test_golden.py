@@ -47,6 +47,8 @@ LINES = (
 )
 QUICK = ("--max-steps", "24", "--save-every", "6", "--max-gaussians", "80", "--feature-width", "4", "--sh-degree", "1")
 QUICK += ("--test-every", "4", "--no-report", "--quiet")
+EVERYTHING = ("--exposure", "learned", "--poses", "refined", "--skybox", "on", "--transients", "mask")
+EVERYTHING += ("--filter-3d", "on")
 
 
 def parsed(line: str) -> dict:
@@ -101,6 +103,16 @@ def test_a_stopped_run_goes_on(place):
     assert psnr[1] == pytest.approx(psnr[0], abs=0.5)
 
 
+def test_a_stopped_run_with_everything_goes_on(place):
+    """Gains, poses, a skybox, transients and a low-pass filter are read from its checkpoint, and reported."""
+    from drgs import cli
+
+    assert cli.main(["fit", "still", "-o", "everything", *QUICK, *EVERYTHING, "--resume"]) == 0
+    metrics = json.loads(Path("everything/metrics.json").read_text())
+    assert {"poses", "skybox"} <= set(metrics)
+    assert Path("everything/refined_cameras.json").is_file()
+
+
 def make() -> None:
     """The golden files, in this version."""
     import os
@@ -125,7 +137,8 @@ def make() -> None:
 
     Trainer.step = stopped
     assert cli.main(["fit", "still", "-o", "stopped", *QUICK]) == 130
-    for run in (Path("run"), Path("stopped")):
+    assert cli.main(["fit", "still", "-o", "everything", *QUICK, *EVERYTHING]) == 130
+    for run in (Path("run"), Path("stopped"), Path("everything")):
         shutil.rmtree(run / "renders")
         # Data beside the run, not where this checkout lies; the list of files knows them by their hashes.
         config, listed = run / "config.json", run / ".drgs.jsonl"
