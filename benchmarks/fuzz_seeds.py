@@ -383,8 +383,8 @@ def dumped() -> tuple[Gaussians, list[Camera], tuple]:
 
 def _dump(suffix: str, pose: bool) -> Any:
     def write(folder: Path) -> None:
-        from drgs.lab.dumps import cotangents, scene_arrays
-        from drgs.lab.raw import PARAMETERS
+        from drgs.lab.parameters import PARAMETERS
+        from drgs.lab.rasterizers import cotangents, scene_arrays
 
         scene = scene_arrays(*dumped())
         count = len(dumped()[1])

@@ -227,7 +227,7 @@ def _run(folder: Path) -> None:
 
 
 def _dump(folder: Path) -> None:
-    from drgs.lab.dumps import is_export, read_dump
+    from drgs.lab.rasterizers import is_export, read_dump
 
     for path in folder.glob("dump.*"):
         is_export(path)

@@ -32,7 +32,7 @@ from drgs.data import load
 from drgs.files import Run, atomic_write
 from drgs.fitting.records import fit_record
 from drgs.lab.ladder import Pictures, ladder
-from drgs.lab.raw import PARAMETERS
+from drgs.lab.parameters import PARAMETERS
 from drgs.settings import RenderSettings
 from drgs.sizes import at_most
 from drgs.studies.tables import fill_between, markdown_table, paragraph

@@ -22,8 +22,7 @@ from studies import ROOT
 from where import ran
 
 from drgs.commands.stress import COLUMNS, markdown
-from drgs.lab.extremes import CASES
-from drgs.lab.refusals import REFUSALS
+from drgs.lab.extremes import CASES, REFUSALS
 from drgs.lab.stress import BOUNDS, rows
 from drgs.studies.tables import fill_between, markdown_table, paragraph
 

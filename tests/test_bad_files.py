@@ -34,7 +34,7 @@ from drgs.data.image_headers import can_hold, is_whole, stated_size
 from drgs.features.decoder import Decoder, load_decoder, save_decoder
 from drgs.features.teacher import read_map
 from drgs.files import Run
-from drgs.lab.dumps import read_dump
+from drgs.lab.rasterizers import read_dump
 from drgs.metrics import _read_weights
 
 pytestmark = pytest.mark.core

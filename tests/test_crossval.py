@@ -22,11 +22,11 @@ from drgs.commands.orbits import Wish, scene_orbit
 from drgs.data.camera_lists import save_cameras_json
 from drgs.ellipsoids import Gaussians
 from drgs.files import load_ply, save_ply
-from drgs.lab import dumps, rasterizers
+from drgs.lab import rasterizers
 from drgs.lab.crossval import crossval
-from drgs.lab.differences import _extrapolated, central
+from drgs.lab.parameters import PARAMETERS, depth_of, posed, raw_of, with_pose
 from drgs.lab.rasterizers import function
-from drgs.lab.raw import PARAMETERS, depth_of, posed, raw_of, with_pose
+from drgs.lab.verdicts import _extrapolated, central
 from drgs.testing import assert_matches, random_scene
 
 pytestmark = pytest.mark.usefixtures("functions_in_float64")
@@ -171,7 +171,7 @@ def test_a_real_scene(data_dir, name):
         return
     # A defect that this view does not show cannot be found in it.
     raw, made = raw_of(g), [function(f, name) for f in (torch_rasterizer.rasterization, DEFECTS[name].make())]
-    u = dumps.cotangents([camera], 0)[0]
+    u = rasterizers.cotangents([camera], 0)[0]
     images = [x.image(raw, camera, BACKGROUND)[0] for x in made]
     gradients = [x.gradient(raw, camera, BACKGROUND, u) for x in made]
     same = all(b is not None and torch.equal(a, b) for a, b in zip(*(x.values() for x in gradients), strict=True))
@@ -225,7 +225,7 @@ def test_pose_is_differentiated_along_motions():
     """
     g, (camera,), _ = _made(1)
     raw, slope = with_pose(raw_of(g)), torch.randn(4, 4, generator=torch.Generator().manual_seed(0)).double()
-    (got,) = dumps.along_motions(g, [camera], slope[None])
+    (got,) = rasterizers.along_motions(g, [camera], slope[None])
     for k in range(6):
         ends = [posed(raw | {"viewmats": sign * 1e-4 * torch.eye(6).double()[k]}, camera).w2c for sign in (1, -1)]
         for w2c in ends:
@@ -277,7 +277,7 @@ def test_central_differences(dtype):
 
     made = function(only, "only")
     assert made.dtype == dtype
-    u = dumps.cotangents([camera], 0)[0]
+    u = rasterizers.cotangents([camera], 0)[0]
     wanted = made.gradient(raw, camera, background, u)
     entries = {name: torch.topk(wanted[name].abs().reshape(-1), 5).indices.tolist() for name in PARAMETERS}
     own = central(made, raw, camera, background, u, entries)
@@ -312,7 +312,7 @@ def test_entries_that_jump_are_left_out():
 
     g, (camera,), background = _made(0)
     made, raw = function(blinking, "blinking"), raw_of(g)
-    own = central(made, raw, camera, background, dumps.cotangents([camera], 0)[0], {"means": [0]})
+    own = central(made, raw, camera, background, rasterizers.cotangents([camera], 0)[0], {"means": [0]})
     assert own.entries["means"] == []
     assert own.left_out["means"] == 1
     assert not own.kept.all()
@@ -372,7 +372,7 @@ def test_near_ties_are_no_difference(contrast, monkeypatch):
 
     # If they were not left out, it would be said what is not so: this is what the test is about.
     monkeypatch.setattr(
-        "drgs.lab.reference_model.ReferenceModel.near_ties", lambda *_: torch.zeros(20, 24, dtype=torch.bool)
+        "drgs.lab.conventions.ReferenceModel.near_ties", lambda *_: torch.zeros(20, 24, dtype=torch.bool)
     )
     # (Colors of six channels are random: they show the order whatever the contrast is.)
     found = crossval(ours, g, cameras, "gsplat", {"background": BACKGROUND}, channels=0)

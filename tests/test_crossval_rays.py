@@ -21,11 +21,11 @@ from drgs import cli
 from drgs.cameras import Camera, c2w_to_opengl
 from drgs.ellipsoids import Gaussians
 from drgs.files import save_ply
-from drgs.lab import dumps, rasterizers
+from drgs.lab import rasterizers
 from drgs.lab.crossval import crossval
 from drgs.lab.ladder import ladder
+from drgs.lab.parameters import MOTIONS, PARAMETERS, raw_of
 from drgs.lab.rasterizers import function, load_rasterizer, ours
-from drgs.lab.raw import MOTIONS, PARAMETERS, raw_of
 from drgs.settings import RenderSettings
 from drgs.shutters import SHUTTERS
 from drgs.testing import assert_matches
@@ -322,7 +322,7 @@ def test_a_lens_is_not_exported(tmp_path):
     """What is written for another machine is pinholes, and a lens is refused in one line."""
     g, camera = _made(0, "opencv")
     with pytest.raises(ValueError, match="cameras that are exported must be pinholes, got a lens or a rolling shutter"):
-        dumps.export(tmp_path / "scene.npz", g, [camera], BACKGROUND, 0)
+        rasterizers.export(tmp_path / "scene.npz", g, [camera], BACKGROUND, 0)
     save_ply(g, tmp_path / "scene.ply")
     write_capture(tmp_path / "capture", camera)
     command = ["crossval", str(tmp_path / "scene.ply"), "--cameras", str(tmp_path / "capture"), "--quiet"]

@@ -1,6 +1,6 @@
 """The extremes of the renderer: everything finite, and as close to the float64 oracle as anywhere else.
 
-The cases are in drgs/lab/extremes.py and drgs/lab/refusals.py; `drgs stress` runs them on any machine, and
+The cases are in drgs/lab/extremes.py; `drgs stress` runs them on any machine, and
 `python benchmarks/numerics.py` prints their errors for docs/numerics.md.
 """
 
@@ -21,7 +21,7 @@ from drgs import fisher, reference
 from drgs.cameras import Camera, intrinsics_from_fov, look_at
 from drgs.ellipsoids import Gaussians
 from drgs.integrator import render, render_jvp, render_rays
-from drgs.lab.refusals import REFUSALS
+from drgs.lab.extremes import REFUSALS
 from drgs.lab.stress import refused, row_of, truth_of
 from drgs.rasterize import rasterization
 from drgs.settings import RenderSettings

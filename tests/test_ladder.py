@@ -11,9 +11,8 @@ import scenes_random
 import torch
 
 from drgs import integrator, reference
-from drgs.lab.ladder import Pictures, ladder, sequences, table
-from drgs.lab.ladder_pictures import constant_colors
-from drgs.lab.raw import PARAMETERS
+from drgs.lab.ladder import Pictures, constant_colors, ladder, sequences, table
+from drgs.lab.parameters import PARAMETERS
 from drgs.settings import RenderSettings
 
 Preset = RenderSettings.preset

@@ -29,7 +29,7 @@ from drgs.data import load
 from drgs.data.camera_lists import save_cameras_json
 from drgs.features.decoder import save_decoder
 from drgs.files import save_ply
-from drgs.lab.rows import Crop
+from drgs.lab.crossval import Crop
 from drgs.testing import random_scene
 from drgs.train import SelectionConfig, fit
 

@@ -12,7 +12,7 @@ import torch
 from scenes_random import camera
 
 from drgs import cli, fisher
-from drgs.lab import accuracy, extremes, refusals, stress
+from drgs.lab import accuracy, extremes, stress
 
 pytestmark = pytest.mark.core
 
@@ -170,15 +170,15 @@ def test_what_is_not_refused_fails():
         yield lambda: int("x"), "must be finite"
 
     for attempts in (silent, other):
-        row = stress.refused(refusals.Refusal("a", attempts))
+        row = stress.refused(extremes.Refusal("a", attempts))
         assert row.verdict == "FAILS"
         assert "attempt 1" in row.remark
-    assert stress.refused(refusals.Refusal("a", other, warns=True)).verdict == "FAILS"
+    assert stress.refused(extremes.Refusal("a", other, warns=True)).verdict == "FAILS"
 
 
 def test_every_extreme_has_a_case():
     """Names are unique, and the design's list is in them."""
-    names = [case.name for case in (*extremes.CASES, *refusals.REFUSALS)]
+    names = [case.name for case in (*extremes.CASES, *extremes.REFUSALS)]
     assert len(set(names)) == len(names)
     for item, part in ITEMS.items():
         assert any(part in name for name in names), item

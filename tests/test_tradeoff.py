@@ -16,10 +16,19 @@ from drgs.commands import tradeoff
 from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.files import load_ply, save_ply
 from drgs.integrator import render
-from drgs.lab.tradeoff import measure
-from drgs.lab.tradeoff_advice import USES, interval, recommend
-from drgs.lab.tradeoff_full import measure_full
-from drgs.lab.tradeoff_rows import TRADEOFF_VARIANTS, GroupInformation, Interval, Measured, TradeoffRow, WorstErrors
+from drgs.lab.tradeoff import (
+    TRADEOFF_VARIANTS,
+    USES,
+    GroupInformation,
+    Interval,
+    Measured,
+    TradeoffRow,
+    WorstErrors,
+    interval,
+    measure,
+    measure_full,
+    recommend,
+)
 from drgs.settings import RenderSettings
 
 BUDGETS = (1e-12, 1e-5, 1e-3, 1e-1, 10.0)
@@ -234,7 +243,7 @@ def test_size_is_what_is_drawn_or_what_fits(place, monkeypatch):
     g, variants = load_ply(place / "scene.ply"), tuple(v for v in TRADEOFF_VARIANTS if v.name in ("exact", "fast"))
 
     def timed(seconds):
-        monkeypatch.setattr("drgs.lab.tradeoff_full.clocked", lambda work: (None, seconds))  # whatever is done
+        monkeypatch.setattr("drgs.lab.tradeoff.clocked", lambda work: (None, seconds))  # whatever is done
         return measure_full(measured, g, large, BUDGETS, 1, 60.0, 0, lambda text: None)["forward"]
 
     for _ in range(10):  # beside other work times may scatter so much that nothing leads

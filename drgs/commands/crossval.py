@@ -11,7 +11,7 @@ from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, atomic_write, write_json
 from drgs.guards.outputs import check_file, claim
-from drgs.lab import dumps, ladder, rasterizers
+from drgs.lab import ladder, rasterizers
 from drgs.lab.crossval import Result, crossval
 from drgs.lab.report import html
 from drgs.settings import PRESETS, RenderSettings
@@ -32,7 +32,7 @@ def run(args: Crossval) -> int:
     elif args.export.suffix != ".npz":
         raise ValueError(f"--export {args.export}: must end with .npz, got {args.export.suffix or 'no suffix'}")
     else:
-        check_file(args.export, "crossval", inputs, dumps.is_export)
+        check_file(args.export, "crossval", inputs, rasterizers.is_export)
     given = SceneInput.of(args)
     g, fields = given.colors, given.fields
     along_rays = _along_rays(args)
@@ -40,7 +40,7 @@ def run(args: Crossval) -> int:
     cameras, source = seen_views(args, given, lenses=along_rays and args.export is None)
     cameras = [at_most(camera, args.max_pixels) for camera in cameras]
     if args.export is not None:
-        dumps.export(args.export, g, cameras, given.background, args.seed)
+        rasterizers.export(args.export, g, cameras, given.background, args.seed)
         if not args.quiet:
             print(f"{len(g)} Gaussians, {len(cameras)} views of {cameras[0].width}x{cameras[0].height}: {args.export}")
         return 0
@@ -71,7 +71,7 @@ def _along_rays(args: Crossval) -> bool:
     """Whether the preset that is compared with is said to evaluate Gaussians along rays; a dump is of pinholes."""
     own = args.rasterizer.removeprefix("drgs:") if args.rasterizer.startswith("drgs:") else "auto"
     name = own if own in PRESETS and args.preset == "auto" else args.preset
-    if name == "auto" or args.rasterizer.endswith(dumps.SUFFIXES):
+    if name == "auto" or args.rasterizer.endswith(rasterizers.SUFFIXES):
         return False
     return not RenderSettings.preset(name).planar
 

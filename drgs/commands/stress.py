@@ -12,7 +12,7 @@ from drgs import runtime
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, atomic_write, write_json
 from drgs.guards.outputs import claim
-from drgs.lab import extremes, refusals
+from drgs.lab import extremes
 from drgs.lab.stress import BOUNDS, StressRow, rows
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ COLUMNS = {
 
 def run(args: Stress) -> int:
     """`drgs stress`: exit code 1 if a bound is broken."""
-    known = (*extremes.CASES, *refusals.REFUSALS)
+    known = (*extremes.CASES, *extremes.REFUSALS)
     chosen = [case for case in known if args.match.lower() in case.name.lower()]
     if not chosen:
         raise ValueError(f"stress: --match must be part of a case's name, got {args.match!r}; drgs stress lists all")

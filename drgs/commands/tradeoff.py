@@ -15,9 +15,9 @@ the largest unit); of information, the larger of L1 and median.
 
 Times are medians over rounds in which all settings take turns on one view, everything included; ratios are to `exact`
 in the same round. Errors, and a first look at all times, are of reduced views; the leading settings are timed again on
-views as large as they are drawn (lab/tradeoff_full.py), and advice follows from these (lab/tradeoff_advice.py). With
-one thread it is the processor's time, else the clock's. What would take minutes (Mitsuba's traversal without cut-offs,
-the oracle) is measured on a sample of rays, once, and its time scaled to the image.
+views as large as they are drawn (`measure_full`), and advice follows from these (`recommend`). With one thread it is
+the processor's time, else the clock's. What would take minutes (Mitsuba's traversal without cut-offs, the oracle) is
+measured on a sample of rays, once, and its time scaled to the image.
 """
 
 from __future__ import annotations
@@ -36,11 +36,20 @@ from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.files import SCHEMA, atomic_write, write_json
 from drgs.guards.outputs import claim
-from drgs.lab.tradeoff import measure
-from drgs.lab.tradeoff_advice import USES, Advice, recommend
-from drgs.lab.tradeoff_full import FullSize, measure_full
-from drgs.lab.tradeoff_plot import plot
-from drgs.lab.tradeoff_rows import CLOCKS, TRADEOFF_VARIANTS, Interval, Measured, TradeoffRow
+from drgs.lab.tradeoff import (
+    CLOCKS,
+    TRADEOFF_VARIANTS,
+    USES,
+    Advice,
+    FullSize,
+    Interval,
+    Measured,
+    TradeoffRow,
+    measure,
+    measure_full,
+    plot,
+    recommend,
+)
 from drgs.sizes import at_most
 
 if TYPE_CHECKING:

@@ -3,7 +3,7 @@
 The image is compared with our models until one with the rasterizer's conventions is found (conventions.py). There the
 gradients of <u, image>, u of random signs, are compared group by group: raw parameters, the pose of every view along
 rigid motions (`viewmats`), and, in an image of many channels, plain `colors`. Where they differ, a choice that is known
-to be made on purpose may explain it; else the rasterizer's own central differences decide (differences.py):
+to be made on purpose may explain it; else the rasterizer's own central differences decide (verdicts.py):
 
     agreement          the gradient is the model's
     known deviation    it is the model's with a documented choice: view direction detached, clamped alpha passed through
@@ -28,17 +28,15 @@ from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
 from drgs.integrator import render
 from drgs.lab import conventions
-from drgs.lab.dumps import Dump, cotangents, one_line
+from drgs.lab.conventions import ReferenceModel
 from drgs.lab.image_errors import error_line
-from drgs.lab.rasterizers import Rasterizer
-from drgs.lab.raw import COLORS, MOTIONS, PARAMETERS, raw_of, with_colors, with_pose
-from drgs.lab.reference_model import ReferenceModel
-from drgs.lab.rows import Crop, GroupRow, ViewRow
-from drgs.lab.verdicts import Case, Compared, compared, judge, with_errors
+from drgs.lab.parameters import COLORS, MOTIONS, PARAMETERS, raw_of, with_colors, with_pose
+from drgs.lab.rasterizers import Dump, Rasterizer, cotangents, one_line
+from drgs.lab.verdicts import Case, Compared, GroupRow, ViewRow, compared, judge, with_errors
 from drgs.settings import RenderSettings
 from drgs.sizes import cropped
 
-__all__ = ["VERDICTS", "Result", "crops", "crossval"]
+__all__ = ["VERDICTS", "Crop", "Result", "crops", "crossval"]
 
 VERDICTS = ("gradient bug", "undecided", "model difference", "other convention", "known deviation", "agreement")
 _STARTS = ("gsplat", "inria", "3dgut", "fast", "exact", "mitsuba")  # the first of equally near ones is taken
@@ -49,6 +47,17 @@ _ALPHA = 1e-4  # a mean difference of alpha that is worth a word
 _SIDES = (32, 16, 8)  # pixels of a crop, the largest that the oracle can take
 _STEP = 16  # pixels between the places that are tried for a crop: a rasterizer's tiles stay where they are
 _CROP_PAIRS = 1_000_000  # (pixel, Gaussian) pairs of a crop that take the oracle seconds: image and gradient, by CPU
+
+
+@dataclasses.dataclass(frozen=True)
+class Crop:
+    """The place of a crop in its view: a corner, its size, and the view's (width, height), in pixels."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+    of: list[int]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,9 +15,7 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
-from drgs.lab.rows import ErrorRow
-
-__all__ = ["OFF", "PATTERNS", "Pattern", "error_line", "error_row", "pattern_of"]
+__all__ = ["OFF", "PATTERNS", "ErrorRow", "Pattern", "error_line", "error_row", "pattern_of"]
 
 PATTERNS = {
     "flipped": "mirrored, or turned by half a turn",
@@ -71,6 +69,32 @@ class Pattern:
     def is_change(self) -> bool:
         """Whether it makes the wrong image of the right one, rather than say where they differ."""
         return self.name not in _PLACES
+
+
+@dataclasses.dataclass(frozen=True)
+class ErrorRow:
+    """The place where an image is wrong, and what its error looks like.
+
+    Attributes:
+        pixels: Number of pixels that count and differ by more than 0.001.
+        box: The smallest rectangle that holds them: x and y of its first and of its last pixel.
+        x, y: Column and row of the worst of them.
+        rasterizer: RGB of that pixel in the rasterizer's image.
+        model: RGB of that pixel in the model's image.
+        pattern: One of `drgs.lab.image_errors.PATTERNS`.
+        what: The pattern in words, with its numbers.
+        explained: Share of the squared error that the pattern explains, or that lies where it says; null for `none`.
+    """
+
+    pixels: int
+    box: list[int]
+    x: int
+    y: int
+    rasterizer: list[float]
+    model: list[float]
+    pattern: str
+    what: str
+    explained: float | None
 
 
 @dataclasses.dataclass(frozen=True)

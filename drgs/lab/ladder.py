@@ -16,18 +16,22 @@ compositing to the integral over summed densities) lie beyond `exact` and stay l
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
+import torch
+
+from drgs import reference
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
-from drgs.lab.ladder_pictures import Pictures, State
-from drgs.lab.ladder_table import Step, table
-from drgs.lab.raw import PARAMETERS
+from drgs.integrator import render
+from drgs.lab.parameters import PARAMETERS
+from drgs.oracle import sh_colors
 from drgs.settings import RenderSettings
 
-__all__ = ["RUNGS", "Pictures", "ladder", "sequences", "table"]
+__all__ = ["RUNGS", "Pictures", "State", "Step", "constant_colors", "ladder", "sequences", "table"]
 
 RUNGS = {
     "float32": (),
@@ -205,3 +209,291 @@ def _asides(made: Pictures, start: RenderSettings, end: RenderSettings) -> list[
         steps["SH along rays"] = made.full(end.replace(sh_direction="ray")) - exact
     steps["response"] = made.full(end.replace(response="integral")) - exact
     return [Step.of(step, total, exact, name).to_json() for name, step in steps.items()]
+
+
+# ------------------------------------------------------------------------------------------------- images and gradients
+
+
+@dataclasses.dataclass
+class State:
+    """What one rasterizer makes of a scene, and differences of such.
+
+    Attributes:
+        image: (P, 3) float64, the pixels of all views.
+        gradient: Parameter -> J^T u; empty without gradients.
+    """
+
+    image: torch.Tensor
+    gradient: dict[str, torch.Tensor]
+
+    def __add__(self, other: State) -> State:
+        gradient = {name: x.double() + other.gradient[name].double() for name, x in self.gradient.items()}
+        return State(self.image + other.image, gradient)
+
+    def __sub__(self, other: State) -> State:
+        gradient = {name: x.double() - other.gradient[name].double() for name, x in self.gradient.items()}
+        return State(self.image - other.image, gradient)
+
+
+class Pictures:
+    """Images and gradients of one scene and its cameras, each computed once.
+
+    Give the same one to several calls of `ladder` (other starts) to share what they have in common.
+
+    Args:
+        g: N Gaussians.
+        cameras: Pinhole cameras, at least one.
+        crop: Width and height in pixels of the crops of the first camera; 0 for none.
+        seed: Seed of the cotangent.
+        gradients: Whether J^T u is wanted.
+        advance: Called after each image.
+    """
+
+    def __init__(
+        self,
+        g: Gaussians,
+        cameras: Sequence[Camera],
+        crop: int = 24,
+        seed: int = 0,
+        gradients: bool = True,
+        advance: Callable[[], None] | None = None,
+    ):
+        if not len(cameras) or not len(g):
+            raise ValueError(
+                f"ladder: there must be a camera and a Gaussian, got {len(cameras)} and {len(g)}; give both"
+            )
+        if crop < 0:
+            raise ValueError(f"ladder: crop must be >= 0 pixels, got {crop}; correct it")
+        # Each picture makes leaves of its own; a graph behind these would be walked by each of them.
+        self.g = g.detach()
+        self.cameras = list(cameras)
+        self.crop = crop
+        self.gradients = gradients
+        self.advance = advance or (lambda: None)
+        self.background = (0.0, 0.0, 0.0)
+        rng = np.random.default_rng(seed)
+        self.u = [torch.from_numpy(rng.choice([-1.0, 1.0], (c.height, c.width, 3))) for c in self.cameras]
+        self.windows: list[tuple[int, int, int, int]] = []
+        self._made: dict[tuple, State] = {}
+
+    def full(self, s: RenderSettings, detached: bool = False) -> State:
+        """All pixels of all cameras, by `drgs.render`; `detached`: colors ignore how the direction follows a mean."""
+        return self._once(("full", s, detached), lambda: self._full(s, detached))
+
+    def part(self, s: RenderSettings, kind: str) -> State:
+        """The crops: kind `float32` (`drgs.render`), `float64` (`reference.render`) or `volume`."""
+        return self._once((kind, s), lambda: self._part(s, kind))
+
+    def place_crops(self, s: RenderSettings) -> None:
+        """The middle of the first camera's image and, if it does not overlap, the corner with the most opacity."""
+        camera = self.cameras[0]
+        width, height = min(self.crop, camera.width), min(self.crop, camera.height)
+        x, y = (camera.width - width) // 2, (camera.height - height) // 2
+        self.windows = [(x, y, width, height)]
+        if x < width and y < height:
+            return
+        with torch.no_grad():  # where a crop lies has no derivative
+            alpha = render(self.g, camera, s, outputs=()).alpha
+        corners = [(x, y) for y in (0, camera.height - height) for x in (0, camera.width - width)]
+        x, y = max(corners, key=lambda at: float(alpha[at[1] : at[1] + height, at[0] : at[0] + width].sum()))
+        self.windows.append((x, y, width, height))
+
+    def _once(self, key: tuple, make: Callable[[], State]) -> State:
+        if key not in self._made:
+            self._made[key] = make()
+            self.advance()
+        return self._made[key]
+
+    def _leaves(self) -> Gaussians:
+        moving = {name: self.g.parameters()[name].clone().requires_grad_(self.gradients) for name in PARAMETERS}
+        return self.g.replace(features=None, **moving)
+
+    def _state(self, g: Gaussians, images: list[torch.Tensor], cotangents: list[torch.Tensor]) -> State:
+        """Images as rows of pixels, and J^T u by backward mode where gradients are wanted."""
+        gradient = {}
+        if self.gradients:
+            # In float64, so that rounding of the sum is no rung of the ladder.
+            loss: Any = sum((image.double() * u).sum() for image, u in zip(images, cotangents, strict=True))
+            leaves = [g.parameters()[name] for name in PARAMETERS]
+            found: Sequence[torch.Tensor | None] = [None] * len(leaves)
+            if loss.requires_grad:
+                found = torch.autograd.grad(loss, leaves, allow_unused=True)
+            for name, leaf, x in zip(PARAMETERS, leaves, found, strict=True):
+                gradient[name] = torch.zeros_like(leaf) if x is None else x.detach().cpu()
+        # What is kept are numbers: a graph would hold every picture's intermediates.
+        return State(torch.cat([x.detach().cpu().double().reshape(-1, 3) for x in images]), gradient)
+
+    def _full(self, s: RenderSettings, detached: bool) -> State:
+        states = []
+        for camera, u in zip(self.cameras, self.u, strict=True):
+            g = self._leaves()
+            drawn = constant_colors(g, camera) if detached else g
+            states.append(self._state(g, [render(drawn, camera, s, outputs=()).rgb.cpu()], [u]))
+        return _joined(states)
+
+    def _part(self, s: RenderSettings, kind: str) -> State:
+        """Both crops, in float32 by drawing the whole picture, in float64 by the oracle's window."""
+        camera = self.cameras[0]
+        states = []
+        for x, y, width, height in self.windows:
+            rows, columns = slice(y, y + height), slice(x, x + width)
+            g = self._leaves()
+            window = (x, y, width, height)
+            with torch.set_grad_enabled(self.gradients):
+                if kind == "float32":
+                    image = render(g, camera, s, outputs=()).rgb.cpu()[rows, columns]
+                elif kind == "float64":
+                    image = reference.render(g, camera, s, window=window).rgb
+                else:
+                    image = reference.render_volume(g, camera, s, window=window).rgb
+            states.append(self._state(g, [image], [self.u[0][rows, columns]]))
+        return _joined(states)
+
+
+def _joined(states: list[State]) -> State:
+    """Pixels of all, and the sum of their gradients."""
+    gradient: dict[str, Any] = {name: sum(x.gradient[name] for x in states) for name in states[0].gradient}
+    return State(torch.cat([x.image for x in states]), gradient)
+
+
+def constant_colors(g: Gaussians, camera: Camera) -> Gaussians:
+    """The same image with colors computed beforehand, from directions that are constants."""
+    offset = torch.from_numpy(np.asarray(camera.center, np.float64) - np.asarray(g.origin, np.float64))
+    towards = g.means.detach().cpu().double() - offset  # this is the approximation: the mean gets nothing through it
+    base = (sh_colors(g.sh.cpu().double(), towards) - 0.5) * np.sqrt(4 * np.pi)
+    return g.replace(sh=base.to(g.sh.dtype).to(g.sh.device)[:, None, :])
+
+
+# ------------------------------------------------------------------------------------------------------------ the table
+
+
+@dataclasses.dataclass(frozen=True)
+class Size:
+    """How large a step's gradient by one parameter is; None where the divisor is 0.
+
+    Attributes:
+        norm: |step|.
+        share: <step, total> / |total|^2.
+        of_total: |step| / |total|.
+        of_exact: |step| / |exact|.
+    """
+
+    norm: float
+    share: float | None
+    of_total: float | None
+    of_exact: float | None
+
+    @classmethod
+    def of(cls, step: torch.Tensor, total: torch.Tensor, exact: torch.Tensor) -> Size:
+        """Measure a step beside the whole way and the exact end, three tensors of one shape."""
+        step, total, exact = (x.double().reshape(-1) for x in (step, total, exact))  # norms over millions of values
+        whole = float(total.norm())
+        truth = float(exact.norm())
+        size = float(step.norm())
+        return cls(
+            norm=size,
+            share=float(step @ total) / whole**2 if whole > 0 else None,
+            of_total=size / whole if whole > 0 else None,
+            of_exact=size / truth if truth > 0 else None,
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """One rung; without its first two fields, the whole way.
+
+    Attributes:
+        rung: Name of the rung.
+        switched: Field of the settings -> [before, after]; None of a step outside of the ladder.
+        rms: Root of the mean square of the image's change, over pixels and channels.
+        max: Largest change of the image.
+        norm, share, of_total, of_exact: Size of the image's change, as `Size` says it of a gradient.
+        gradient: Parameter -> `Size`; empty without gradients.
+    """
+
+    rung: str | None
+    switched: dict | None
+    rms: float
+    max: float
+    norm: float
+    share: float | None
+    of_total: float | None
+    of_exact: float | None
+    gradient: dict[str, Size]
+
+    @classmethod
+    def of(cls, step: State, total: State, exact: State, rung: str | None = None, switched: dict | None = None) -> Step:
+        """Measure the difference that a step makes beside that of the whole way and the way's end."""
+        return cls(
+            rung=rung,
+            switched=switched,
+            rms=float(step.image.square().mean().sqrt()),
+            max=float(step.image.abs().max()),
+            **vars(Size.of(step.image, total.image, exact.image)),
+            gradient={n: Size.of(x, total.gradient[n], exact.gradient[n]) for n, x in step.gradient.items()},
+        )
+
+    def to_json(self) -> dict:
+        """As a report holds it."""
+        row = dataclasses.asdict(self)
+        return {name: x for name, x in row.items() if not (x is None and name in ("rung", "switched"))}
+
+    @classmethod
+    def from_json(cls, row: dict) -> Step:
+        """As a report holds it."""
+        gradient = {name: Size(**size) for name, size in row["gradient"].items()}
+        return cls(**{"rung": None, "switched": None, **row, "gradient": gradient})
+
+
+def table(report: dict) -> str:
+    """Markdown of a report: image, gradients, crops.
+
+    A pair is `stated order / reverse`, one number where they agree; gradients show shares, in asides |step| / |exact|.
+    """
+    groups = report["groups"]
+    lines = _both(report["image"], groups, "all pixels")
+    if "crops" in report:
+        windows = ", ".join(f"{w}x{h} at ({x}, {y})" for x, y, w, h in report["crops"]["windows"])
+        lines += ["", *_both(report["crops"], groups, f"crops {windows}")]
+    if "far" in report:
+        lines += ["", *_both({"reverse": [], **report["far"]}, groups, "beyond `exact`, crops")]
+    lines += ["", "| aside, all pixels | RMS | max |" + "".join(f" {name}, of exact |" for name in groups)]
+    lines += ["|---" * (3 + len(groups)) + "|"]
+    for row in map(Step.from_json, report["asides"]):
+        cells = [_percent(row.gradient[name].of_exact) for name in groups]
+        lines.append(f"| {row.rung} | {row.rms:.1e} | {row.max:.1e} |" + "".join(f" {c} |" for c in cells))
+    return "\n".join(lines)
+
+
+def _both(part: dict, groups: list[str], what: str) -> list[str]:
+    """Rows of one ladder: RMS and share of the image, shares of the gradients, `first order / reverse`."""
+    forward, reverse = ([Step.from_json(row) for row in part[order]] for order in ("forward", "reverse"))
+    back = {step.rung: step for step in reverse}
+    total = Step.from_json(part["total"])
+    lines = [f"| rung, {what} | RMS | max | share |" + "".join(f" {name} |" for name in groups)]
+    lines.append("|---" * (4 + len(groups)) + "|")
+    for step in forward:
+        orders = [_shares(x, groups) for x in (step, back.get(step.rung)) if x is not None]
+        # A number once where both orders agree on it.
+        cells = [" / ".join(dict.fromkeys(pair)) for pair in zip(*orders, strict=True)]
+        lines.append(f"| {step.rung} |" + "".join(f" {c} |" for c in cells))
+    cells = [f"{total.rms:.1e}", f"{total.max:.1e}", "100 %"]
+    cells += [f"|total| = {_percent(total.gradient[n].of_exact)} of |exact|".replace("|", "\\|") for n in groups]
+    lines.append("| total |" + "".join(f" {c} |" for c in cells))
+    return lines
+
+
+def _shares(step: Step, groups: list[str]) -> list[str]:
+    """The cells of a row behind its name."""
+    shares = (step.share, *(step.gradient[name].share for name in groups))
+    return [f"{step.rms:.1e}", f"{step.max:.1e}", *map(_percent, shares)]
+
+
+def _percent(x: float | None) -> str:
+    """Two digits below 1 %, none above 10."""
+    if x is None:
+        return "-"
+    # Below 5e-5 two digits of a percent round to 0, and -0.00 says nothing.
+    digits = 0 if abs(x) >= 0.1 or abs(x) < 5e-5 else 1 if abs(x) >= 0.01 else 2
+    x = 0.0 if abs(x) < 5e-5 else x
+    return f"{100 * x:.{digits}f} %"

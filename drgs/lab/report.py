@@ -8,8 +8,7 @@ import re
 import numpy as np
 
 from drgs.display import pictures
-from drgs.lab.image_errors import error_line
-from drgs.lab.rows import ErrorRow
+from drgs.lab.image_errors import ErrorRow, error_line
 
 __all__ = ["html"]
 

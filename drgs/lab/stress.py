@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.gain import Information
     from drgs.lab.accuracy import Oracle
-    from drgs.lab.extremes import ExtremeCase
-    from drgs.lab.refusals import Refusal
+    from drgs.lab.extremes import ExtremeCase, Refusal
     from drgs.settings import RenderSettings
 
 __all__ = ["BOUNDS", "StressRow", "Truth", "row_of", "refused", "rows", "truth_of"]
@@ -72,7 +71,7 @@ class StressRow:
 
 def rows(case: ExtremeCase | Refusal) -> Iterator[StressRow]:
     """Measure a case on each of its traversals; what raises becomes a row."""
-    from drgs.lab.refusals import Refusal
+    from drgs.lab.extremes import Refusal
 
     if isinstance(case, Refusal):
         yield _caught(case.name, "all", lambda: refused(case))

@@ -1,52 +1,556 @@
-"""Times and errors of render settings against preset `exact` (what they are: commands/tradeoff.py)."""
+"""Times and errors of render settings against preset `exact`: what `drgs tradeoff` measures, draws and recommends.
+
+Settings are compared in pairs of times: a setting's over that of `exact` in the same round and view. The interval of
+the median of these ratios says how well it is known; `exact` against itself, measured as every other setting, says how
+much equal work scatters. A setting has a gain if its whole interval lies below 1 and below that of `exact` against
+itself; recommended is the fastest one within a budget of error that has a gain.
+
+Ratios change with the size of an image: what a setting does once a Gaussian weighs less in a large one. So the settings
+that lead at the reduced size are timed again on views as large as `drgs render` draws them, within a number of seconds
+that the user gives (`measure_full`). Where one round would take longer, views are reduced just so far that it does not,
+and the report says so. Where there is no time for three rounds, intervals are as wide as the scatter of equal work at
+the reduced size.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import random
 import statistics
 import time
-from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeVar
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
 
 from drgs import fisher, reference, runtime
+from drgs.guards.outputs import replacing
 from drgs.integrator import render, render_rays
-from drgs.lab.tradeoff_advice import interval
-from drgs.lab.tradeoff_rows import (
-    CLOCKS,
-    GradientError,
-    ImageError,
-    InformationError,
-    Measured,
-    TradeoffRow,
-    Variant,
-    WorstErrors,
-    rows_of,
-    why_skipped,
-)
-from drgs.sizes import by_share
+from drgs.settings import RenderSettings
+from drgs.sizes import at_most, by_share
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
     from drgs.information.choices import Method
     from drgs.integrator import Output
     from drgs.settings import RenderSettings
 
-__all__ = ["clocked", "measure", "placed", "scaled_diagonal"]
+__all__ = [
+    "CLOCKS",
+    "TRADEOFF_VARIANTS",
+    "USES",
+    "Advice",
+    "FullSize",
+    "FullTime",
+    "GradientError",
+    "GroupInformation",
+    "ImageError",
+    "InformationError",
+    "Interval",
+    "Measured",
+    "TradeoffRow",
+    "Variant",
+    "WorstErrors",
+    "clocked",
+    "interval",
+    "leaders",
+    "measure",
+    "measure_full",
+    "placed",
+    "plot",
+    "recommend",
+    "rows_of",
+    "scaled_diagonal",
+    "why_skipped",
+]
+
+CLOCKS = ("forward", "forward_backward", "fisher")
+"""What is timed: an image; an image and its gradients; the Fisher diagonal of a view."""
+
+_UNSEEN = 1e-6  # share of the largest group, and of a diagonal's largest entry: smaller ones have no relative error
+
+
+# ------------------------------------------------------------------------------------------------------ which settings
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """One row: settings, and how much of the image they are used for.
+
+    Attributes:
+        kind: `approximation` (of exact's model), `model` (another response or view direction: a difference, not an
+            error), `resolution`, or `precision`.
+        preset: Preset that the settings start from.
+        fields: Settings that differ from the preset.
+        share: Share of width and height that is rendered; the image is enlarged bilinearly, information scaled by the
+            number of pixels.
+        by: What is measured: a whole `view`, a sample of its `rays`, or that sample by the float64 `oracle`.
+    """
+
+    kind: str
+    preset: str = "exact"
+    fields: dict = dataclasses.field(default_factory=dict)
+    share: float = 1.0
+    by: str = "view"
+
+    @property
+    def name(self) -> str:
+        """A short name for people."""
+        if self.by == "oracle":
+            return "float64 oracle"
+        text = " ".join(f"{key}={_short(value)}" for key, value in self.fields.items())
+        text = text if self.preset == "exact" and text else f"{self.preset} {text}".strip()
+        return text + {1.0: "", 0.5: ", half resolution", 0.25: ", quarter resolution"}[self.share]
+
+    def flags(self, overrides: tuple[str, ...] = ()) -> str:
+        """Options of the other commands for these settings, after the user's own."""
+        kept = [text for text in overrides if text.partition("=")[0] not in self.fields]
+        texts = [*(f"{key}={str(value).lower()}" for key, value in self.fields.items()), *kept]
+        return " ".join([f"--preset {self.preset}", *(f"--set {text}" for text in texts)])
+
+
+def _rows(kind: str, preset: str, key: str, *values) -> list[Variant]:
+    return [Variant(kind, preset, {key: value}) for value in values]
+
+
+_EWA = {"response": "ewa", "order": "center"}
+TRADEOFF_VARIANTS = (
+    Variant("precision"),
+    Variant("precision", by="oracle"),
+    # One switch away from exact.
+    *_rows("model", "exact", "response", "integral"),
+    Variant("model", fields=_EWA),
+    Variant("model", fields=_EWA | {"dilation": 0.3}),
+    *_rows("model", "exact", "sh_direction", "ray"),
+    *_rows("approximation", "exact", "order", "center"),
+    Variant("approximation", fields={"order": "center", "depth_key": "z"}),
+    Variant("approximation", fields={"traversal": "bvh"}, by="rays"),
+    Variant("approximation", fields={"traversal": "bvh", "order": "entry"}, by="rays"),
+    *_rows("approximation", "exact", "extent", 4.0, 3.33, 3.0, 2.5, 2.0),
+    *_rows("approximation", "exact", "alpha_min", 1e-5, 1e-4, 1e-3, 1 / 255),
+    *_rows("approximation", "exact", "alpha_max", 0.999, 0.99),
+    Variant("approximation", fields={"alpha_max": 0.99, "alpha_max_gradient": "pass"}),
+    *_rows("approximation", "exact", "transmittance_min", 1e-6, 1e-4, 1e-3, 1e-2),
+    # Several at a time.
+    Variant("approximation", fields={"alpha_min": 1e-3, "transmittance_min": 1e-4}),
+    Variant("approximation", fields={"alpha_min": 1 / 255, "transmittance_min": 1e-4}),
+    Variant("approximation", fields={"order": "center", "alpha_min": 1e-4, "transmittance_min": 1e-6}),
+    Variant("approximation", "fast"),
+    *_rows("approximation", "fast", "order", "ray"),
+    *_rows("approximation", "fast", "depth_key", "z"),
+    *_rows("approximation", "fast", "extent", None, 4.0, 3.33, 2.5, 2.0),
+    *_rows("approximation", "fast", "alpha_min", 1 / 255),
+    *_rows("approximation", "fast", "alpha_max", 1.0),
+    *_rows("approximation", "fast", "transmittance_min", 1e-4, 1e-3),
+    *_rows("model", "fast", "response", "integral"),
+    Variant("model", "mitsuba"),
+    Variant("model", "inria"),
+    Variant("model", "gsplat"),
+    Variant("approximation", "3dgut"),
+    *(Variant("resolution", preset, share=share) for preset in ("exact", "fast") for share in (0.5, 0.25)),
+)
+
+
+def _short(value) -> str:
+    if value == 1 / 255:
+        return "1/255"
+    if not isinstance(value, float):
+        return str(value).lower()
+    return f"{value:g}" if value >= 0.01 else f"{value:.0e}".replace("e-0", "e-")
+
+
+def why_skipped(error: Exception) -> str:
+    """Why something was skipped."""
+    return " ".join(str(error).split()).removeprefix("RenderSettings: ") or type(error).__name__
+
+
+# ------------------------------------------------------------------------------ what is measured
+
+
+@dataclasses.dataclass(frozen=True)
+class ImageError:
+    """Absolute differences of all values of all views: RMS, 99.9th percentile, largest; PSNR for peak 1, None of 0."""
+
+    rms: float
+    p999: float
+    max: float
+    psnr: float | None
+
+    @classmethod
+    def of(cls, off: np.ndarray) -> ImageError:
+        """Compute the errors from absolute differences (P,).
+
+        Raises:
+            ValueError: If there is none.
+        """
+        if not off.size:
+            raise ValueError("every sampled pixel is a tie; choose another --seed")
+        rms = float(np.sqrt(np.mean(off**2)))
+        psnr = -20 * math.log10(rms) if rms > 0 else None
+        return cls(rms, float(np.quantile(off, 0.999)), float(off.max()), psnr)
+
+
+@dataclasses.dataclass(frozen=True)
+class GradientError:
+    """Relative L2 errors of a gradient.
+
+    Attributes:
+        all: Error over all groups together; None where there is no gradient.
+        worst: Largest error of a group; None where no group has one.
+        group: Name of that group.
+        groups: Group -> its error; None where it has no gradient to speak of.
+    """
+
+    all: float | None
+    worst: float | None
+    group: str | None
+    groups: dict[str, float | None]
+
+    @classmethod
+    def of(cls, squares: dict[str, tuple[float, float]]) -> GradientError:
+        """Compute the errors from sums of squares of the difference and of the truth, by group."""
+        names = _compared({name: b for name, (_, b) in squares.items()})
+        groups = {name: math.sqrt(a / b) if name in names else None for name, (a, b) in squares.items()}
+        worst = max(names, key=groups.get, default=None)
+        total = sum(b for _, b in squares.values())
+        whole = math.sqrt(sum(a for a, _ in squares.values()) / total) if total else None
+        return cls(whole, groups[worst] if worst else None, worst, groups)
+
+
+@dataclasses.dataclass(frozen=True)
+class GroupInformation:
+    """Relative errors of a group's diagonal: L1, and the median of its entries'; None where it is all but 0."""
+
+    l1: float | None
+    median: float | None
+
+
+@dataclasses.dataclass(frozen=True)
+class InformationError:
+    """Relative errors of the Fisher diagonal.
+
+    Attributes:
+        groups: Group -> its errors.
+        group: Group with the largest error; None where no group has one.
+        l1, median: The errors of that group.
+    """
+
+    groups: dict[str, GroupInformation]
+    group: str | None
+    l1: float | None
+    median: float | None
+
+    @classmethod
+    def of(cls, sums: dict[str, tuple[float, float]], medians: dict[str, float]) -> InformationError:
+        """Compute the errors from sums of absolute differences and of the truth and from medians of relative ones."""
+        names = _compared({name: b for name, (_, b) in sums.items()})
+        nothing = GroupInformation(None, None)
+        groups = {n: GroupInformation(a / b, medians[n]) if n in names else nothing for n, (a, b) in sums.items()}
+        worst = max(names, key=lambda name: max(groups[name].l1, groups[name].median), default=None)
+        chosen = groups[worst] if worst else nothing
+        return cls(groups, worst, chosen.l1, chosen.median)
+
+
+def _compared(sizes: dict[str, float]) -> list[str]:
+    """Groups that have a relative error: rotating spheres changes nothing, and rounding would look like an error."""
+    # Means have a unit, the others do not.
+    least = _UNSEEN**2 * max((x for name, x in sizes.items() if name != "means"), default=0.0)
+    return [name for name, x in sizes.items() if x > (0.0 if name == "means" else least)]
+
+
+@dataclasses.dataclass(frozen=True)
+class WorstErrors:
+    """What a budget is compared with, by kind; None where there is no number."""
+
+    image: float | None = None
+    gradient: float | None = None
+    information: float | None = None
+
+    def worst(self, kinds: Sequence[str]) -> float | None:
+        """The largest of some kinds, None if one of them is missing."""
+        values = [getattr(self, kind) for kind in kinds]
+        return None if None in values else max(values)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Interval:
+    """A median of ratios of times, the two order statistics between which it lies with 95 %, and how many there are."""
+
+    ratio: float
+    low: float
+    high: float
+    rounds: int
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FullTime(Interval):
+    """Times of a row on views as large as they are drawn: ratios to exact's, and the median in seconds."""
+
+    seconds: float
+
+
+@dataclasses.dataclass(kw_only=True)
+class TradeoffRow:
+    """A variant, and what was measured of it, in the order of tradeoff.json.
+
+    Attributes:
+        name, kind, share, by: The variant's fields of these names.
+        skipped: Why nothing was measured, else None.
+        settings: The variant's settings with the user's; None where these cannot be.
+        image, gradient, information: Differences from the truth; None where there are none.
+        notes: What a reader should know, by subject.
+        seconds: Clock -> median time in seconds; None where a clock was not read.
+        ratio: Clock -> median ratio of the times to the truth's.
+        times: Clock -> these ratios with their interval; None of what was measured once, on a sample.
+        first_call: Seconds that the first view took longer than others.
+        full: Clock -> ratios on views as large as they are drawn (`measure_full`), where they were timed.
+        errors: What budgets are compared with: the worst measure of each kind, plus the truth's own error.
+        flags: Options of other commands for these settings; None of the oracle.
+    """
+
+    name: str
+    kind: str
+    share: float = 1.0
+    by: str = "view"
+    skipped: str | None = None
+    settings: RenderSettings | None = None
+    image: ImageError | None = None
+    gradient: GradientError | None = None
+    information: InformationError | None = None
+    notes: dict[str, Any] = dataclasses.field(default_factory=dict)
+    seconds: dict[str, float | None] | None = None
+    ratio: dict[str, float | None] | None = None
+    times: dict[str, Interval | None] | None = None
+    first_call: float | None = None
+    full: dict[str, FullTime] = dataclasses.field(default_factory=dict)
+    errors: WorstErrors = WorstErrors()
+    flags: str | None = None
+
+    def bound(self, own: WorstErrors) -> WorstErrors:
+        """`errors`, where the truth's own are known."""
+        if self.skipped is not None or self.by == "oracle":
+            return WorstErrors()
+        found = {}
+        if self.image:
+            found["image"] = max(self.image.rms, self.image.p999)
+        if self.gradient and self.gradient.worst is not None:
+            found["gradient"] = self.gradient.worst
+        if self.information and self.information.group:
+            found["information"] = max(self.information.l1, self.information.median)
+        return WorstErrors(**{kind: x + (getattr(own, kind) or 0.0) for kind, x in found.items()})
+
+    def to_json(self) -> dict[str, Any]:
+        """As tradeoff.json holds it."""
+        value = dataclasses.asdict(self)
+        if self.information and self.information.group is None:
+            del value["information"]["l1"], value["information"]["median"]
+        return value
+
+
+@dataclasses.dataclass(frozen=True)
+class Measured:
+    """Times and errors of settings.
+
+    Attributes:
+        rows: Rows in the order of the variants; the first one is the truth.
+        own: Errors of the truth against the oracle.
+        scatter: Clock -> the truth's times against itself.
+        pixels: Number of pixels of one view, on average.
+        rounds: Number of rounds of timing.
+        clock: Clock that was read, `wall` or `processor`.
+    """
+
+    rows: list[TradeoffRow]
+    own: WorstErrors
+    scatter: dict[str, Interval | None]
+    pixels: float
+    rounds: int
+    clock: str
+
+    @property
+    def truth(self) -> TradeoffRow:
+        """What the others are compared with."""
+        return self.rows[0]
+
+    def to_json(self) -> dict[str, Any]:
+        """As tradeoff.json holds it."""
+        return dataclasses.asdict(self) | {"rows": [row.to_json() for row in self.rows]}
+
+
+def rows_of(variants: Sequence[Variant], fields: dict[str, Any]) -> list[TradeoffRow]:
+    """Rows without numbers; those that cannot or need not be measured say why."""
+    rows = []
+    seen = {}
+    for variant in variants:
+        row = TradeoffRow(name=variant.name, kind=variant.kind, share=variant.share, by=variant.by)
+        try:
+            row.settings = RenderSettings.preset(variant.preset, **{**fields, **variant.fields})
+        except (ValueError, NotImplementedError) as error:
+            if not rows:
+                raise  # the truth itself
+            row.skipped = why_skipped(error)
+        else:
+            same = seen.setdefault((row.settings, variant.share, variant.by == "oracle"), variant.name)
+            if same != variant.name:
+                row.skipped = f"the same as {same}, with these --set"
+        rows.append(row)
+    return rows
+
+
+# -------------------------------------------------------------------------------------------------- what is recommended
+
+USES = {
+    "image": ("forward", ("image",)),
+    "gradients": ("forward_backward", ("gradient",)),
+    "information": ("fisher", ("information",)),
+    "everything": ("forward_backward", ("image", "gradient", "information")),
+}
+"""Use -> the time that counts, and the errors that must be within the budget."""
+
+_SURE = 0.05  # two-sided; of the interval, by the sign test
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Advice:
+    """What is recommended for a use and a budget.
+
+    Attributes:
+        use: One of `USES`.
+        budget: Largest error that is allowed.
+        clock: Name of the time that counts.
+        name: Name of the row that is chosen; None where no setting is within the budget, and then all that follows
+            `reason` is None.
+        gain: Whether it is faster than `exact`.
+        reason: Why there is no setting, or no gain.
+        kind, flags: The row's fields of these names.
+        error: The row's largest error that counts.
+        full: Whether its time is of views as large as they are drawn.
+        ratio, low, high, rounds: Its times over exact's, as an `Interval`.
+    """
+
+    use: str
+    budget: float
+    clock: str
+    name: str | None = None
+    gain: bool = False
+    reason: str | None = None
+    kind: str | None = None
+    flags: str | None = None
+    error: float | None = None
+    full: bool | None = None
+    ratio: float | None = None
+    low: float | None = None
+    high: float | None = None
+    rounds: int | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """The advice as tradeoff.json holds it: what was not found has no numbers."""
+        value = dataclasses.asdict(self)
+        return value if self.name else {k: value[k] for k in ("use", "budget", "clock", "name", "gain", "reason")}
+
+
+def interval(ratios: Sequence[float]) -> Interval | None:
+    """The median and the two order statistics between which it lies with 95 %; fewer than six: all of them.
+
+    Returns:
+        None of an empty list.
+    """
+    if not ratios:
+        return None
+    x = sorted(ratios)
+    n = len(ratios)
+    k = 0
+    tail = 0.5 ** len(ratios)
+    while 2 * (tail + math.comb(n, k + 1) * 0.5**n) <= _SURE:
+        k += 1
+        tail += math.comb(n, k) * 0.5**n
+    return Interval(ratio=statistics.median(x), low=x[k], high=x[-1 - k], rounds=n)
+
+
+def leaders(measured: Measured, clock: str, budgets: Sequence[float]) -> list[str]:
+    """Names of the rows that are worth timing at full size: the fastest within each budget, and preset `fast`."""
+    names = []
+    for use, (timed, _) in USES.items():
+        for budget in budgets if timed == clock else ():
+            rows = [row for row, _ in _within(measured, use, budget) if row.times[clock].ratio < 1]
+            names += [min(rows, key=lambda row: row.times[clock].ratio).name] if rows else []
+    fast = [row.name for row in measured.rows if row.name == "fast" and row.skipped is None and row.times[clock]]
+    return list(dict.fromkeys([*fast, *names]))
+
+
+def recommend(measured: Measured, use: str, budgets: Sequence[float]) -> list[Advice]:
+    """Choose for each budget the fastest setting with a gain, the most exact one of those as fast, or say why not.
+
+    Args:
+        measured: What `measure` returned, and what `measure_full` added to its rows under
+            `full`: where a clock was read at full size, only that counts. Rows of a reduced resolution and rows that
+            were measured on a sample of the rays are no candidates.
+        use: One of `USES`.
+        budgets: Largest errors that are allowed, each > 0.
+    """
+    clock = USES[use][0]
+    scatter = measured.scatter[clock]
+    sure = min(1.0, scatter.low) if scatter else 1.0
+    picks = []
+    for budget in budgets:
+        within = _within(measured, use, budget)
+        full = any(row.full.get(clock) for row, _ in within)
+        timed = [(row, error, row.full.get(clock) if full else row.times[clock]) for row, error in within]
+        faster = [(row, error, times) for row, error, times in timed if times and times.high < sure]
+        exact = next((entry for entry in timed if entry[0] is measured.truth), None)
+        pick = Advice(use=use, budget=budget, clock=clock)
+        if faster or exact:
+            if faster:
+                least = min(faster, key=lambda entry: entry[2].ratio)
+                alike = [entry for entry in faster if entry[2].low <= least[2].high]
+                row, error, times = min(alike, key=lambda entry: entry[1])
+            else:
+                row, error, times = exact
+                times = times or row.times[clock]
+                pick = dataclasses.replace(pick, reason="no measurable gain over exact")
+            found = {"name": row.name, "kind": row.kind, "flags": row.flags, "gain": bool(faster), "full": full}
+            numbers = {name: getattr(times, name) for name in ("ratio", "low", "high", "rounds")}
+            pick = dataclasses.replace(pick, error=error, **found, **numbers)
+        else:
+            pick = dataclasses.replace(pick, reason=_why_none(measured, use))
+        picks.append(pick)
+    return picks
+
+
+def _why_none(measured: Measured, use: str) -> str:
+    """Why a budget has no setting."""
+    every = _within(measured, use, math.inf)
+    if not every:
+        return f"there is no setting whose {' and '.join(USES[use][1])} error could be measured"
+    row, error = min(every, key=lambda entry: entry[1])
+    return f"no setting is within it, the least error is {error:.1e} ({row.name})"
+
+
+def _within(measured: Measured, use: str, budget: float) -> list[tuple[TradeoffRow, float]]:
+    """Candidates whose errors are within the budget, with the largest of them."""
+    clock, kinds = USES[use]
+    rows = [row for row in measured.rows if row.skipped is None and row.share == 1 and row.by == "view"]
+    found = [(row, row.errors.worst(kinds)) for row in rows if row.times[clock] is not None]
+    return [(row, error) for row, error in found if error is not None and error <= budget]
+
 
 Tensors = dict[str, torch.Tensor]
 _Result = TypeVar("_Result")
+
+# ------------------------------------------------------------------------------------------------------------ measuring
 
 _SECONDS = 100.0  # rounds end after so many of the clock or, where others use the machine, of the processor
 _AT_LEAST = 3  # rounds, before which they do not end
 _RAYS = 200  # rays of a sample on Mitsuba's traversal
 _PAIRS = 6_000_000  # (ray, Gaussian) pairs of the oracle's sample: 10 s
 _NOTHING = 1e-6  # alpha of a view that shows nothing
-_UNSEEN = 1e-6  # share of the largest: smaller entries of the diagonal are left out of relative errors
 
 
 def measure(
@@ -416,3 +920,257 @@ def _clock_name() -> str:
     """The clock: of one thread the processor's time, which nothing else on the machine stretches; else the wall's."""
     backend = runtime.backend()
     return "processor" if backend.name == "llvm" and backend.threads == 1 else "wall"
+
+
+# ------------------------------------------------------------------------------------- views as large as they are drawn
+
+_ROUNDS = 3  # rounds that say how much times scatter
+_FORWARD = 0.6  # share of the seconds for images, which is what is drawn at full size
+_GROW = 4  # times as many pixels are tried next, on the way to full size
+
+
+@dataclasses.dataclass(frozen=True)
+class FullSize:
+    """What was timed with a clock, in the order of tradeoff.json.
+
+    Attributes:
+        size: (width, height) of the first view as it was timed; None where there was no time.
+        drawn: (width, height) of the first view as it is drawn.
+        rounds: Number of rounds of timing.
+        names: Names of the rows that were timed.
+    """
+
+    size: list[int] | None
+    drawn: list[int]
+    rounds: int
+    names: list[str]
+
+
+def measure_full(
+    measured: Measured,
+    gaussians: Gaussians,
+    cameras: list[Camera],
+    budgets: Sequence[float],
+    repeats: int,
+    seconds: float,
+    seed: int,
+    say: Callable[[str], None],
+) -> dict[str, FullSize]:
+    """Times at full size, into the rows' `full`: clock -> `FullTime`.
+
+    Args:
+        measured: What `measure` returned.
+        gaussians: Gaussians of the scene, at least one.
+        cameras: Pinhole cameras, as large as they are drawn.
+        budgets: Largest errors that are allowed.
+        repeats: Largest number of rounds.
+        seconds: Time for all three clocks together.
+        seed: Seed of the order within a round and of the cotangent.
+        say: Called with what is being timed, before each.
+    Returns:
+        Clock -> what was timed with it.
+    """
+    rows = {row.name: row for row in measured.rows}
+    exact = measured.truth
+    order = random.Random(seed)
+    report = {}
+    gaussians = placed(gaussians)
+    chosen = {clock: leaders(measured, clock, budgets) for clock in CLOCKS}
+    chosen = {clock: names for clock, names in chosen.items() if names}
+    drawn = [cameras[0].width, cameras[0].height]
+    for k, (clock, names) in enumerate(chosen.items()):
+        work = _Work(clock, gaussians, seed)
+        share = seconds * (_FORWARD if clock == "forward" and len(chosen) > 1 else 1 / (len(chosen) - k))
+        # What a round takes, in units of exact's time: at full size the others take a smaller share of it, if any.
+        units = 1 + sum(rows[name].times[clock].ratio for name in names)
+        views, spent = _sized(work, cameras, exact, measured.pixels, share, units, say)
+        if not views:
+            seconds = max(seconds - spent, 0.0)
+            report[clock] = FullSize(None, drawn, 0, [])
+            continue
+        took: dict[str, list[float]] = {name: [] for name in (exact.name, *names)}
+        for number in range(max(repeats, _ROUNDS)):
+            a_round = sum(x[-1] for x in took.values()) if number else 0.0
+            if number and spent + a_round > share:
+                break
+            camera = views[number % len(views)]
+            for name in (exact.name, *order.sample(names, len(names))):
+                say(_said(clock, camera, name))
+                took[name].append(work(camera, rows[name]))
+                spent += took[name][-1]
+        seconds = max(seconds - spent, 0.0)
+        for name, times in took.items():
+            found = interval([a / b for a, b in zip(times, took[exact.name], strict=True)])
+            if found.rounds < _ROUNDS and name != exact.name:
+                found = _widened(found, measured.scatter[clock])
+            rows[name].full[clock] = FullTime(**dataclasses.asdict(found), seconds=statistics.median(times))
+        report[clock] = FullSize([views[0].width, views[0].height], drawn, len(took[exact.name]), list(took))
+    return report
+
+
+def _widened(times: Interval, scatter: Interval) -> Interval:
+    """Ratios of too few rounds, with an interval at least as wide as equal work scatters."""
+    low = min(times.low, times.ratio * scatter.low)
+    high = max(times.high, times.ratio * scatter.high)
+    return dataclasses.replace(times, low=low, high=high)
+
+
+class _Work:
+    """One clock: what is done to a view between its two readings."""
+
+    def __init__(self, clock: str, gaussians: Gaussians, seed: int):
+        self.clock = clock
+        self.gaussians = gaussians
+        self.seed = seed
+        self.leaves = {name: x.clone().requires_grad_() for name, x in gaussians.parameters().items()}
+        self.moving = gaussians.replace(**self.leaves)
+
+    def __call__(self, camera: Camera, row: TradeoffRow) -> float:
+        """Seconds that a row's settings take."""
+        return clocked(lambda: getattr(self, "_" + self.clock)(camera, row.settings))[1]
+
+    def _forward(self, camera: Camera, settings: RenderSettings) -> object:
+        with torch.no_grad():  # what an image alone takes
+            out = render(self.gaussians, camera, settings, outputs=())
+        return out.rgb.cpu(), out.alpha.cpu()  # as `drgs render` takes them
+
+    def _forward_backward(self, camera: Camera, settings: RenderSettings) -> object:
+        image = render(self.moving, camera, settings, outputs=()).rgb
+        signs = torch.randint(0, 2, image.shape, generator=torch.Generator().manual_seed(self.seed)) * 2 - 1
+        return torch.autograd.grad((image * signs.to(image)).sum(), list(self.leaves.values()), allow_unused=True)
+
+    def _fisher(self, camera: Camera, settings: RenderSettings) -> object:
+        return fisher.diagonal(self.gaussians, camera, settings)
+
+
+def _sized(
+    work: _Work,
+    cameras: list[Camera],
+    exact: TradeoffRow,
+    pixels: float,
+    seconds: float,
+    units: float,
+    say: Callable[[str], None],
+) -> tuple[list[Camera], float]:
+    """The cameras, reduced until a round fits into the seconds, and how many of these finding out took.
+
+    No cameras if a round fits at no more than the pixels that all rows were measured with already. Four times as many
+    pixels are tried each time, so that nothing far too large is ever begun.
+    """
+    whole = max(camera.width * camera.height for camera in cameras)
+    spent = 0.0
+    least = pixels = min(pixels, whole)
+    while True:
+        camera = at_most(cameras[0], int(pixels))
+        say(_said(work.clock, camera, "exact"))
+        took = work(camera, exact)
+        spent += took
+        # Time grows with the pixels at most. What is tried on the way is spent, too.
+        fits = pixels * (seconds - spent) / (units * took)
+        following = min(whole, _GROW * pixels)
+        if following * _GROW >= fits or following >= whole:
+            break
+        pixels = following
+    return [at_most(camera, int(min(whole, fits))) for camera in cameras if fits >= least], spent
+
+
+def _said(clock: str, camera: Camera, name: str) -> str:
+    return f"{clock.replace('_', ' + ')} at {camera.width}x{camera.height}: {name}"
+
+
+# ------------------------------------------------------------------------------------------------------------- the plot
+
+Point = tuple[float, float, TradeoffRow]
+"""Ratio of times, error, and whose they are."""
+
+_PANELS = (
+    ("image", "forward", "image error (larger of RMS and 99.9 %)"),
+    ("gradient", "forward_backward", "gradient error (worst group)"),
+    ("information", "fisher", "information error (worst group)"),
+)
+_COLORS = {"approximation": "#1f77b4", "model": "#d62728", "resolution": "#2ca02c", "precision": "#7f7f7f"}
+
+
+def plot(measured: Measured, budgets: Sequence[float], title: str, path: Path) -> bool:
+    """Write error against time for each use, one panel below the other.
+
+    Args:
+        measured: Times and errors of all rows; those of samples are left out.
+        budgets: Errors that are drawn as lines.
+        title: Text above the plot.
+        path: File to write, a .png.
+    Returns:
+        False where there is no matplotlib.
+    """
+    try:
+        import matplotlib
+    except ImportError:
+        return False
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, panels = plt.subplots(3, 1, figsize=(10, 15), dpi=90)
+    for axis, (kind, clock, label) in zip(panels, _PANELS, strict=True):
+        rows = [row for row in measured.rows if row.skipped is None and row.by == "view"]
+        points = [(row.ratio[clock], getattr(row.errors, kind), row) for row in rows]
+        points = [(x, y, row) for x, y, row in points if x and y]
+        for name, color in _COLORS.items():
+            part = [(x, y) for x, y, row in points if row.kind == name]
+            axis.plot(*zip(*part, strict=True), "o", ms=5, color=color, label=name) if part else None
+        points.sort(key=lambda p: p[:2])
+        front = [p for i, p in enumerate(points) if all(p[1] < q[1] for q in points[:i])]
+        axis.plot([p[0] for p in front], [p[1] for p in front], "-", lw=1, color="black", label="front", zorder=0)
+        axis.set(xscale="log", yscale="log", ylabel=label, xlabel=f"time, {clock.replace('_', ' + ')} / exact")
+        axis.margins(x=0.25, y=0.12)
+        for budget in budgets:
+            axis.axhline(budget, lw=0.6, ls=":", color="gray", zorder=0)
+        axis.legend(fontsize=7, loc="upper right")
+        # The front first: what finds no free place is left without a label.
+        rest = [p for p in points if p not in front]
+        _labels(figure, axis, [*front, *rest], points)
+    figure.suptitle(title, fontsize=10)
+    figure.tight_layout(rect=(0, 0, 1, 0.985))
+    with replacing(path, path.suffix) as name:
+        figure.savefig(name)
+    plt.close(figure)
+    return True
+
+
+def _labels(figure: Figure, axis: Axes, points: list[Point], dots: list[Point]) -> None:
+    """Names beside points, without overlaps; a point whose surroundings are full goes without."""
+    from matplotlib.transforms import Bbox
+
+    figure.tight_layout(rect=(0, 0, 1, 0.985))  # places do not move any more
+    renderer = figure.canvas.get_renderer()
+    inside = axis.get_window_extent()
+    places = [axis.transData.transform(p[:2]) for p in dots]
+    taken = [Bbox.from_bounds(x - 4, y - 4, 8, 8) for x, y in places]
+    taken.append(axis.get_legend().get_window_extent(renderer))
+    for x, y, row in points:
+        for reach in (6, 16, 30, 46):
+            for angle in (0, 180, 90, 270, 45, 315, 135, 225):
+                dx = reach * math.cos(math.radians(angle))
+                dy = reach * math.sin(math.radians(angle))
+                text = axis.annotate(
+                    row.name,
+                    (x, y),
+                    xytext=(dx, dy),
+                    textcoords="offset points",
+                    fontsize=7.5,
+                    color=_COLORS[row.kind],
+                    ha="left" if dx > 1 else "right" if dx < -1 else "center",
+                    va="bottom" if dy > 1 else "top" if dy < -1 else "center",
+                    arrowprops={"arrowstyle": "-", "lw": 0.4, "color": "gray"} if reach > 6 else None,
+                )
+                box = text.get_window_extent(renderer)
+                if (
+                    inside.contains(box.x0, box.y0)
+                    and inside.contains(box.x1, box.y1)
+                    and not box.count_overlaps(taken)
+                ):
+                    taken.append(box)
+                    break
+                text.remove()
+            else:
+                continue
+            break

@@ -1,28 +1,160 @@
 """What a rasterizer's image and gradients are beside a model's, and what explains the difference: verdicts of groups.
 
-Pixels that hang on near ties, where two correct renderers differ, are left out before a difference counts; then known
-deviations explain what they can, and the rasterizer's own central differences decide the rest.
+Pixels with near ties, where two correct renderers differ, are left out before a difference counts; then known
+deviations explain what they can, and the rasterizer's own central differences decide the rest: what its gradient has to
+agree with, whatever its model is. An image that is cut off somewhere (alpha below 1/255, transmittance below 1e-4,
+tiles, order) jumps where a parameter moves a pixel across. Pixels that jump on any of the steps are left out, of the
+differences and, by a masked cotangent, of the gradient; so are entries that do not converge with the square of the
+step. `dataclasses.asdict` of the rows is what `crossval.json` holds.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Callable
 
 import torch
 
 from drgs.cameras import Camera
-from drgs.lab.conventions import LEAST
-from drgs.lab.differences import Differences, central
-from drgs.lab.dumps import Dump
-from drgs.lab.image_errors import OFF, Pattern, error_row, pattern_of
-from drgs.lab.rasterizers import Rasterizer
-from drgs.lab.raw import MOTIONS
-from drgs.lab.reference_model import BETWEEN, ReferenceModel
-from drgs.lab.rows import AlphaRow, GroupRow, OwnRow, ViewRow, WorstGaussian, WorstPixel
+from drgs.lab.conventions import BETWEEN, LEAST, ReferenceModel
+from drgs.lab.image_errors import OFF, ErrorRow, Pattern, error_row, pattern_of
+from drgs.lab.parameters import MOTIONS
+from drgs.lab.rasterizers import Dump, Rasterizer
+from drgs.oracle import float64
 
-__all__ = ["Case", "Compared", "compared", "judge", "with_errors"]
+__all__ = [
+    "AlphaRow",
+    "Case",
+    "Compared",
+    "Differences",
+    "GroupRow",
+    "OwnRow",
+    "ViewRow",
+    "WorstGaussian",
+    "WorstPixel",
+    "central",
+    "compared",
+    "judge",
+    "with_errors",
+]
+
+
+@dataclasses.dataclass(frozen=True)
+class WorstPixel:
+    """A pixel where two images differ most."""
+
+    x: int
+    y: int
+    difference: float
+
+
+@dataclasses.dataclass(frozen=True)
+class AlphaRow:
+    """How far alpha is off: root of the mean square, and the mean."""
+
+    rms: float
+    bias: float
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewRow:
+    """One view's image beside the model's.
+
+    Attributes:
+        view: The camera's name, or its number where it has none.
+        rms: Root of the mean square of the difference.
+        max: Largest difference.
+        share: Share of the pixels that differ by more than 0.001.
+        alpha: Difference of the alphas.
+        near_ties: Number of pixels that do not count.
+        worst: Up to five pixels of the largest difference.
+        error: Place and look of the error; null where the image is the model's.
+    """
+
+    view: str
+    rms: float
+    max: float
+    share: float
+    alpha: AlphaRow
+    near_ties: int
+    worst: list[WorstPixel]
+    error: ErrorRow | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class WorstGaussian:
+    """A Gaussian (of `viewmats`: a view) whose gradient is off by most, as a norm."""
+
+    gaussian: int
+    difference: float
+
+
+@dataclasses.dataclass(frozen=True)
+class OwnRow:
+    """A gradient beside the rasterizer's own central differences.
+
+    Attributes:
+        entries: Flat indices of the group's parameters.
+        central: Central difference at each of them.
+        uncertainty: Error bar of each central difference.
+        gradient: The rasterizer's gradient at each of them.
+        relative: L2 norm of the error over that of the differences.
+        left_out: Number of entries that did not converge.
+        bug: Whether the gradient contradicts the differences.
+        what: The finding in words.
+        pixels_left_out: Number of pixels that jump on one of the steps.
+    """
+
+    entries: list[int]
+    central: list[float]
+    uncertainty: list[float]
+    gradient: list[float]
+    relative: float
+    left_out: int
+    bug: bool
+    what: str
+    pixels_left_out: int
+
+
+@dataclasses.dataclass
+class GroupRow:
+    """One parameter group's gradient beside the model's.
+
+    Attributes:
+        verdict: One of `crossval.VERDICTS`, None while it is to be explained.
+        why: The reason in words.
+        worst: Up to five Gaussians of the largest difference.
+        relative: L2 norm of the difference over that of the model's gradient.
+        cosine: Cosine of the angle between the two gradients.
+        bias: How much too long the gradient is along the model's.
+        max: Largest difference.
+        norm: L2 norm of the model's gradient.
+        differences: Central differences that decided, where they were asked for.
+    """
+
+    verdict: str | None
+    why: str
+    worst: list[WorstGaussian]
+    relative: float
+    cosine: float
+    bias: float
+    max: float
+    norm: float
+    differences: OwnRow | None = None
+
+    def settle(self, verdict: str, why: str) -> None:
+        """Give it its verdict."""
+        self.verdict = verdict
+        self.why = why
+
+    def json(self) -> dict:
+        """The row as crossval.json holds it, without `differences` where there are none."""
+        return {name: x for name, x in dataclasses.asdict(self).items() if name != "differences" or x is not None}
+
+
+# ------------------------------------------------------------------------------------------------------------- verdicts
 
 _FEW = 0.01  # share of the pixels: so few that are off hang on a cut-off or on the order, and are left out
 _IMAGE = 1e-3  # RMS of images that agree
@@ -370,3 +502,158 @@ def _own_row(gradient: torch.Tensor, wanted: torch.Tensor | None, own: Differenc
         what=what,
         pixels_left_out=int((~own.kept).sum()),
     )
+
+
+# -------------------------------------------------------------------------------------------------- central differences
+
+_STEPS = 4  # each half of the one before
+_FIRST = {torch.float64: 2e-3, torch.float32: 1.6e-2}  # first step, in units of what changes the image by its own size
+_EPS = {torch.float64: 1e-9, torch.float32: 2e-7}  # rounding of an image, of float32 renderers in general
+_LEFT = 0.5  # share of the pixels that an entry changes which must be kept
+_JUMP = 0.05  # share of the largest slope that no smooth change of half a step reaches
+
+
+@dataclasses.dataclass(frozen=True)
+class Differences:
+    """What was measured at some entries.
+
+    Attributes:
+        entries: Group -> list of flat indices that converged.
+        values: Group -> central differences there of <cotangent, image>, over the pixels that are kept.
+        uncertainty: Group -> error bars of `values`.
+        left_out: Group -> number of entries that did not converge, or lost most of their pixels.
+        kept: (H, W) bool, pixels that no step made jump.
+    """
+
+    entries: dict[str, list[int]]
+    values: dict[str, torch.Tensor]
+    uncertainty: dict[str, torch.Tensor]
+    left_out: dict[str, int]
+    kept: torch.Tensor
+
+
+def central(
+    rasterizer: Rasterizer,
+    raw: dict,
+    camera: Camera,
+    background: tuple,
+    cotangent: torch.Tensor,
+    entries: dict[str, list[int]],
+    noise: float | None = None,
+) -> Differences:
+    """Central differences at chosen entries, four steps each, accumulated in float64.
+
+    Args:
+        rasterizer: The rasterizer whose image is differenced.
+        raw: Raw parameters, float64.
+        camera, background: The view.
+        cotangent: (H, W, 3) weights of the image's values.
+        entries: Group -> flat indices of the parameters that are moved.
+        noise: Rounding of the rasterizer's image; default by its precision.
+    """
+    slopes: dict[str, list[list[torch.Tensor]]] = {}
+    steps: dict[str, list[list[float]]] = {}
+    kept = torch.ones(cotangent.shape[:2], dtype=torch.bool)
+    noise = noise or _EPS[rasterizer.dtype]
+    for group, indices in entries.items():
+        slopes[group] = []
+        steps[group] = []
+        for index in indices:
+            found, used = _slopes(rasterizer, raw, camera, background, group, index)
+            largest = max(float(x.abs().max()) for x in found)
+            for a, b, h in zip(found, found[1:], used[1:], strict=False):
+                kept &= ~((a - b).abs() > _JUMP * largest + 8 * noise / h).any(-1)
+            slopes[group].append(found)
+            steps[group].append(used)
+    weight = cotangent * kept[..., None]
+    good = {group: [] for group in entries}
+    values, bars = ({group: [] for group in entries} for _ in range(2))
+    left_out = dict.fromkeys(entries, 0)
+    for group, indices in entries.items():
+        for index, found, used in zip(indices, slopes[group], steps[group], strict=True):
+            sums = [float((weight * x).sum()) for x in found]
+            changed = found[-1] != 0
+            touched = int((changed & kept[..., None]).sum())
+            if touched < _LEFT * int(changed.sum()):  # what is left says nothing about this entry
+                left_out[group] += 1
+                continue
+            # Each pixel's rounding is divided by the step; random signs add up as a square root.
+            bar = [noise * math.sqrt(max(touched, 1)) / h for h in used]
+            value, error = _extrapolated(sums, bar)
+            if value is None:
+                left_out[group] += 1
+                continue
+            good[group].append(index)
+            values[group].append(value)
+            bars[group].append(error)
+    return Differences(
+        good,
+        {group: torch.tensor(x, dtype=torch.float64) for group, x in values.items()},
+        {group: torch.tensor(x, dtype=torch.float64) for group, x in bars.items()},
+        left_out,
+        kept,
+    )
+
+
+def _slopes(
+    rasterizer: Rasterizer, raw: dict, camera: Camera, background: tuple, group: str, index: int
+) -> tuple[list[torch.Tensor], list[float]]:
+    """(I(+h) - I(-h)) / 2h for each step, as (H, W, 3), and the steps as they were after rounding."""
+    first = _FIRST[rasterizer.dtype] * _unit(raw, camera, group, index)
+    found, used = [], []
+    for k in range(_STEPS):
+        images, places = [], []
+        for sign in (1, -1):
+            moved = dict(raw)
+            moved[group] = raw[group].clone()
+            moved[group].view(-1)[index] += sign * first / 2**k
+            places.append(float(moved[group].view(-1)[index].to(rasterizer.dtype)))
+            images.append(rasterizer.image(moved, camera, background)[0])
+        width = places[0] - places[1]
+        used.append(width / 2)
+        found.append((images[0] - images[1]) / width if width > 0 else torch.zeros_like(images[0]))
+    # A step that rounding has taken away is 0, and is divided by: its rounding then counts for everything.
+    return found, [max(h, 1e-300) for h in used]
+
+
+def _unit(raw: dict, camera: Camera, group: str, index: int) -> float:
+    """The change of a parameter that changes its Gaussian's part of the image by about its own size."""
+    if group not in ("means", "quats", *MOTIONS):
+        return 1.0
+    # A step is a number: it scales what is measured and is differentiated by nothing.
+    w2c = float64(camera.w2c).detach()
+    scales = raw["log_scales"].exp()
+    depths = raw["means"] @ w2c[2, :3] + w2c[2, 3]
+    # Nothing in the image is thinner than this.
+    thin = scales.amin(1).maximum(0.3 * depths.abs() / float(camera.K[0][0]))
+    if group in MOTIONS:  # an angle, or a part of the depth: all Gaussians move by as much as one of them is thin
+        ahead = depths > 0
+        return float((thin / depths)[ahead].median()) if bool(ahead.any()) else 1.0
+    i = index // raw[group].shape[1]
+    if group == "means":
+        return float(thin[i])
+    return float(raw["quats"][i].norm()) * min(1.0, float(thin[i]) / float(scales[i].max()))
+
+
+def _extrapolated(sums: list[float], bars: list[float]) -> tuple[float | None, float]:
+    """The limit of central differences at h, h/2, h/4, h/8, or None where they do not converge with h^2.
+
+    Returns:
+        The best Richardson value and its uncertainty.
+    """
+    gaps = [abs(a - b) for a, b in zip(sums, sums[1:], strict=False)]
+    best = None
+    for k, (gap, bar) in enumerate(zip(gaps, bars[1:], strict=True)):
+        value = sums[k + 1] + (sums[k + 1] - sums[k]) / 3
+        error = gap / 3 + bar
+        if best is None or error < best[1]:
+            best = value, error, k
+    value, error, k = best
+    # An error of 1e-3 is far below what is a bug (verdicts._OWN).
+    if error <= 1e-3 * abs(value) or all(gap <= 4 * bar for gap, bar in zip(gaps, bars[1:], strict=True)):
+        return value, error  # settled, or below rounding on all steps
+    # A gap of 0 has a logarithm, too, far from 2.
+    ratios = [math.log2(max(a, 1e-300) / b) for a, b, bar in zip(gaps, gaps[1:], bars[2:], strict=False) if b > 4 * bar]
+    if ratios and all(1.5 <= ratio <= 2.5 for ratio in ratios):
+        return value, error
+    return None, math.inf
