@@ -18,9 +18,17 @@ from typing import Any
 
 from studies import PAGE_DATA, ROOT, write_csv
 
-from drgs.studies.race import over_views
 from drgs.studies.rows import read_study
-from drgs.studies.statistics import at_views, coverage, differences, estimate, unit_of, values_of, view_counts
+from drgs.studies.statistics import (
+    at_views,
+    coverage,
+    differences,
+    estimate,
+    over_views,
+    unit_of,
+    values_of,
+    view_counts,
+)
 from drgs.studies.tables import fill_between, markdown_table
 
 Rows = Sequence[dict[str, Any]]

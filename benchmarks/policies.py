@@ -20,10 +20,9 @@ from studies import ROOT
 
 from drgs.fitting.config import FitConfig
 from drgs.studies.cells import Metric, Study
-from drgs.studies.curves import draw_curves
 from drgs.studies.rows import read_study
 from drgs.studies.statistics import FEWEST_UNITS, at_views, differences, estimate, unit_of, values_of, view_counts
-from drgs.studies.tables import fill_between, markdown_table
+from drgs.studies.tables import draw_curves, fill_between, markdown_table
 
 Rows = Sequence[dict[str, Any]]
 

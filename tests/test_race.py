@@ -11,8 +11,8 @@ from drgs.studies import cells as engine
 from drgs.studies.cells import Metric, Study, run_cells
 from drgs.studies.experiments import study_of
 from drgs.studies.plan import plan_of
-from drgs.studies.race import decided, over_views
 from drgs.studies.rows import Cell, append_row, cell_of, read_study
+from drgs.studies.statistics import decided, over_views
 from drgs.train import FitConfig
 
 

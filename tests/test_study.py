@@ -23,7 +23,6 @@ from drgs.fitting.config import FitConfig
 from drgs.guards.locks import InUse
 from drgs.studies import cells as engine
 from drgs.studies.cells import Metric, Study, distinct_seeds, run_cell, run_cells
-from drgs.studies.curves import draw_curves
 from drgs.studies.experiments import EXPERIMENTS
 from drgs.studies.rows import Cell, append_row, cell_of, read_study
 from drgs.studies.statistics import (
@@ -35,7 +34,7 @@ from drgs.studies.statistics import (
     unit_of,
     view_counts,
 )
-from drgs.studies.tables import explained, fill_between, study_report
+from drgs.studies.tables import draw_curves, explained, fill_between, study_report
 
 METRICS = (
     Metric("psnr", "PSNR", 2),

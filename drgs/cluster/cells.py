@@ -49,7 +49,7 @@ def run_cells_on(
 
     A fit that fails is told and left for the next call; the others go on. On Ctrl-C, workers of this machine end;
     those of a cluster that was joined finish the cell that they have, and its row is found by the next call. All cells
-    are handed out at once: who has left a race (`drgs.studies.race`) is asked when the call begins.
+    are handed out at once: who has left a race (`drgs.studies.statistics`) is asked when the call begins.
 
     Args:
         cluster: The workers.

@@ -11,7 +11,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 from drgs.commands.option_groups import Clustered, Common, Lenses, OutputPath, SceneFile, Settings, Timed, Views
 from drgs.commands.record_options import options_of
 from drgs.meshing.options import MeshOptions
-from drgs.studies.choices import ExperimentName, ProtocolName, StudyScale
+from drgs.studies.protocols import ExperimentName, ProtocolName, StudyScale
 
 __all__ = ["Capture", "Demo", "Mesh", "Reproduce", "Scene", "Sfm", "Teach"]
 

@@ -31,8 +31,8 @@ from drgs.guards.writing import is_full
 from drgs.machine import forget_peak_memory
 from drgs.metrics import Lpips
 from drgs.studies.protocols import PROTOCOLS
-from drgs.studies.race import decided
 from drgs.studies.rows import Cell, append_row, is_done, read_study
+from drgs.studies.statistics import decided
 from drgs.train import fit
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ class Study:
         reference: Label of the policy that the others are compared with.
         comparisons: More pairs (policy, reference) to be compared.
         lpips: Weights of a backbone: every row then has LPIPS, those of finished runs, too.
-        race: A policy has no more fits once its difference from the reference is known (`drgs.studies.race`).
+        race: A policy has no more fits once its difference from the reference is known (`drgs.studies.statistics`).
         of_one_camera: Fields of the selection in cells without a held-out camera, where things move: the views of one
             camera that moves about and films.
     """

@@ -10,10 +10,8 @@ from typing import Any
 
 from drgs import data
 from drgs.studies.cells import Study, distinct_seeds
-from drgs.studies.choices import ExperimentName, ProtocolName, StudyScale
-from drgs.studies.experiments import EXPERIMENTS, Experiment, study_of
-from drgs.studies.made import MADE_SPLIT
-from drgs.studies.protocols import PROTOCOLS
+from drgs.studies.experiments import EXPERIMENTS, MADE_SPLIT, Experiment, study_of
+from drgs.studies.protocols import PROTOCOLS, ExperimentName, ProtocolName, StudyScale
 from drgs.studies.rows import Cell
 
 __all__ = ["StudyPlan", "plan_of"]

@@ -1,14 +1,22 @@
-"""How an active fit of a study is run, by name: what is known at the start, and what happens at a pick."""
+"""The names of studies, and how an active fit of one is run: what is known at the start, and what happens at a pick.
+
+Imports nothing heavy: the options of the command line read it.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 from drgs.fitting.config import InitPoints
 
-__all__ = ["PROTOCOLS", "Protocol"]
+__all__ = ["PROTOCOLS", "ExperimentName", "Protocol", "ProtocolName", "StudyName", "StudyScale"]
+
+ExperimentName = Literal["static", "dynamic", "prior", "blocks", "captures"]
+StudyName = Literal["static", "dynamic", "captures"]
+ProtocolName = Literal["paper", "blind", "fisherrf", "nbv-gym"]
+StudyScale = Literal["tiny", "small", "paper"]
 
 
 @dataclasses.dataclass(frozen=True)
