@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import stats
 from test_active import write_still
 from test_data import write_transforms
 from test_dynamic_data import cameras, coded, write_poses, write_video
@@ -30,7 +31,6 @@ from drgs.studies.statistics import (
     coverage,
     differences,
     estimate,
-    student_quantile,
     unit_of,
     view_counts,
 )
@@ -471,13 +471,9 @@ def test_intervals_are_those_of_all_resamples(rng, sizes):
 
 
 def test_what_is_detectable_is_students(rng):
-    """Quantiles are SciPy's; the number is that of a t test of the scenes' means, of one scene of its units, and none
-    where a single mean says nothing of its spread.
+    """The number is that of a t test of the scenes' means, of one scene of its units, and none where a single mean says
+    nothing of its spread.
     """
-    stats = pytest.importorskip("scipy.stats")
-    for degrees in (1, 2, 3, 4, 7, 8, 39, 200):
-        for share in (0.6, 0.8, 0.975):
-            assert student_quantile(share, degrees) == pytest.approx(stats.t.ppf(share, degrees), rel=1e-12)
     values = {(f"s{s}", (8, 0), (str(k),)): float(rng.normal()) for s, n in enumerate((3, 3, 6)) for k in range(n)}
     scenes = [[x for unit, x in values.items() if unit[0] == f"s{s}"] for s in range(3)]
     for given, means in ((values, [np.mean(x) for x in scenes]), ({u: values[u] for u in list(values)[:3]}, scenes[0])):
@@ -493,7 +489,6 @@ def test_what_is_detectable_is_detected(sizes):
     600 studies know a share of 0.8 to 0.016, one of 0.05 to 0.009: three of these. Of three means the sum of quantiles
     falls a little short of the quantile of the noncentral distribution: a power of 0.77.
     """
-    stats = pytest.importorskip("scipy.stats")
     rng, found = np.random.default_rng(3), []
     for _ in range(600):
         means = rng.normal(size=len(sizes))
@@ -690,7 +685,6 @@ def test_the_semantic_page_comes_from_its_rows(monkeypatch, tmp_path):
 
 def test_data_files_come_from_their_rows(monkeypatch):
     """Those of benchmarks/predict.py and benchmarks/uncertainty.py, which make them without running anything."""
-    pytest.importorskip("scipy.stats")
     root = Path(__file__).parents[1]
     monkeypatch.syspath_prepend(root / "benchmarks")
     predict, uncertainty = importlib.import_module("predict"), importlib.import_module("uncertainty")

@@ -30,6 +30,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.special import stdtrit
 
 __all__ = [
     "FEWEST_UNITS",
@@ -41,7 +42,6 @@ __all__ = [
     "differences",
     "estimate",
     "over_views",
-    "student_quantile",
     "unit_of",
     "values_of",
     "view_counts",
@@ -179,41 +179,14 @@ def coverage(scenes: int, units: int) -> float:
     return table[max(key for key in table if key <= count)]
 
 
-def student_quantile(share: float, degrees: int) -> float:
-    """The number that so large a share, in (0.5, 1), of Student's t distribution lies below.
-
-    By bisection in the angle of [1], 26.7.3 and 26.7.4.
-
-    Reference:
-        [1] Abramowitz and Stegun, "Handbook of Mathematical Functions", 1964.
-    """
-    low = 0.0
-    high = math.pi / 2
-    for _ in range(60):
-        angle = (low + high) / 2
-        low, high = (angle, high) if _within(angle, degrees) < 2 * share - 1 else (low, angle)
-    return math.tan(low) * math.sqrt(degrees)
-
-
-def _within(angle: float, degrees: int) -> float:
-    """The share of Student's distribution between -t and t, for t = tan(angle) sqrt(degrees)."""
-    cosine = math.cos(angle)
-    odd = degrees % 2
-    term = cosine if odd else 1.0
-    total = 0.0 if degrees == 1 else term
-    for power in range(2 + odd, degrees - 1, 2):
-        term *= (power - 1) / power * cosine**2
-        total += term
-    return 2 / math.pi * (angle + math.sin(angle) * total) if odd else math.sin(angle) * total
-
-
 def _detectable(means: Sequence[float]) -> float | None:
     """`Effect.detectable` of independent means."""
     degrees = len(means) - 1
     if degrees < 1:
         return None
     error = float(np.std(means, ddof=1)) / math.sqrt(len(means))
-    return (student_quantile(_LEVEL, degrees) + student_quantile(_POWER, degrees)) * error
+    # Quantiles of Student's t distribution.
+    return float(stdtrit(degrees, _LEVEL) + stdtrit(degrees, _POWER)) * error
 
 
 # ------------------------------------------------------------------------------------------------------------- the race
