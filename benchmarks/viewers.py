@@ -69,8 +69,7 @@ from drgs.integrator import render  # noqa: E402
 from drgs.metrics import psnr  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
-from drgs.viewing.poses import pose_of  # noqa: E402
-from drgs.viewing.splats import ClientGaussians  # noqa: E402
+from drgs.viewing.client import ClientGaussians, pose_of  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "viewers.jsonl"
 PAGE = ROOT / "docs" / "one-model.md"

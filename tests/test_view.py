@@ -37,15 +37,12 @@ from drgs.data.flight_files import read_flight
 from drgs.display.pictures import map_colors
 from drgs.files import load_state, save_state
 from drgs.viewing import panel
-from drgs.viewing.drawing import bands, drawn, stages
-from drgs.viewing.layers import layers_of, tinted
+from drgs.viewing.client import ClientGaussians, Pose, camera_of, looking, pose_of
+from drgs.viewing.layers import Uncertainty, bands, drawn, layers_of, stages, tinted
 from drgs.viewing.placed_views import PlacedView, Ranking, Score, Sight, placed_views_of, read_ranking, score_colors
-from drgs.viewing.poses import Pose, camera_of, looking, pose_of
 from drgs.viewing.server import Viewer
 from drgs.viewing.session import Session
-from drgs.viewing.splats import ClientGaussians
 from drgs.viewing.subject import FirstView, Subject
-from drgs.viewing.uncertainty import Uncertainty
 from drgs.viewing.worker import Worker
 
 FAST = drgs.RenderSettings.preset("fast")

@@ -31,7 +31,7 @@ from drgs.commands.viewed import subject_of, watched_files
 from drgs.data.flight import rotation_of
 from drgs.data.flight_files import read_flight
 from drgs.files import load_state, save_state
-from drgs.viewing.poses import camera_of, pose_of
+from drgs.viewing.client import camera_of, pose_of
 from drgs.viewing.server import Viewer
 from drgs.viewing.session import REST
 from drgs.viewing.subject import FirstView

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.client
+import inspect
 import socket
 
 import pytest
@@ -16,8 +17,8 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from drgs.viewing.gate import Gate, is_loopback
+from drgs.viewing.gated_viser import bound_socket, guarded
 from drgs.viewing.server import Viewer
-from drgs.viewing.wire import bound_socket, guarded
 
 TOKEN = "a-token-of-the-test"
 
@@ -186,6 +187,14 @@ def test_no_tunnel_is_opened(open_viewer):
         client.picture()
     assert open_viewer._server._share_tunnel is None
     assert not {m["type"] for m in client.heard} & {"ShareUrlUpdated"}
+
+
+def test_viser_has_no_public_way_yet():
+    """Fails when viser's server takes other arguments: if one checks requests or is a socket, `gated_viser` goes."""
+    import viser
+
+    known = ["self", "host", "port", "label", "verbose", "_deprecated_kwargs"]
+    assert list(inspect.signature(viser.ViserServer.__init__).parameters) == known
 
 
 def test_a_server_that_goes_another_way_is_noticed():

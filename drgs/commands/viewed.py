@@ -19,11 +19,10 @@ from drgs.files import Run, state_header
 from drgs.fitting.records import fitted_views
 from drgs.guards.foreign import refuse_foreign
 from drgs.information.blocks import MAP_PRIOR, together
-from drgs.viewing.layers import layers_of
+from drgs.viewing.client import pose_of
+from drgs.viewing.layers import Uncertainty, layers_of
 from drgs.viewing.placed_views import NEXT, PlacedView, Ranking, placed_views_of, read_ranking
-from drgs.viewing.poses import pose_of
 from drgs.viewing.subject import FirstView, Subject
-from drgs.viewing.uncertainty import Uncertainty
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

@@ -5,7 +5,7 @@ page may open a WebSocket to 127.0.0.1 (it states its own site as `Origin`), or 
 (the request then states that name as `Host`). Both are refused. One that listens to a network asks for a token, once
 in the address, from then on in a cookie that scripts do not see.
 
-Here is what is decided, from a path and headers alone; `drgs.viewing.wire` asks it.
+Here is what is decided, from a path and headers alone; `drgs.viewing.gated_viser` asks it.
 """
 
 from __future__ import annotations

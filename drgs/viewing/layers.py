@@ -1,24 +1,141 @@
-"""Which pictures there are of what is looked at: what it does not have is not offered."""
+"""Which pictures there are of what is looked at, and how they are drawn: in steps, a small one first.
+
+What a scene does not have is not offered. A small picture comes first, then one as large as the browser shows, a band
+of rows at a time. Between two steps the worker may turn to something else, so that a browser whose camera has moved
+waits for one band of the picture that is no longer wanted, not for all of it.
+
+What the photographs leave uncertain is added up once, view by view, when it is first wanted. A sketch comes before, of
+few photographs and few of their pixels: within seconds it shows about the same map.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Generator, Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import torch
 
 from drgs.display import pictures
-from drgs.integrator import Output
-from drgs.viewing.drawing import Done, drawn
+from drgs.ellipsoids import colors_only
+from drgs.gain import Information, Prior, check, variances
+from drgs.information.blocks import add
+from drgs.integrator import Output, render
+from drgs.sizes import at_most, cropped
 
 if TYPE_CHECKING:
+    import torch
+
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians, Scene
+    from drgs.integrator import Output
     from drgs.settings import RenderSettings
-    from drgs.viewing.uncertainty import Uncertainty
 
-__all__ = ["UNCERTAINTY", "ColorScale", "Drawing", "Layer", "layers_of", "tinted"]
+__all__ = [
+    "UNCERTAINTY",
+    "ColorScale",
+    "Done",
+    "Drawing",
+    "Layer",
+    "Steps",
+    "Uncertainty",
+    "bands",
+    "drawn",
+    "layers_of",
+    "over",
+    "stages",
+    "tinted",
+]
+
+
+class Done(NamedTuple):
+    """How far a picture is.
+
+    Attributes:
+        share: Share that is done.
+        rows: (h, W, 3) uint8 rows from the top that are done; None where colors are not known before the end.
+    """
+
+    share: float
+    rows: np.ndarray | None = None
+
+
+Steps = Generator[Done, None, np.ndarray]
+"""Yields its progress between its steps, and returns what it has made."""
+
+_FIRST = 16_000  # pixels of the first picture
+_BAND = 48_000  # pixels that are drawn in one step
+
+
+def stages(camera: Camera, most: int) -> list[Camera]:
+    """The cameras of one view in the order in which they are drawn: a small picture, then one of `most` pixels.
+
+    Args:
+        camera: The view, as large as the browser's window.
+        most: Largest number of pixels; no picture is larger than the window either.
+    """
+    last = at_most(camera, most)
+    first = at_most(camera, _FIRST)
+    return [first, last] if 2 * first.width * first.height < last.width * last.height else [last]
+
+
+def bands(camera: Camera, pixels: int = _BAND) -> list[Camera]:
+    """Cameras that show the rows of a view from top to bottom, each at most so many pixels, but a row at least."""
+    rows = max(1, pixels // camera.width)
+    parts = []
+    for top in range(0, camera.height, rows):
+        parts.append(cropped(camera, 0, top, camera.width, min(rows, camera.height - top)))
+    return parts
+
+
+def drawn(
+    scene: Scene,
+    camera: Camera,
+    settings: RenderSettings,
+    read: Callable[[Output], np.ndarray],
+    features: bool = False,
+    colors: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> Steps:
+    """What `read` takes of the rendering of a view, (H, W, ...).
+
+    Args:
+        scene: What is drawn.
+        camera: The view, as large as the picture.
+        settings: Render settings.
+        read: Function that takes a band's rendering, with its depth, and returns rows of the picture.
+        features: Whether it reads the features, which else cost nothing.
+        colors: What makes rows of the picture of that, where a row does not depend on others.
+    """
+    parts = []
+    shown: list[np.ndarray] = []
+    with torch.no_grad():  # a picture is looked at only; a graph would keep every band's intermediates
+        seen = scene.at(camera.time) if features else colors_only(scene.at(camera.time), None)
+    below = 0
+    for part in bands(camera):
+        with torch.no_grad():  # entered for each band: between two of them the thread does other work
+            parts.append(read(render(seen, part, settings, ("depth",))))
+        below += part.height
+        if colors is not None:
+            shown.append(colors(parts[-1]))
+        yield Done(below / camera.height, np.concatenate(shown) if shown else None)
+    return np.concatenate(parts)
+
+
+def over(before: np.ndarray, rows: np.ndarray, height: int) -> np.ndarray:
+    """(height, W, 3) uint8 picture whose first rows are done, over a smaller one of the same view.
+
+    Args:
+        before: (h, w, 3) uint8 smaller picture.
+        rows: (r, W, 3) uint8 rows that are done.
+        height: H.
+    """
+    import cv2
+
+    picture = cv2.resize(before, (rows.shape[1], height), interpolation=cv2.INTER_LINEAR)
+    picture[: len(rows)] = rows
+    return picture
+
 
 UNCERTAINTY = "uncertainty"
 _WIDE_PIXELS = 200_000  # pixels of a picture of features: 100 MB of 128 channels
@@ -160,3 +277,92 @@ def _tint_of(painter: Callable[[Output], np.ndarray]) -> Callable[[Gaussians], n
         return np.concatenate(rows) if rows else np.zeros((0, 3), np.uint8)
 
     return tint
+
+
+_VIEWS = 24  # of the sketch, at most
+_PIXELS = 2400  # of each, at most
+
+
+class Uncertainty:
+    """Maps of the predictive variance, given the views that a scene was fitted to.
+
+    Args:
+        cameras: The cameras of these views, at least one.
+        said: What a view says about the parameters.
+        mapped: (camera, weights) -> (H, W) sum over the parameters of squared derivatives times weights.
+        prior: lambda.
+    """
+
+    def __init__(
+        self,
+        cameras: Sequence[Camera],
+        said: Callable[[Camera], Information],
+        mapped: Callable[[Camera, Information], np.ndarray],
+        prior: Prior,
+    ) -> None:
+        self.cameras = tuple(cameras)
+        self._said = said
+        self._mapped = mapped
+        self._prior = prior
+        self.done = 0
+        self._sum: dict[str, torch.Tensor] = {}
+        self._weights: Information | None = None
+
+    @property
+    def is_known(self) -> bool:
+        """Whether all views have been added."""
+        return self.done == len(self.cameras)
+
+    @property
+    def is_sketched(self) -> bool:
+        """Whether there is a map, if only a sketch."""
+        return self._weights is not None
+
+    def learn(self, told: Callable[[], None], sketch: bool = True) -> Iterator[None]:
+        """Sketch the map, if there is none, then add the views that are not added yet, one a step.
+
+        Args:
+            told: Called after the sketch and each view.
+            sketch: Whether somebody waits for a sketch; of few small views there is none.
+        """
+        few = len(self.cameras) <= _VIEWS and max(x.width * x.height for x in self.cameras) <= _PIXELS
+        if sketch and not few and not self.is_sketched:
+            yield from self._sketch()
+            told()
+            yield
+        while self.done < len(self.cameras):
+            camera = self.cameras[self.done]
+            add(self._sum, self._of(camera))
+            self.done += 1
+            if self.done == len(self.cameras):
+                self._weights = variances(self._sum, self._prior)
+                self._sum = {}
+            told()
+            yield
+
+    def _sketch(self) -> Iterator[None]:
+        """Add up few pixels of few views, evenly spaced, each for those of all that it stands for."""
+        total: dict[str, torch.Tensor] = {}
+        count = min(len(self.cameras), _VIEWS)
+        for k in range(count):
+            camera = self.cameras[k * len(self.cameras) // count]
+            small = at_most(camera, _PIXELS)
+            stands_for = len(self.cameras) / count * (camera.width * camera.height) / (small.width * small.height)
+            add(total, {name: x * stands_for for name, x in self._of(small).items()})
+            yield
+        self._weights = variances(total, self._prior)
+
+    def _of(self, camera: Camera) -> Information:
+        said = self._said(camera)
+        check(f"view: {camera.name}", said)
+        return said
+
+    def map(self, camera: Camera) -> np.ndarray:
+        """(H, W) predictive variance of a view's pixels, for unit noise.
+
+        Raises:
+            RuntimeError: Before all views have been added, or sketched.
+        """
+        if self._weights is None:
+            raise RuntimeError(f"view: all {len(self.cameras)} views must be added first, {self.done} are")
+        return self._mapped(camera, self._weights)

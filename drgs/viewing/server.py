@@ -11,11 +11,10 @@ from collections.abc import Hashable, Iterator
 from typing import Any
 
 from drgs.viewing.gate import Gate
-from drgs.viewing.layers import UNCERTAINTY
+from drgs.viewing.gated_viser import bound_socket, gated_server, in_a_line
+from drgs.viewing.layers import UNCERTAINTY, Uncertainty
 from drgs.viewing.session import Session
 from drgs.viewing.subject import Subject
-from drgs.viewing.uncertainty import Uncertainty
-from drgs.viewing.wire import bound_socket, guarded, in_a_line
 from drgs.viewing.worker import Worker
 
 __all__ = ["Viewer"]
@@ -54,9 +53,6 @@ class Viewer:
         preset: str = "exact",
         pixels: int = 500_000,
     ) -> None:
-        import viser
-        from viser._messages import ShareUrlDisconnect, ShareUrlRequest
-
         listening = bound_socket(host, port)
         try:
             self.port = listening.getsockname()[1]
@@ -67,14 +63,10 @@ class Viewer:
             self._pixels = pixels
             self.sessions: dict[int, Session] = {}
             self._learnt: Subject | None = None  # the last one whose uncertainty is known
-            with guarded(self.gate, listening), contextlib.redirect_stdout(io.StringIO()):  # it says where it listens
-                self._server = viser.ViserServer(host, self.port, verbose=False)
+            self._server = gated_server(self.gate, listening, host)
         except BaseException:
             listening.close()
             raise
-        # A tunnel to a server of somebody else's would lead around the gate.
-        self._server._websock_server.unregister_handler(ShareUrlRequest)
-        self._server._websock_server.unregister_handler(ShareUrlDisconnect)
         self._server.get_event_loop().set_exception_handler(self._misunderstood)
         self.worker = Worker(self._failed)
         self._place()

@@ -22,12 +22,10 @@ import numpy as np
 from drgs.data.flight import Keyframe
 from drgs.display.pictures import to_bytes
 from drgs.viewing import panel
-from drgs.viewing.drawing import over, stages
+from drgs.viewing.client import ClientGaussians, Pose, camera_of, looking, pose_of
 from drgs.viewing.keyframes import KeyframeFolder
-from drgs.viewing.layers import UNCERTAINTY, Layer, tinted
+from drgs.viewing.layers import UNCERTAINTY, Layer, over, stages, tinted
 from drgs.viewing.placed_views import PlacedView, score_colors
-from drgs.viewing.poses import Pose, camera_of, looking, pose_of
-from drgs.viewing.splats import ClientGaussians
 
 if TYPE_CHECKING:
     import viser

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.viewing.layers import Layer
+from drgs.viewing.client import Pose
+from drgs.viewing.layers import Layer, Uncertainty
 from drgs.viewing.placed_views import PlacedView, Ranking
-from drgs.viewing.poses import Pose
-from drgs.viewing.uncertainty import Uncertainty
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Scene

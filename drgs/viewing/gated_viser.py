@@ -1,18 +1,24 @@
-"""The socket of the viewer, and what is answered on it: the gate is asked before anything of viser's is.
+"""viser's server behind the gate: the one module that reaches into what viser keeps to itself.
 
-viser has no place for such a question, so its call of `websockets`' `serve` is led through here (`guarded`): to the
-socket that was bound before, with our question in front of its own, and with an answer to what is no request at all.
+viser 1.1 has no public way to check a request before it is answered, to listen on a socket that is bound already, or to
+refuse a tunnel. So, while its server starts, the name `websockets` in `viser.infra._infra` stands for a module whose
+`serve` is ours (`guarded`): with the gate in front of viser's own handler, on our socket, and with an answer to what is
+no request of HTTP. And the handlers of two private messages, by which a browser opens and closes a tunnel, are removed
+(`gated_server`). pyproject.toml pins viser below 1.2; another version in which this does not hold raises, and
+tests/test_view_gate.py fails as soon as `viser.ViserServer` takes arguments that it does not take now: one of them may
+be the public way.
 """
 
 from __future__ import annotations
 
 import contextlib
 import http
+import io
 import logging
 import socket
 import types
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
@@ -20,7 +26,10 @@ from websockets.http11 import Request, Response
 
 from drgs.viewing.gate import Gate
 
-__all__ = ["bound_socket", "guarded", "in_a_line"]
+if TYPE_CHECKING:
+    import viser
+
+__all__ = ["bound_socket", "gated_server", "guarded", "in_a_line"]
 
 _log = logging.getLogger(__name__)
 
@@ -47,6 +56,27 @@ def bound_socket(host: str, port: int) -> socket.socket:
         ) from None
 
 
+def gated_server(gate: Gate, listening: socket.socket, host: str) -> viser.ViserServer:
+    """Start viser's server on a bound socket, behind a gate, without tunnels.
+
+    Args:
+        gate: What each request must pass.
+        listening: Socket that listens.
+        host: Name or address that it listens at.
+    Raises:
+        RuntimeError: As `guarded`.
+    """
+    import viser
+    from viser._messages import ShareUrlDisconnect, ShareUrlRequest
+
+    with guarded(gate, listening), contextlib.redirect_stdout(io.StringIO()):  # viser prints where it listens
+        server = viser.ViserServer(host, listening.getsockname()[1], verbose=False)
+    # A tunnel to a server of somebody else's would lead around the gate.
+    server._websock_server.unregister_handler(ShareUrlRequest)
+    server._websock_server.unregister_handler(ShareUrlDisconnect)
+    return server
+
+
 @contextlib.contextmanager
 def guarded(gate: Gate, listening: socket.socket) -> Iterator[None]:
     """Let a server that viser starts within the block listen at a socket, behind a gate.
@@ -56,12 +86,12 @@ def guarded(gate: Gate, listening: socket.socket) -> Iterator[None]:
     """
     from viser.infra import _infra
 
-    led = []
+    started = []
 
     def serve_guarded(
         handler: Any, host: Any, port: Any, *, process_request: Callable[..., Any], **options: Any
     ) -> Any:
-        led.append(port)
+        started.append(port)
         options |= {"process_request": _asked(gate, process_request), "create_connection": _Answering, "logger": _log}
         return serve(handler, sock=listening, **options)
 
@@ -73,7 +103,7 @@ def guarded(gate: Gate, listening: socket.socket) -> Iterator[None]:
         yield
     finally:
         _infra.websockets = before
-    if not led:
+    if not started:
         raise RuntimeError("view: viser must start its server by websockets.asyncio.server.serve, has not")
 
 
