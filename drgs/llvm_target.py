@@ -1,6 +1,9 @@
 """What Dr.Jit compiles for on a CPU: the processor as LLVM names it, its features, and the lanes of a packet.
 
-Dr.Jit asks LLVM for the machine's own. Its Python module says nothing of it, the library that it loads does.
+Dr.Jit 1.5 takes the machine's own from LLVM and has no Python function that tells it, or chooses another: the library
+that it loads has, in C++ (`jit_llvm_target_cpu`, `jit_llvm_target_features`, `jit_llvm_vector_width`,
+`jit_llvm_set_target`). This is the one module that calls them, by their mangled names; in a version that has others,
+`compiled_for` gives None and `compile_for` refuses. tests/test_runtime.py fails as soon as Dr.Jit has a name for it.
 """
 
 from __future__ import annotations
@@ -29,6 +32,9 @@ _PROCESSORS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("x86-64-v4", "skylake-avx512", "cascadelake"), ("avx512vl", _NEEDED)),
     **dict.fromkeys(("icelake-server", "sapphirerapids", "znver4", "znver5"), ("avx512vbmi2", _NEEDED)),
 }
+# Dr.Jit 1.5's, as C++ mangles them: processor, features, lanes of a packet; and what chooses all three.
+_READERS = ("_Z19jit_llvm_target_cpuv", "_Z24jit_llvm_target_featuresv", "_Z21jit_llvm_vector_widthv")
+_CHOOSER = "_Z19jit_llvm_set_targetPKcS0_j"
 _WRITTEN = re.compile(r"(?P<cpu>[\w.-]+)/(?P<lanes>\d+)(?:/(?P<features>[+-][\w.-]+(?:,[+-][\w.-]+)*))?")
 
 
@@ -51,9 +57,7 @@ def compiled_for() -> Target | None:
     """The target of Dr.Jit's LLVM backend, which must have started; None where its library does not tell."""
     try:
         core = _core()
-        cpu = core._Z19jit_llvm_target_cpuv
-        features = core._Z24jit_llvm_target_featuresv
-        lanes = core._Z21jit_llvm_vector_widthv
+        cpu, features, lanes = (getattr(core, name) for name in _READERS)
     except (OSError, AttributeError):  # another version of Dr.Jit
         return None
     cpu.restype = features.restype = ctypes.c_char_p
@@ -75,7 +79,7 @@ def compile_for(text: str, where: str) -> None:
             Dr.Jit cannot be told.
     """
     found = _WRITTEN.fullmatch(text)
-    here = _own()
+    here = _of_machine()
     if here is None or here.features is None or not _is_x86():
         raise ValueError(f"{where} must be left out but on x86-64 with Dr.Jit 1.5, got {platform.machine()}")
     if found is None or int(found["lanes"]) not in LANES or found["cpu"] not in _PROCESSORS:
@@ -88,7 +92,7 @@ def compile_for(text: str, where: str) -> None:
     wanted = [*_PROCESSORS[found["cpu"]], *(x[1:] for x in (features or "").split(",") if x.startswith("+"))]
     if absent := [name for name in wanted if f"+{name}" not in here.features]:
         raise ValueError(f"{where} must be of instructions that {here.cpu} has, got {text!r} with {', '.join(absent)}")
-    choose = _core()._Z19jit_llvm_set_targetPKcS0_j
+    choose = getattr(_core(), _CHOOSER)
     choose.argtypes = (ctypes.c_char_p, ctypes.c_char_p, ctypes.c_uint32)
     choose.restype = None
     choose(found["cpu"].encode(), None if features is None else features.encode(), int(found["lanes"]))
@@ -105,7 +109,7 @@ def missing_features(target: Target) -> list[str]:
 
 
 @functools.cache
-def _own() -> Target | None:
+def _of_machine() -> Target | None:
     """This machine's target: first asked for before another one is chosen."""
     return compiled_for()
 

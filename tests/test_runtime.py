@@ -416,12 +416,20 @@ def test_compiled_for_another_processor():
     assert done.stdout.splitlines() == ["True", "{'cpu': 'x86-64-v2', 'lanes': 4}"], done.stderr[-500:]
 
 
+def test_drjit_has_no_public_target_yet():
+    """Fails when Dr.Jit's module tells or chooses the target: then `llvm_target` needs no mangled names any more."""
+    import drjit as dr
+
+    names = [name.lower() for name in (*dir(dr), *dir(dr.detail))]
+    assert [name for name in names if "target" in name or "vector_width" in name] == []
+
+
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="about instructions of x86-64")
 def test_a_processor_newer_than_this_one_is_refused(monkeypatch):
     """Its instructions would end the process; a target is chosen of what the machine has, however often."""
     runtime.backend()
     old = llvm_target.Target("haswell", 8, ("+avx2", "+fma"))
-    monkeypatch.setattr(llvm_target, "_own", lambda: old)
+    monkeypatch.setattr(llvm_target, "_of_machine", lambda: old)
     with pytest.raises(ValueError, match=r"DRGS_LLVM_TARGET must be of instructions that haswell has, got .*avx512vl"):
         llvm_target.compile_for("x86-64-v4/16", "drgs: DRGS_LLVM_TARGET")
     code = RENDER + "drgs.runtime.setup(threads=1)\ndrgs.runtime.setup(threads=2)\n" + RENDER
