@@ -27,9 +27,9 @@ RESPONSES: Registry[Any] = Registry(
     "response",
     "drgs.responses",
     {
-        "peak": "drgs.tracing.responses.peak:PEAK",
-        "integral": "drgs.tracing.responses.integral:INTEGRAL",
-        "ewa": "drgs.tracing.responses.ewa:EWA",
+        "peak": "drgs.tracing.peak:PEAK",
+        "integral": "drgs.tracing.integral:INTEGRAL",
+        "ewa": "drgs.tracing.ewa:EWA",
     },
 )
 """Name -> `drgs.tracing.responses.Response`. The table stands here, below the engine, so that settings know its names

@@ -14,8 +14,8 @@ from scenes_random import camera, gaussians
 from drgs import fisher, reference, settings
 from drgs.guards import registry
 from drgs.integrator import render, render_jvp
+from drgs.tracing.peak import Peak
 from drgs.tracing.responses import RESPONSES, response_of
-from drgs.tracing.responses.peak import Peak
 
 
 def test_responses_are_known_by_the_same_names():
@@ -50,9 +50,7 @@ def test_what_is_no_name_of_a_response(got):
 
 def test_a_response_of_another_package(tmp_path, monkeypatch):
     """An entry point of an installed package is a name for settings; what it can be combined with it says itself."""
-    (tmp_path / "flat.py").write_text(
-        "from drgs.tracing.responses.ewa import Ewa\nclass Flat(Ewa): pass\nFLAT = Flat()\n"
-    )
+    (tmp_path / "flat.py").write_text("from drgs.tracing.ewa import Ewa\nclass Flat(Ewa): pass\nFLAT = Flat()\n")
     info = tmp_path / "flat-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: flat\nVersion: 1.0\n")

@@ -4,7 +4,7 @@ With the notation of kernels.py, dC_c = T (c_c - B_c) da + w dc_c, where B_c lie
 to a channel is summed up, then squared. Channels are those that were composited: colors, whose c moves with the mean
 and behind which there is a background, then any number of others, for which dc = 0 and the background is 0. The
 derivatives da of a hit's opacity by the geometry of its Gaussian are closed forms of the responses
-(`tracing/responses/`, where they are derived); dc by the mean is the same for all hits of a Gaussian (replay.py).
+(`tracing/peak.py`, where they are derived); dc by the mean is the same for all hits of a Gaussian (replay.py).
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 `walk.py` decides which Gaussian a ray meets next; this module evaluates the hit from what is
 stored of the Gaussian and updates the state of the ray. All of it runs inside Dr.Jit loops with AD suspended; the
-derivative of a hit is taken by local AD inside the loop, so there is one formula a response (`responses/`).
+derivative of a hit is taken by local AD inside the loop, so there is one formula a response (responses.py).
 
     a     opacity of the hit            T     transmittance in front of it       w = a T   its weight
 

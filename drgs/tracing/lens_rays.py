@@ -4,7 +4,7 @@ A lens only says which ray each pixel has. Everything here is made from that tab
 `Camera.pixel_directions` gives, not from the lens model: it holds for every model, where its polynomial turns back and
 where its inverse is an approximation, too.
 
-A hit (responses/peak.py) is a linear function of the ray's direction around an anchor. Narrow lenses, all of whose rays
+A hit (peak.py) is a linear function of the ray's direction around an anchor. Narrow lenses, all of whose rays
 are less than `NARROW` off the axis, have pixels of the pinhole camera with the same K: a pixel's ray is a point of
 that image, and w = 1. Wide ones have directions d; a Gaussian's anchor is on the side of a cube around the camera that
 its mean is seen through, and (x, y, w) are the components of d along that side's axes. Either is kept in two floats, of

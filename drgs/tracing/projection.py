@@ -1,7 +1,7 @@
 """From raw Gaussian parameters and a camera to one record of floats a Gaussian and view, in Dr.Jit.
 
 Everything here is per-Gaussian work, done once a view in float64 and differentiated by Dr.Jit's AD; the loops over hits
-(`kernels.py`) only see the records. What of a record depends on the response is filled by it (`responses/`).
+(`kernels.py`) only see the records. What of a record depends on the response is filled by it (responses.py).
 
 Notation: W = S^-1 R^T takes a world vector into the local frame of a Gaussian; c is its mean in camera coordinates.
 """

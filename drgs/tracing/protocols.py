@@ -3,7 +3,7 @@
 A part (walk.py) walks its rays along a stream of candidate Gaussians and calls a kernel at each hit. Kernels composite
 (kernels.py) or differentiate what was composited (derivatives.py, jacobian.py); the one of the Jacobian passes its rows
 on to a sink. Where a *lane* is spoken of, it is one of Dr.Jit's: a lane carries one or four rays. What hands out parts
-is a `Traversal` (walk.py); what all of them evaluate is a `Response` (responses/).
+is a `Traversal` (walk.py); what all of them evaluate is a `Response` (responses.py).
 """
 
 from __future__ import annotations

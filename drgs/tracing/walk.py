@@ -23,10 +23,10 @@ from drgs import runtime
 from drgs.tracing.arrays import Float, Lib, Mask, UInt32
 from drgs.tracing.errors import own_errors
 from drgs.tracing.kernels import HitModel
+from drgs.tracing.peak import entry
 from drgs.tracing.primitives import Projected, Ray
 from drgs.tracing.protocols import Candidates, DividedStream, Kernel
 from drgs.tracing.records import RECORD, load_record
-from drgs.tracing.responses.peak import entry
 from drgs.tracing.sort_keys import BEYOND, EMPTY, ascending, name_of, positive, push, word_of
 from drgs.tracing.weights import PIXELS, Weights
 

@@ -13,9 +13,9 @@ import drjit as dr
 
 from drgs.tracing import records as layout
 from drgs.tracing.arrays import Float, Lib, Mask
+from drgs.tracing.peak import AlphaStrength, deviation
 from drgs.tracing.primitives import Activated, Patch, Projected, Ray, Screen
 from drgs.tracing.records import cross, dot
-from drgs.tracing.responses.peak import AlphaStrength, deviation
 
 __all__ = ["EWA", "Ewa"]
 

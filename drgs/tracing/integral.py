@@ -16,8 +16,8 @@ import drjit as dr
 
 from drgs.tracing import records as layout
 from drgs.tracing.arrays import Float
+from drgs.tracing.peak import Peak, approach, times
 from drgs.tracing.primitives import Ray
-from drgs.tracing.responses.peak import Peak, approach, times
 
 __all__ = ["INTEGRAL", "Integral"]
 
