@@ -6,33 +6,89 @@ rolling shutters and rays of the caller's own. What gsplat can do and this canno
 gsplat's memory and speed (`packed`, `tile_size`, `segmented`, `macro_tile`, `renderer_config`) is accepted and changes
 nothing.
 
-What the tensors are in raw parameters is said in splats.py, what the options mean in gsplat_options.py.
+What the tensors are in raw parameters is said in splats.py, how covariances are differentiated in covariances.py.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 
 from drgs.cameras import Camera
-from drgs.covariances import factors
-from drgs.ellipsoids import Y_00
-from drgs.gsplat_options import MODES, NEAR, Mode, check_unscented, lenses_of, one_of, refuse, settings_of, shutter_of
+from drgs.covariances import factors, strained
+from drgs.ellipsoids import Y_00, semi_axes
+from drgs.guards.arguments import ArgumentError
 from drgs.integrator import render_normals, render_with_offsets
-from drgs.projected import projected, unscented
 from drgs.runtime import uncompiled
 from drgs.settings import EPS_ALPHA, RenderSettings
+from drgs.shutters import SHUTTERS
 from drgs.splats import Splats, cameras_of, check_shapes, inside, inside_opacities
 from drgs.tracing.harmonics import higher_harmonics
 from drgs.tracing.pose import rigid_pose
 from drgs.tracing.shutter import middle_pose
+from drgs.tracing.unscented import (
+    DILATION,
+    EXTENT,
+    LEAST_COMPENSATION,
+    LEAST_OPACITY,
+    MARGIN,
+    OF_COVARIANCE,
+    OF_MEAN,
+    SPREAD,
+)
 
 __all__ = ["rasterization"]
 
-_FAR = 1e10  # gsplat's default: none
+# Defaults of gsplat's signature: another preset's own constants hold unless an argument differs from these.
+_NEAR = 0.01  # scene units
+_FAR = 1e10  # scene units: no far plane
+_DILATION = 0.3  # px^2
+
+
+@dataclasses.dataclass(frozen=True)
+class _Mode:
+    """What a `render_mode` draws.
+
+    Attributes:
+        color: Colors.
+        depth: A last channel: `gaussian`, the depth of each Gaussian, `hit`, the distance along the ray, or none.
+        expected: That channel is divided by alpha.
+    """
+
+    color: bool
+    depth: str | None = None
+    expected: bool = False
+
+
+_MODES = {
+    "RGB": _Mode(True),
+    "D": _Mode(False, "gaussian"),
+    "ED": _Mode(False, "gaussian", True),
+    "RGB+D": _Mode(True, "gaussian"),
+    "RGB+ED": _Mode(True, "gaussian", True),
+    "d": _Mode(False, "hit"),
+    "Ed": _Mode(False, "hit", True),
+    "RGB-d": _Mode(True, "hit"),
+    "RGB-Ed": _Mode(True, "hit", True),
+}
+"""gsplat's `render_mode`s."""
+
+# What to do instead of an option that does not exist here.
+_RAYS = "pass its rays as rays=, with with_eval3d=True"
+_INSTEAD = {
+    "sparse_grad": "gradients are dense here; drop it",
+    "distributed": "one process renders; split the cameras among processes yourself",
+    "lidar_coeffs": _RAYS,
+    "external_distortion_coeffs": _RAYS,
+    "camera_model='ortho'": _RAYS,
+    "camera_model='lidar'": _RAYS,
+    "with_ut without with_eval3d": "the image plane's Gaussians are those of the EWA model here; pass both, or neither",
+}
 
 
 @uncompiled
@@ -46,7 +102,7 @@ def rasterization(
     Ks: torch.Tensor,
     width: int,
     height: int,
-    near_plane: float = NEAR,
+    near_plane: float = _NEAR,
     far_plane: float = _FAR,
     radius_clip: float = 0.0,
     eps2d: float = 0.3,
@@ -151,9 +207,9 @@ def rasterization(
         V. Ye et al., gsplat, JMLR 26, 2025; Z. Yu et al., Mip-Splatting, CVPR 2024 (antialiased); Q. Wu et al., 3DGUT,
         CVPR 2025.
     """
-    one_of("render_mode", render_mode, list(MODES))
-    one_of("rasterize_mode", rasterize_mode, ("classic", "antialiased"))
-    refuse(
+    _one_of("render_mode", render_mode, list(_MODES))
+    _one_of("rasterize_mode", rasterize_mode, ("classic", "antialiased"))
+    _refuse(
         sparse_grad=sparse_grad,
         distributed=distributed,
         lidar_coeffs=lidar_coeffs is not None,
@@ -161,14 +217,14 @@ def rasterization(
         **{f"camera_model={name!r}": camera_model == name for name in ("ortho", "lidar")},
         **{"with_ut without with_eval3d": with_ut and not with_eval3d and preset is None},
     )
-    check_unscented(ut_params)
+    _check_unscented(ut_params)
     if not near_plane < far_plane:
         raise ValueError(
             f"rasterization: near_plane must be less than far_plane, got {near_plane:g} and {far_plane:g}; swap them"
         )
-    mode = MODES[render_mode]
+    mode = _MODES[render_mode]
     antialiased = rasterize_mode == "antialiased"
-    settings = settings_of(preset, near_plane, eps2d, antialiased, with_eval3d, with_ut, global_z_order)
+    settings = _settings_of(preset, near_plane, eps2d, antialiased, with_eval3d, with_ut, global_z_order)
     strains = None
     if covars is not None:
         if return_normals:
@@ -185,7 +241,7 @@ def rasterization(
     colors = _for_batches(colors, sh_degree, lead)
     shown = colors
     if sh_degree is not None and colors.ndim and colors.shape[-1] != 3:
-        shown = colors[..., :1].expand(*colors.shape[:-1], 3)  # SH of other channels: evaluated below
+        shown = colors[..., :1].expand(*colors.shape[:-1], 3)  # SH of other channels: evaluated by `_View`
     checked_backgrounds = None if shown is not colors else backgrounds
     lead, count = check_shapes(
         "rasterization", means, quats, scales, opacities, shown, viewmats, Ks, sh_degree, checked_backgrounds
@@ -196,131 +252,163 @@ def rasterization(
         raise ValueError(
             f"rasterization: viewmats must hold at least one camera, got shape {tuple(viewmats.shape)}; skip the call"
         )
-    shutter = shutter_of(rolling_shutter, viewmats_rs)
+    shutter = _shutter_of(rolling_shutter, viewmats_rs)
     coefficients = radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs
-    lenses = lenses_of(camera_model, lead, count, *coefficients, Ks)
+    lenses = _lenses_of(camera_model, lead, count, *coefficients, Ks)
     _check_along_rays(settings, shutter != "global", bool(lenses[0][0]), rays, mode, return_normals)
     _check_rays(rays, (*lead, count, height, width, 6))
     extra = None if extra_signals is None else _for_batches(extra_signals, extra_signals_sh_degree, lead)
     _check_extra(extra, extra_signals_sh_degree, lead, count, means.shape[-2])
-    of = lambda x: x.reshape(batches, *x.shape[len(lead) :])  # noqa: E731
-    given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "viewmats": viewmats, "Ks": Ks}
-    flat = {name: of(x) for name, x in given.items()}
-    ends = None if viewmats_rs is None else of(viewmats_rs)
+    options = _Options(
+        settings=settings,
+        mode=mode,
+        antialiased=antialiased,
+        with_ut=with_ut and with_eval3d,
+        gsplat_depth=with_eval3d and preset is None,
+        near=near_plane if with_eval3d and preset is None else settings.near,
+        far=far_plane,
+        clip=radius_clip,
+        extra_degree=extra_signals_sh_degree,
+        normals=return_normals,
+    )
     leaf = _leaf(means, viewmats, opacities, settings, lead, count)
     absolute = _absolute(leaf) if absgrad else None
+
+    def by_batch(x: Any) -> Any:
+        """All leading axes as one; None stays None."""
+        return None if x is None else x.reshape(batches, *x.shape[len(lead) :])
+
+    def at(x: Any, batch: int, camera: int) -> Any:
+        """What one view has of a tensor by batch and camera; None of None."""
+        return None if x is None else x[batch, camera]
+
+    means_, quats_, scales_, opacities_, strains_ = map(by_batch, (means, quats, scales, opacities, strains))
+    viewmats_, ends_, Ks_ = map(by_batch, (viewmats, viewmats_rs, Ks))
+    by_view = [by_batch(x) for x in (backgrounds, rays, leaf, absolute)]
     views = []
     for b in range(batches):
-        for c in range(count):
-            if ends is not None:
-                lenses[b][c] |= {"shutter": shutter, "w2c_end": ends[b, c]}
-        for c, camera in enumerate(cameras_of(flat["viewmats"][b], flat["Ks"][b], width, height, lenses[b])):
-            views.append(
-                _View(
-                    splats=Splats(
-                        means=flat["means"][b],
-                        quats=flat["quats"][b],
-                        scales=flat["scales"][b],
-                        opacities=flat["opacities"][b],
-                        colors=_of_view(of(colors), b, c, sh_degree),
-                        degree=sh_degree,
-                        strains=None if strains is None else of(strains)[b],
-                    ),
-                    camera=camera,
-                    settings=settings,
-                    mode=mode,
-                    antialiased=antialiased,
-                    with_ut=with_ut and with_eval3d,
-                    gsplat_depth=with_eval3d and preset is None,
-                    near=near_plane if with_eval3d and preset is None else settings.near,
-                    far=far_plane,
-                    clip=radius_clip,
-                    background=None if backgrounds is None else of(backgrounds)[b, c],
-                    extra=None if extra is None else _of_view(of(extra), b, c, extra_signals_sh_degree),
-                    extra_degree=extra_signals_sh_degree,
-                    rays=None if rays is None else of(rays)[b, c],
-                    leaf=None if leaf is None else leaf.reshape(batches, count, -1, 2)[b, c],
-                    absolute=None if absolute is None else absolute.reshape(batches, count, -1, 2)[b, c],
-                    normals=return_normals,
-                )
+        if ends_ is not None:
+            moving = [{"shutter": shutter, "w2c_end": ends_[b, c]} for c in range(count)]
+            lenses[b] = [lens | fields for lens, fields in zip(lenses[b], moving, strict=True)]
+        for c, camera in enumerate(cameras_of(viewmats_[b], Ks_[b], width, height, lenses[b])):
+            splats = Splats(
+                means=means_[b],
+                quats=quats_[b],
+                scales=scales_[b],
+                opacities=opacities_[b],
+                colors=_of_view(by_batch(colors), b, c, sh_degree),
+                degree=sh_degree,
+                strains=None if strains_ is None else strains_[b],
             )
-    made = [view.draw() for view in views]
-    images, alphas = (
-        torch.stack(x).reshape(*lead, count, *x[0].shape) for x in zip(*(v[:2] for v in made), strict=True)
-    )
-    meta: dict[str, Any] = {
-        name: torch.stack([v[2][name] for v in made]).reshape(*lead, count, *made[0][2][name].shape)
-        for name in made[0][2]
-    }
+            signals = None if extra is None else _of_view(by_batch(extra), b, c, extra_signals_sh_degree)
+            views.append(_View(options, splats, camera, signals, *(at(x, b, c) for x in by_view)))
+    drawn = [view.draw() for view in views]
+
+    def joined(parts: list[torch.Tensor]) -> torch.Tensor:
+        """What views have, one each, with the leading axes and that of cameras."""
+        return torch.stack(parts).reshape(*lead, count, *parts[0].shape)
+
+    meta: dict[str, Any] = {name: joined([of_view[name] for _, _, of_view in drawn]) for name in drawn[0][2]}
     if leaf is not None:
         with torch.no_grad():  # its values; the graph of every view begins at the leaf
             leaf.copy_(meta["means2d"])
         meta["means2d"] = leaf
     meta |= {"width": width, "height": height, "n_batches": batches, "n_cameras": count}
     meta |= dict.fromkeys(("batch_ids", "camera_ids", "gaussian_ids"))  # of packed arrays, which these are not
-    return images, alphas, meta
+    return joined([image for image, _, _ in drawn]), joined([alpha for _, alpha, _ in drawn]), meta
 
 
-@dataclasses.dataclass
-class _View:
-    """One image of `rasterization`, whose arguments these are, of one scene and camera."""
+@dataclasses.dataclass(frozen=True)
+class _Options:
+    """What all views of a call have in common.
 
-    splats: Splats
-    camera: Camera
+    Attributes:
+        settings: The renderer.
+        mode: What is drawn.
+        antialiased: Opacities are compensated for the dilation.
+        with_ut: `meta` is that of the unscented transform.
+        gsplat_depth: Depths are the Gaussians' own by `depth_key`, drawn as a feature.
+        near, far: Means whose depth is not in (near, far] are left out.
+        clip: Gaussians of at most this radius, in pixels, are left out.
+        extra_degree: SH degree of the extra signals; None of plain ones.
+        normals: Whether normals are drawn, too.
+    """
+
     settings: RenderSettings
-    mode: Mode
+    mode: _Mode
     antialiased: bool
     with_ut: bool
     gsplat_depth: bool
     near: float
     far: float
     clip: float
-    background: torch.Tensor | None
-    extra: torch.Tensor | None
     extra_degree: int | None
+    normals: bool
+
+
+@dataclasses.dataclass
+class _View:
+    """One image of `rasterization`.
+
+    Attributes:
+        options: What it has in common with the others.
+        splats, camera: What is drawn, and from where.
+        extra: (N, E) or (N, K, E) extra signals.
+        background: (D,) behind the colors.
+        rays: (H, W, 6) of the caller's own.
+        leaf: (N, 2) part of what becomes `meta["means2d"]`.
+        absolute: (N, 2) zeros, for absolute gradients.
+    """
+
+    options: _Options
+    splats: Splats
+    camera: Camera
+    extra: torch.Tensor | None
+    background: torch.Tensor | None
     rays: torch.Tensor | None
     leaf: torch.Tensor | None
     absolute: torch.Tensor | None
-    normals: bool
 
     def draw(self) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
         """The image (H, W, X), its alpha (H, W, 1), and the arrays of `meta`."""
-        camera, settings, splats = self.camera, self.settings, self.splats
+        o, camera, splats = self.options, self.camera, self.splats
+        settings = o.settings
         local, center = self._seen()
         own = local[:, 2:] if settings.depth_key == "z" else local.norm(dim=1, keepdim=True)
-        cut = (own[:, 0] if self.gsplat_depth else local[:, 2]).detach()  # what near and far planes look at
-        meta, compensation = self._projected(cut)
+        cut = (own[:, 0] if o.gsplat_depth else local[:, 2]).detach()  # what near and far planes look at
+        meta, compensation = self._on_image(cut)
         if compensation is not None:
             splats = dataclasses.replace(splats, opacities=inside_opacities(splats.opacities * compensation))
         # `meta` is to be looked at: no gradient passes through it.
         meta["opacities"] = splats.opacities.detach().to(splats.means.dtype)
         extra = self.extra
-        if extra is not None and self.extra_degree is not None:
-            extra = _evaluated(extra, self.extra_degree, splats.means - center)
+        if extra is not None and o.extra_degree is not None:
+            extra = _evaluated(extra, o.extra_degree, splats.means - center)
         if splats.degree is not None and (camera.is_rolling or splats.colors.shape[-1] != 3):
             # As gsplat: of a rolling shutter from the middle of both centers; other numbers of channels one by one.
             colors = _evaluated(splats.colors, splats.degree, splats.means - center).clamp_min(0)
             splats = dataclasses.replace(splats, colors=colors, degree=None)
         added = [] if extra is None else [extra]
-        if self.mode.depth == "gaussian" and self.gsplat_depth:
+        own_depth = o.gsplat_depth and o.mode.depth == "gaussian"
+        if own_depth:
             added.append(own.to(splats.means.dtype))
         offsets = None if self.leaf is None else self.leaf - self.leaf.detach()  # zeros with its derivative
         absolute = self.absolute
         kept = self._kept(meta, cut)
         meta["radii"] = meta["radii"] * kept[:, None]
-        if not bool(kept.all()) and (self.far < _FAR or self.clip > 0 or self.near > settings.near):
+        if not bool(kept.all()) and (o.far < _FAR or o.clip > 0 or o.near > settings.near):
             index = kept.nonzero()[:, 0]
             splats = splats.take(index)
             added = [x[index] for x in added]
             offsets = None if offsets is None else offsets[index]
             absolute = None if absolute is None else absolute[index]
-        gaussians, shift = splats.gaussians(with_color=self.mode.color)
+        gaussians, shift = splats.gaussians(with_color=o.mode.color)
         features = [x for x in (gaussians.features, *added) if x is not None]
         if added:
             gaussians = gaussians.replace(features=torch.cat([x.to(features[0].dtype) for x in features], 1))
-        asked = ("depth",) if self.mode.depth and not (self.gsplat_depth and self.mode.depth == "gaussian") else ()
-        out = render_with_offsets(gaussians, camera, settings, asked, self.rays, offsets, absolute, splats.strains)
-        if self.normals:
+        outputs = ("depth",) if o.mode.depth and not own_depth else ()
+        out = render_with_offsets(gaussians, camera, settings, outputs, self.rays, offsets, absolute, splats.strains)
+        if o.normals:
             meta["normals"] = render_normals(gaussians.replace(features=None), camera, settings, self.rays)
         kind = splats.means.dtype
         image = self._image(out, shift, splats, 0 if extra is None else extra.shape[1], meta)
@@ -328,26 +416,26 @@ class _View:
 
     def _image(self, out: Any, shift: float, splats: Splats, signals: int, meta: dict) -> torch.Tensor:
         """The channels of the image; the extra signals go to `meta`."""
-        alpha = out.alpha[..., None]
+        mode, alpha = self.options.mode, out.alpha[..., None]
         features = out.features if out.features is not None else alpha[..., :0]
         rest = features.shape[-1]
         depth = None
-        if self.mode.depth == "gaussian" and self.gsplat_depth:
+        if mode.depth == "gaussian" and self.options.gsplat_depth:
             rest -= 1
             depth = features[..., rest:]
-            depth = depth / alpha.clamp_min(EPS_ALPHA) if self.mode.expected else depth
+            depth = depth / alpha.clamp_min(EPS_ALPHA) if mode.expected else depth
         elif out.depth is not None:
             depth = out.depth[..., None]
-            if self.mode.depth == "gaussian" and not self.settings.planar:
+            if mode.depth == "gaussian" and not self.options.settings.planar:
                 # Along the ray -> along the axis.
                 axis = torch.from_numpy(self.camera.local_directions()[..., 2:])
                 depth = depth * axis.to(depth)
-            depth = depth if self.mode.expected else depth * alpha.clamp_min(EPS_ALPHA)
+            depth = depth if mode.expected else depth * alpha.clamp_min(EPS_ALPHA)
         if signals:
             meta["render_extra_signals"] = features[..., rest - signals : rest].to(splats.means.dtype)
             rest -= signals
         channels = []
-        if self.mode.color:
+        if mode.color:
             width = 3 if splats.degree is not None else min(3, splats.colors.shape[1])
             color = torch.cat([out.rgb[..., :width] - shift * alpha, features[..., :rest]], -1)
             channels.append(color if self.background is None else color + (1 - alpha) * self.background)
@@ -367,20 +455,20 @@ class _View:
             center = 0.5 * (center - end[:, 3] @ end[:, :3])
         return means @ pose[:, :3].T + pose[:, 3], center.to(self.splats.means.dtype)
 
-    def _projected(self, depths: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor | None]:
+    def _on_image(self, depths: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor | None]:
         """`meta`, and what opacities are multiplied with."""
-        if self.with_ut or self.camera.is_distorted or self.camera.is_rolling:
-            return unscented(self.splats, self.camera, depths, self.near), None
-        return projected(self.splats, self.camera, self.settings, self.antialiased)
+        if self.options.with_ut or self.camera.is_distorted or self.camera.is_rolling:
+            return _projected_by_points(self.splats, self.camera, depths, self.options.near), None
+        return _projected_by_jacobian(self.splats, self.camera, self.options.settings, self.options.antialiased)
 
     def _kept(self, meta: dict[str, torch.Tensor], depths: torch.Tensor) -> torch.Tensor:
         """(N,) which Gaussians are drawn: the renderer itself knows no far plane and no smallest radius."""
-        depths = meta["depths"] if self.settings.planar else depths
-        kept = depths <= self.far
-        if self.settings.planar or self.near > 0:
-            kept &= depths > self.near
-        if self.clip > 0:
-            kept &= (meta["radii"] > self.clip).any(-1)
+        depths = meta["depths"] if self.options.settings.planar else depths
+        kept = depths <= self.options.far
+        if self.options.settings.planar or self.options.near > 0:
+            kept &= depths > self.options.near
+        if self.options.clip > 0:
+            kept &= (meta["radii"] > self.options.clip).any(-1)
         return kept
 
 
@@ -436,7 +524,7 @@ def _absolute(leaf: torch.Tensor | None) -> torch.Tensor | None:
 
 
 def _check_along_rays(
-    settings: RenderSettings, rolling: bool, lens: bool, rays: torch.Tensor | None, mode: Mode, normals: bool
+    settings: RenderSettings, rolling: bool, lens: bool, rays: torch.Tensor | None, mode: _Mode, normals: bool
 ) -> None:
     """Refuse what only responses along rays have."""
     asked = {
@@ -473,3 +561,287 @@ def _check_extra(
     if tuple(extra.shape[:-tail]) not in fits or (tail == 2 and extra.shape[-2] < least):
         wanted = "(..., N, E) or (..., C, N, E)" if degree is None else f"(N, K, E) with K >= {least}"
         raise ValueError(f"rasterization: extra_signals must have shape {wanted}, got {tuple(extra.shape)}")
+
+
+# ------------------------------------------------------------------------------------------------ what the options mean
+
+
+def _refuse(**asked: bool) -> None:
+    """Raise NotImplementedError for the first option of gsplat's that is asked for and does not exist here."""
+    for name, is_asked in asked.items():
+        if is_asked:
+            raise NotImplementedError(f"rasterization: {name} is not supported; {_INSTEAD[name]}")
+
+
+def _check_unscented(params: object) -> None:
+    """Raise NotImplementedError for parameters of the unscented transform that are not gsplat's defaults."""
+    defaults = {"alpha": 0.1, "beta": 2.0, "kappa": 0.0, "in_image_margin_factor": 0.1}
+    for name, usual in {**defaults, "require_all_sigma_points_valid": False}.items():
+        value = getattr(params, name, usual)
+        if value != usual:
+            raise NotImplementedError(
+                f"rasterization: ut_params must be alpha 0.1, beta 2, kappa 0, got {name}={value:g}; leave with_ut "
+                "out, and nothing is culled by boxes"
+            )
+
+
+def _one_of(name: str, value: str, allowed: Sequence[str]) -> None:
+    """Raise ValueError for a value that is none of those allowed."""
+    if value not in allowed:
+        raise ArgumentError(f"rasterization: {name} must be one of {', '.join(allowed)}, got {value!r}")
+
+
+def _settings_of(
+    preset: str | RenderSettings | None,
+    near: float,
+    eps2d: float,
+    antialiased: bool,
+    along_rays: bool,
+    with_ut: bool,
+    by_z: bool,
+) -> RenderSettings:
+    """The renderer that the options mean, on a black background (colors behind are added in torch).
+
+    Args:
+        preset: The caller's, whose own constants hold where `near` and `eps2d` are gsplat's defaults; None: gsplat's.
+        near: Means nearer than that are left out.
+        eps2d: Added to projected covariances, in px^2.
+        antialiased: Opacities are compensated for it.
+        along_rays: Option `with_eval3d`.
+        with_ut: Tiles are those of the unscented transform's boxes.
+        by_z: Option `global_z_order`.
+    """
+    if preset is None:
+        key = "z" if by_z else "distance"
+        if along_rays:
+            culling = "ut" if with_ut else "extent"
+            # What is too near by its distance is left out by `rasterization`.
+            near = near if by_z else 0.0
+            settings = RenderSettings.preset("3dgut", depth_key=key, culling=culling, near=near)
+        else:
+            settings = RenderSettings.preset("gsplat", depth_key=key, dilation=eps2d, near=near)
+    else:
+        settings = preset if isinstance(preset, RenderSettings) else RenderSettings.preset(preset)
+        if preset == "gsplat" or near != _NEAR:
+            settings = settings.replace(near=near)
+        if preset == "gsplat" or eps2d != _DILATION:
+            settings = settings.replace(dilation=eps2d)
+    if antialiased and not settings.planar:
+        raise NotImplementedError(
+            "rasterization: rasterize_mode='antialiased' must have a preset with projected covariances, got "
+            f"{'with_eval3d' if preset is None else f'preset={preset!r}'}; use preset='gsplat' or 'inria', or "
+            "rasterize_mode='classic'"
+        )
+    return settings.replace(background=(0.0, 0.0, 0.0))
+
+
+def _lenses_of(
+    model: str,
+    lead: tuple[int, ...],
+    count: int,
+    radial: torch.Tensor | None,
+    tangential: torch.Tensor | None,
+    prism: torch.Tensor | None,
+    ftheta: Any,
+    Ks: torch.Tensor,
+) -> list[list[dict[str, Any]]]:
+    """Of each batch and camera, the fields of `Camera` that say what lens it has; empty ones of pinholes.
+
+    gsplat's radial coefficients of a pinhole are OpenCV's k1 to k6, whose order has the tangential p1, p2 behind k2; of
+    a fisheye its k1 to k4.
+    """
+    _one_of("camera_model", model, ("pinhole", "fisheye", "ftheta"))
+    if (model == "ftheta") != (ftheta is not None):
+        raise ArgumentError(
+            f"rasterization: ftheta_coeffs must come with camera_model='ftheta', and with no other, got {model!r} and "
+            f"{'none' if ftheta is None else 'some'}; change one of them"
+        )
+    given = {
+        "radial_coeffs": (radial, 4 if model == "fisheye" else 6),
+        "tangential_coeffs": (tangential, 2),
+        "thin_prism_coeffs": (prism, 4),
+    }
+    values: dict[str, torch.Tensor] = {}
+    for name, (x, width) in given.items():
+        if x is None:
+            continue
+        if model == "ftheta" or (model == "fisheye" and name != "radial_coeffs"):
+            raise ArgumentError(f"rasterization: {name} must be of camera_model='pinhole', got {model}; drop it")
+        if tuple(x.shape) != (*lead, count, width):
+            raise ArgumentError(
+                f"rasterization: {name} must have shape {(*lead, count, width)} for camera_model={model!r}, got "
+                f"{tuple(x.shape)}"
+            )
+        values[name] = x.detach().cpu().double().reshape(-1, count, width)  # as of intrinsics, no gradient
+    batches = math.prod(lead)
+    if model == "ftheta":
+        centers = Ks.detach().cpu().double().reshape(batches, count, 3, 3)[..., :2, 2]  # no gradient, as of others
+        return [[_ftheta(ftheta, *center.tolist()) for center in batch] for batch in centers]
+    if model == "pinhole" and not values:
+        return [[{} for _ in range(count)] for _ in range(batches)]
+    zeros = {name: torch.zeros(batches, count, width, dtype=torch.float64) for name, (_, width) in given.items()}
+    k, p, s = ({**zeros, **values}[name] for name in given)
+    if model == "fisheye":
+        return [[{"model": "opencv_fisheye", "distortion": tuple(row.tolist())} for row in batch] for batch in k]
+    every = torch.cat([k[..., :2], p, k[..., 2:], *([s] if "thin_prism_coeffs" in values else [])], -1)
+    return [[{"model": "opencv", "distortion": tuple(row.tolist())} for row in batch] for batch in every]
+
+
+def _ftheta(coefficients: Any, cx: float, cy: float) -> dict[str, Any]:
+    """Fields of `Camera` of gsplat's `FThetaCameraDistortionParameters`: its reference polynomial, from angles to
+    pixels or back; the principal point counts from the center of the first pixel. `max_angle` plays no role for rays.
+    """
+    kind = str(getattr(coefficients.reference_poly, "name", coefficients.reference_poly))
+    forward = kind.endswith("ANGLE_TO_PIXELDIST")
+    polynomial = [
+        float(x) for x in (coefficients.angle_to_pixeldist_poly if forward else coefficients.pixeldist_to_angle_poly)
+    ]
+    if polynomial[0] != 0 or not polynomial[1] > 0:
+        raise NotImplementedError(
+            "rasterization: ftheta_coeffs must have a reference polynomial without a constant term that grows from 0 "
+            f"on, got {kind} with {polynomial[0]:g} and {polynomial[1]:g}; {_RAYS}"
+        )
+    # The focal length belongs into K: bounds of silhouettes are of an equidistant fisheye of that K.
+    focal = polynomial[1] if forward else 1 / polynomial[1]
+    scaled = [x / focal if forward else x * focal**i for i, x in enumerate(polynomial)][1:]
+    K = np.array([[focal, 0.0, cx + 0.5], [0.0, focal, cy + 0.5], [0.0, 0.0, 1.0]])
+    linear = [float(x) for x in coefficients.linear_cde]
+    return {"K": K, "model": "ftheta" if forward else "ftheta_inverse", "distortion": (*scaled, *linear)}
+
+
+def _shutter_of(rolling_shutter: Any, viewmats_rs: torch.Tensor | None) -> str:
+    """`Camera.shutter` of a member of gsplat's `RollingShutterType`, of its name, or of ours."""
+    name = getattr(rolling_shutter, "name", rolling_shutter)
+    shutter = "global" if name is None else str(name).lower()
+    if shutter not in SHUTTERS:
+        raise ArgumentError(
+            f"rasterization: rolling_shutter must be one of {', '.join(SHUTTERS)}, got {rolling_shutter!r}"
+        )
+    if (shutter == "global") != (viewmats_rs is None):
+        raise ArgumentError(
+            f"rasterization: viewmats_rs must be there for rolling shutters, and for no other, got {shutter} and "
+            f"{'none' if viewmats_rs is None else 'some'}; change one of them"
+        )
+    return shutter
+
+
+# ----------------------------------------------------------------------------- `meta`: where Gaussians are on the image
+
+
+def _projected_by_jacobian(
+    splats: Splats, camera: Camera, settings: RenderSettings, antialiased: bool
+) -> tuple[dict[str, torch.Tensor], torch.Tensor | None]:
+    """gsplat's `meta` of a view, without a graph, and the compensation of opacities, (N,), with one.
+
+    Sigma' = J W Sigma W^T J^T, J the derivative of the projection at the mean, its slopes clamped where the settings
+    clamp them.
+    """
+    with torch.set_grad_enabled(antialiased and torch.is_grad_enabled()):
+        like: dict[str, Any] = {"dtype": torch.float64, "device": splats.means.device}
+        w2c = torch.as_tensor(camera.w2c).to(**like)
+        fx, skew, cx, fy, cy = (float(camera.K[i, j]) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
+        x, y, z = (splats.means.to(**like) @ w2c[:3, :3].T + w2c[:3, 3]).unbind(1)
+        valid = z.detach() > settings.near  # which ones are drawn is a constant of every derivative
+        z = torch.where(valid, z, 1)  # the others have no projection
+        u, v = x / z, y / z
+        means2d = torch.stack([fx * u + skew * v + cx, fy * v + cy], 1)
+        # The Jacobian of a mean far outside of the view is that at the view's widened edge, and has no derivative by
+        # where the mean is along that axis: the rasterizers' own rule.
+        if settings.fov_clamp == "gsplat":
+            half = 0.15 * camera.width / fx, 0.15 * camera.height / fy
+            u = u.clamp(-cx / fx - half[0], (camera.width - cx) / fx + half[0])
+            v = v.clamp(-cy / fy - half[1], (camera.height - cy) / fy + half[1])
+        elif settings.fov_clamp == "inria":
+            u, v = (a.clamp(-0.65 * n / f, 0.65 * n / f) for a, n, f in ((u, camera.width, fx), (v, camera.height, fy)))
+        zero = torch.zeros_like(z)
+        rows = [fx / z, skew / z + zero, -(fx * u + skew * v) / z, zero, fy / z, -fy * v / z]
+        scales = splats.scales.to(**like)
+        axes = semi_axes(splats.quats.to(**like), torch.ones_like(scales))
+        if splats.strains is not None:
+            axes = strained(axes, splats.strains)
+        axes = axes * scales[:, None, :]
+        half_axes = torch.stack(rows, 1).reshape(-1, 2, 3) @ w2c[:3, :3] @ axes
+        a, b = half_axes.unbind(1)
+        # The Gram determinant of the rows: thin projections do not cancel as in xx yy - xy^2.
+        sharp = torch.linalg.cross(a, b).square().sum(1)
+        xx = a.square().sum(1)
+        yy = b.square().sum(1)
+        xy = (a * b).sum(1)
+        eps = settings.dilation
+        blurred = sharp + eps * (xx + yy + eps)
+        compensation = None
+        if antialiased:
+            compensation = (sharp / blurred).clamp_min(LEAST_COMPENSATION**2).sqrt().to(splats.means.dtype)
+    with torch.no_grad():  # `meta` has no graph
+        opacity = splats.opacities.to(**like) * (1 if compensation is None else compensation)
+        extent = (2 * (opacity / LEAST_OPACITY).clamp_min(1).log()).sqrt().clamp_max(EXTENT)
+        valid = valid & (opacity >= LEAST_OPACITY)  # not in place: the graph of z keeps the mask
+        radii = torch.ceil(extent[:, None] * torch.stack([xx + eps, yy + eps], 1).sqrt())
+        covariance = torch.stack([xx + eps, xy, yy + eps], 1)
+        meta = _meta(splats, camera, means2d.detach(), covariance, blurred, radii, valid, z)
+    return meta, compensation
+
+
+def _projected_by_points(splats: Splats, camera: Camera, depths: torch.Tensor, near: float) -> dict[str, torch.Tensor]:
+    """gsplat's `meta` of a view by the unscented transform (3DGUT: alpha 0.1, beta 2, kappa 0), without a graph.
+
+    Args:
+        depths: (N,) camera z or distance of the means, of a rolling shutter in the middle of the exposure.
+        near: Means of no larger depth are left out.
+    """
+    with torch.no_grad():  # `meta` has no graph
+        means = splats.means.detach().cpu().double()
+        steps = SPREAD * semi_axes(splats.quats.detach().cpu().double(), splats.scales.detach().cpu().double())
+        steps = steps.mT  # rows are half axes
+        points = torch.cat([means[:, None], means[:, None] + steps, means[:, None] - steps], 1)
+        at, _ = camera.project(points.reshape(-1, 3).numpy())
+        seen = np.isfinite(at).all(1)
+        pixels = torch.from_numpy(np.where(seen[:, None], at, 0.0)).reshape(-1, 7, 2)
+        size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
+        within = ((pixels >= -MARGIN * size) & (pixels < (1 + MARGIN) * size)).all(-1) & torch.from_numpy(seen).reshape(
+            -1, 7
+        )
+        of_mean, of_covariance = (torch.tensor(x, dtype=torch.float64) for x in (OF_MEAN, OF_COVARIANCE))
+        means2d = torch.einsum("k,nki->ni", of_mean, pixels)
+        off = pixels - means2d[:, None]
+        xx, xy, yy = (
+            torch.einsum("k,nk,nk->n", of_covariance, off[..., i], off[..., j]) for i, j in ((0, 0), (0, 1), (1, 1))
+        )
+        sharp = xx * yy - xy * xy
+        xx, yy = xx + DILATION, yy + DILATION
+        det = xx * yy - xy * xy
+        # As if what the dilation widens was made fainter, although the opacity along rays is not.
+        shrunk = (sharp / det.clamp_min(1e-30)).clamp_min(LEAST_COMPENSATION**2).sqrt()
+        opacity = splats.opacities.detach().cpu().double() * shrunk
+        extent = (2 * (opacity / LEAST_OPACITY).clamp_min(1).log()).sqrt().clamp_max(EXTENT)
+        middle = 0.5 * (xx + yy)
+        largest = middle + (middle * middle - det).clamp_min(0.01).sqrt()
+        variance = torch.minimum(torch.stack([xx, yy], 1), largest[:, None]).clamp_min(0)
+        radii = torch.ceil(extent[:, None] * variance.sqrt())
+        valid = within.any(1) & (det > 0) & (depths.detach().cpu() > near) & (opacity >= LEAST_OPACITY)
+        covariance = torch.stack([xx, xy, yy], 1)
+        return _meta(splats, camera, means2d, covariance, det, radii, valid, depths.detach().cpu().double())
+
+
+def _meta(
+    splats: Splats,
+    camera: Camera,
+    means2d: torch.Tensor,
+    covariance: torch.Tensor,
+    det: torch.Tensor,
+    radii: torch.Tensor,
+    valid: torch.Tensor,
+    z: torch.Tensor,
+) -> dict[str, torch.Tensor]:
+    """The dictionary's arrays: 0 where a Gaussian is not seen."""
+    size = torch.tensor([camera.width, camera.height], dtype=torch.float64, device=radii.device)
+    valid = valid & ((means2d + radii > 0) & (means2d - radii < size)).all(1)
+    xx, xy, yy = covariance.unbind(1)
+    conics = torch.stack([yy, -xy, xx], 1) / det[:, None]
+    kind: dict[str, Any] = {"dtype": splats.means.dtype, "device": splats.means.device}
+    return {
+        "radii": (radii * valid[:, None]).to(torch.int32).to(splats.means.device),
+        "means2d": means2d.to(**kind),
+        "depths": torch.where(valid, z, 0).to(**kind),
+        "conics": conics.to(**kind),
+    }

@@ -43,8 +43,8 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"tracing"}, "the engine"),
     ({"integrator", "plugin"}, "rendering with it, from torch and from Mitsuba"),
     (
-        {"gsplat_options", "projected", "covariances"},
-        "what gsplat's options mean here, and what it returns beside images",
+        {"covariances"},
+        "Gaussians by their covariances",
     ),
     ({"rasterize"}, "the same under gsplat's names"),
     ({"deform", "dynamics"}, "Gaussians that move: what comes above sees a scene, by its protocol"),

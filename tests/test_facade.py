@@ -23,13 +23,11 @@ _INSIDE = {
     "capturing",
     "commands",
     "covariances",
-    "gsplat_options",
     "lenses",
     "libllvm",
     "llvm_target",
     "machine",
     "planner_files",
-    "projected",
     "scenes",
     "sizes",
 }

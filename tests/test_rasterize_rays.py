@@ -15,7 +15,7 @@ import drgs
 from drgs import reference
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
-from drgs.gsplat_options import lenses_of
+from drgs.rasterize import _lenses_of
 from drgs.settings import RenderSettings
 
 
@@ -142,7 +142,7 @@ def test_ftheta():
     seen = culled.rgb + (1 - culled.alpha[..., None]) * given["backgrounds"][0]
     assert float((found[0] - seen).abs()[~culled.ambiguous].max()) < 2e-5
     # K has the focal length: with one of 1 all guides are in one cell, and each Gaussian is listed on all tiles.
-    fields = lenses_of("ftheta", (), 1, None, None, None, made, given["Ks"])[0][0]
+    fields = _lenses_of("ftheta", (), 1, None, None, None, made, given["Ks"])[0][0]
     assert fields["K"][0, 0] == fields["K"][1, 1] == polynomial[1]
     assert fields["distortion"] == pytest.approx((*(k / polynomial[1] for k in polynomial[1:]), *made.linear_cde))
     made.reference_poly = "PIXELDIST_TO_ANGLE"
