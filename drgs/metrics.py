@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from drgs.files import Run
     from drgs.fitting.frames import Frame
     from drgs.fitting.segments import Segmentation
+    from drgs.integrator import Output
 
 __all__ = [
     "METRICS",
@@ -78,8 +79,8 @@ VIEW_PICTURES = ("png", "semantics.png")
 _NO_LPIPS = "needs the package lpips: pip install 'drgs[lpips]', and the weights that docs/install.md names"
 _NO_WEIGHTS = "needs the weights of a backbone: pass --lpips-weights FILE (torchvision's AlexNet or VGG16)"
 _COVERED = 0.5  # opacity from which on more of a pixel is Gaussians than background
-_LPIPS_MIN_SIDE = 64  # the AlexNet backbone pools smaller images to nothing
-_SSIM_MIN_SIDE = 11
+_LPIPS_MIN_SIDE = 64  # pixels: the AlexNet backbone pools smaller images to nothing
+_SSIM_MIN_SIDE = 11  # pixels of a side of its window, which is not padded
 _CORRECTIONS = 5  # fits of the color correction, each to the pixels that the one before it left unsaturated
 _SATURATED = 0.5 / 255  # distance from 0 or 1 within which a value of 8 bits says nothing
 
@@ -292,7 +293,8 @@ def evaluate(
         features, the scores of its labels.
     """
     with Bar("measuring views", len(frames)) as bar:
-        result = _evaluated(g, frames, settings, lpips, pictures, segmentation, moving, bar)
+        measured = None if isinstance(segmentation, str) else segmentation
+        result = _evaluated(g, frames, settings, lpips, pictures, measured, moving, bar)
     result["scores"] = dict(result["mean"])
     if isinstance(segmentation, str):
         result["segmentation"] = None
@@ -310,7 +312,7 @@ def _evaluated(
     settings: RenderSettings,
     lpips: Lpips | None,
     pictures: Path | None,
-    segmentation: Segmentation | str | None,
+    segmentation: Segmentation | None,
     moving: frozenset[int],
     bar: Bar,
 ) -> dict:
@@ -319,39 +321,19 @@ def _evaluated(
     reasons = {}
     if lpips is None:
         reasons["lpips"] = _NO_WEIGHTS if importlib.util.find_spec("lpips") else _NO_LPIPS
-    measured = None if isinstance(segmentation, str) else segmentation
-    is_cut_out, background = any(frame.empty() is not None for frame in frames), settings.background
+    is_cut_out = any(frame.empty() is not None for frame in frames)
     for frame, file_name in zip(frames, file_names([frame.name for frame in frames]), strict=True):
-        seen = g if measured else colors_only(g, frame.camera.time)
         with torch.no_grad():  # pictures of whatever an optimizer may hold
-            out = render(seen, frame.camera, settings)
-        image = out.rgb.cpu().clamp(0, 1)
-        target = frame.target()
-        shown = image if frame.mask is None else image * frame.mask[..., None]
-        height, width = target.shape[:2]
-        row: dict[str, Any] = {"name": frame.name, "width": width, "height": height, **dict.fromkeys(METRICS)}
-        row |= _photometric(image, frame, background if is_cut_out else None)
-        if moving:
-            row["psnr_moving"] = _moving_psnr(image, frame, moving)
-        weights = frame.object_weights()
-        counted = frame.mask if weights is None or not bool((weights > 0).any()) else weights
-        row["uncovered"] = uncovered(out.alpha.cpu(), counted)
-        row["ssim_padded"] = float(_ssim_map(shown, target).mean())
-        row["flip"] = flip(shown, target)
-        if min(height, width) >= _SSIM_MIN_SIDE:
-            row["ssim"] = ssim(shown, target)
-        else:
-            reasons["ssim"] = f"view {frame.name} is smaller than the 11x11 window"
-        if lpips is not None and min(height, width) >= _LPIPS_MIN_SIDE:
-            row["lpips"] = lpips(shown, target)
-        elif lpips is not None:
-            reasons["lpips"] = f"view {frame.name} is smaller than {_LPIPS_MIN_SIDE} pixels"
-        if measured and out.features is not None:
-            row |= measured.add(frame, out.features)
+            out = render(g if segmentation else colors_only(g, frame.camera.time), frame.camera, settings)
+        row, missing = _view_metrics(out, frame, settings.background if is_cut_out else None, lpips, moving)
+        reasons |= missing
+        if segmentation and out.features is not None:
+            row |= segmentation.add(frame, out.features)
             if pictures is not None:
-                measured.write(pictures / f"{file_name}.semantics.png", frame, out.features)
+                segmentation.write(pictures / f"{file_name}.semantics.png", frame, out.features)
         views.append(row)
         if pictures is not None:
+            shown, target = _inside_mask(out, frame), frame.target()
             error = (4 * (shown - target).abs()).clamp(0, 1)
             write_png(pictures / f"{file_name}.png", torch.cat([target, shown, error], dim=1).numpy())
         bar.advance()
@@ -370,6 +352,51 @@ def _evaluated(
     if lpips is not None:
         variants["lpips"] += f", {lpips.backbone} backbone"
     return {"views": views, "mean": mean, "median": median, "variants": variants, "reasons": reasons}
+
+
+def _view_metrics(
+    out: Output,
+    frame: Frame,
+    background: tuple[float, float, float] | None,
+    lpips: Lpips | None,
+    moving: frozenset[int],
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Name, size and metrics of one view, and the reasons of what is None because the view is small.
+
+    Args:
+        out: The rendering.
+        frame: The photograph.
+        background: As `_photometric`.
+        lpips, moving: As `evaluate`.
+    """
+    target = frame.target()
+    image, shown = out.rgb.cpu().clamp(0, 1), _inside_mask(out, frame)
+    height, width = target.shape[:2]
+    reasons = {}
+    row: dict[str, Any] = {"name": frame.name, "width": width, "height": height, **dict.fromkeys(METRICS)}
+    row |= _photometric(image, frame, background)
+    if moving:
+        row["psnr_moving"] = _moving_psnr(image, frame, moving)
+    weights = frame.object_weights()
+    counted = frame.mask if weights is None or not bool((weights > 0).any()) else weights
+    row["uncovered"] = uncovered(out.alpha.cpu(), counted)
+    row["ssim_padded"] = float(_ssim_map(shown, target).mean())
+    row["flip"] = flip(shown, target)
+    if min(height, width) >= _SSIM_MIN_SIDE:
+        row["ssim"] = ssim(shown, target)
+    else:
+        reasons["ssim"] = f"view {frame.name} is smaller than the 11x11 window"
+    if lpips is not None and min(height, width) >= _LPIPS_MIN_SIDE:
+        row["lpips"] = lpips(shown, target)
+    elif lpips is not None:
+        reasons["lpips"] = f"view {frame.name} is smaller than {_LPIPS_MIN_SIDE} pixels"
+    return row, reasons
+
+
+def _inside_mask(out: Output, frame: Frame) -> torch.Tensor:
+    """(H, W, 3) colors of a rendering in [0, 1], black outside the photograph's mask."""
+    image = out.rgb.cpu().clamp(0, 1)
+    return image if frame.mask is None else image * frame.mask[..., None]
 
 
 def _moving_psnr(image: torch.Tensor, frame: Frame, moving: frozenset[int]) -> float | None:

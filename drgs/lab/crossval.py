@@ -141,47 +141,23 @@ def crossval(
         float64 oracle, on a crop of every view of a large scene (`crops`).
     """
     say = advance or (lambda _: None)
-    fields = dict(fields or {})
     if len(g) == 0:
         raise ValueError("crossval: the scene must have Gaussians, got 0")
-    presets = _presets(rasterizer, preset)
-    starts = [ReferenceModel(RenderSettings.preset(name, **_legal(name, fields))) for name in presets]
-    through_lens = any(c.is_distorted or c.is_rolling for c in cameras)
-    if through_lens:
-        if all(start.settings.planar for start in starts):
-            raise ValueError(
-                f"crossval: cameras must be pinholes for preset {presets[0]}, a model of their image plane, got a lens "
-                "or a rolling shutter; use undistorted cameras, or a preset along rays (3dgut, exact, fast)"
-            )
-        drawable = [pair for pair in zip(presets, starts, strict=True) if not pair[1].settings.planar]
-        presets, starts = [name for name, _ in drawable], [start for _, start in drawable]
-    background = starts[0].settings.background
+    starts = _starting_models(rasterizer, preset, fields or {}, cameras)
+    first_start = next(iter(starts.values()))
+    background = first_start.settings.background
     oracle = isinstance(rasterizer, Rasterizer) and rasterizer.preset is not None
     cameras = [c if c.name else dataclasses.replace(c, name=str(i)) for i, c in enumerate(cameras)]
-    whole, asked = len(g), len(cameras)
-    places: list[Crop | None] = [None] * asked
+    given = g, cameras
+    places: list[Crop | None] = [None] * len(cameras)
     if oracle and len(g) * sum(c.width * c.height for c in cameras) > _ORACLE_PAIRS:
         say("crops")
-        g, cameras, found_places = crops(g, cameras, starts[0].settings)
-        places = [*found_places]
+        g, cameras, of_crops = crops(g, cameras, first_start.settings)
+        places = [*of_crops]
     dtype = getattr(rasterizer, "dtype", torch.float32)
     raw = with_pose(raw_of(g), any(c.is_rolling for c in cameras))
-    signs = cotangents(cameras, seed)
     say("images")
-    if isinstance(rasterizer, Dump):
-        pictures = list(rasterizer.images)
-        alphas = list(rasterizer.alphas)
-        signs = rasterizer.cotangents
-    else:
-        pairs = [rasterizer.image(raw, camera, background) for camera in cameras]
-        pictures, alphas = ([pair[k] for pair in pairs] for k in range(2))
-    for camera, picture in zip(cameras, pictures, strict=True):
-        if len(bad := (~torch.isfinite(picture)).any(-1).nonzero()):
-            y, x = bad[0].tolist()
-            raise ValueError(
-                f"{rasterizer.name}: its image must be finite, view {camera.name} has NaN or Inf in {len(bad)} of "
-                f"{picture[..., 0].numel()} pixels, first at ({x}, {y}); correct the rasterizer"
-            )
+    pictures, alphas, signs = _images(rasterizer, raw, cameras, background, seed)
     say("conventions")
     first = int(np.argmax([float(x.var()) for x in pictures]))  # the view that shows most
 
@@ -196,14 +172,14 @@ def crossval(
 
     found = conventions.find(
         pictures[first],
-        starts,
+        list(starts.values()),
         lambda m: drawn_by(m, first)[0],
         lambda m: ties_of(m, first),
         _SETTLED[dtype],
         lambda m: m.suits(cameras[first], len(g)),
     )
     model = found.model
-    claimed = next(name for name, start in zip(presets, starts, strict=True) if start == found.start)
+    claimed = next(name for name, start in starts.items() if start == found.start)
     drawn = [drawn_by(model, view) for view in range(len(cameras))]
     if not any(bool(alpha.any()) for _, alpha in drawn):
         if any(bool(drawn_by(found.start, view)[1].any()) for view in range(len(cameras))):
@@ -219,20 +195,87 @@ def crossval(
         say("what the error looks like")
         models = {"the model at its conventions": model} if found.findings else {}
         models |= {f"preset {claimed}": found.start}  # and what else may be meant
-        models |= {f"preset {name}": start for name, start in zip(presets, starts, strict=True)}
+        models |= {f"preset {name}": start for name, start in starts.items()}
         comparison.views = with_errors(comparison, pictures, models, drawn_by)
     not_offered = {k: "its image has no gradient of them" for k in MOTIONS if k in raw and k not in comparison.groups}
     if channels:
         wide, reason = _wide_gradients(case, model, comparison, channels, seed, functools.partial(ties_of, model))
         comparison.groups |= wide
         not_offered |= {COLORS: reason} if reason else {}
+    report = _report(case, comparison, found, claimed, given, places, not_offered, seed)
+    say("pictures")
+    exact = ReferenceModel(RenderSettings.preset("exact", background=background))
+    images = []
+    for picture, (same, _), camera in zip(pictures, drawn, cameras, strict=True):
+        true, _ = _drawn(exact, raw, camera, False)
+        images.append({"rasterizer": picture.numpy(), "model": same.numpy(), "exact": true.numpy()})
+    return Result(report, images, comparison.groups, comparison.views, found.findings, model, g, cameras)
+
+
+def _starting_models(
+    rasterizer: Rasterizer | Dump, preset: str, fields: dict, cameras: list[Camera]
+) -> dict[str, ReferenceModel]:
+    """Preset -> model: what the rasterizer may claim to be, of what can draw the cameras.
+
+    Raises:
+        ValueError: If cameras have a lens and every preset is a model of the image plane.
+    """
+    own = getattr(rasterizer, "preset", None)
+    names = [preset] if preset != "auto" else [own] if own else list(_STARTS)
+    starts = {name: ReferenceModel(RenderSettings.preset(name, **_legal(name, fields))) for name in names}
+    if not any(c.is_distorted or c.is_rolling for c in cameras):
+        return starts
+    along_rays = {name: start for name, start in starts.items() if not start.settings.planar}
+    if not along_rays:
+        raise ValueError(
+            f"crossval: cameras must be pinholes for preset {names[0]}, a model of their image plane, got a lens "
+            "or a rolling shutter; use undistorted cameras, or a preset along rays (3dgut, exact, fast)"
+        )
+    return along_rays
+
+
+def _images(
+    rasterizer: Rasterizer | Dump, raw: dict, cameras: list[Camera], background: tuple, seed: int
+) -> tuple[list[torch.Tensor], list[torch.Tensor], torch.Tensor]:
+    """The rasterizer's images and alphas, one a view, and (C, H, W, 3) cotangents: random signs, or a dump's own.
+
+    Raises:
+        ValueError: If an image has NaN or Inf.
+    """
+    if isinstance(rasterizer, Dump):
+        pictures, alphas, signs = list(rasterizer.images), list(rasterizer.alphas), rasterizer.cotangents
+    else:
+        pairs = [rasterizer.image(raw, camera, background) for camera in cameras]
+        pictures, alphas = ([pair[k] for pair in pairs] for k in range(2))
+        signs = cotangents(cameras, seed)
+    for camera, picture in zip(cameras, pictures, strict=True):
+        if len(bad := (~torch.isfinite(picture)).any(-1).nonzero()):
+            y, x = bad[0].tolist()
+            raise ValueError(
+                f"{rasterizer.name}: its image must be finite, view {camera.name} has NaN or Inf in {len(bad)} of "
+                f"{picture[..., 0].numel()} pixels, first at ({x}, {y}); correct the rasterizer"
+            )
+    return pictures, alphas, signs
+
+
+def _report(
+    case: Case,
+    comparison: Compared,
+    found: conventions.Found,
+    claimed: str,
+    given: tuple[Gaussians, list[Camera]],
+    places: list[Crop | None],
+    not_offered: dict[str, str],
+    seed: int,
+) -> dict:
+    """`Result.report`; `given` are the scene and the cameras before anything was cropped."""
     worst = min((row.verdict for row in comparison.groups.values()), key=VERDICTS.index)
     if not comparison.agrees:
         worst = min(worst, "model difference", key=VERDICTS.index)
     elif found.findings:
         worst = min(worst, "other convention", key=VERDICTS.index)
     report = {
-        "rasterizer": rasterizer.name,
+        "rasterizer": case.rasterizer.name,
         "verdict": worst,
         "preset": claimed,
         "conventions": [dataclasses.asdict(finding) for finding in found.findings],
@@ -244,29 +287,23 @@ def crossval(
         },
         "groups": {name: row.json() for name, row in comparison.groups.items()},
         "not_offered": not_offered,
-        "reference": "float64 oracle" if oracle else "drgs.render",
-        "gaussians": len(g),
-        "of_gaussians": whole,
-        "of_views": asked,
-        "cameras": [camera.name for camera in cameras],
-        "size": [cameras[0].width, cameras[0].height],
+        "reference": "float64 oracle" if case.oracle else "drgs.render",
+        "gaussians": len(case.raw["means"]),
+        "of_gaussians": len(given[0]),
+        "of_views": len(given[1]),
+        "cameras": [camera.name for camera in case.cameras],
+        "size": [case.cameras[0].width, case.cameras[0].height],
         "crops": [None if place is None else dataclasses.asdict(place) for place in places],
         "pixels": comparison.ties.numel(),
         "near_ties": int(comparison.ties.sum()),
         "near_ties_counted": comparison.counted,
-        "background": list(background),
+        "background": list(case.background),
         "tolerance": case.tolerance,
         "seed": seed,
-        "settings": dataclasses.asdict(model.settings),
+        "settings": dataclasses.asdict(found.model.settings),
     }
     report["scope"] = _scope(report)
-    say("pictures")
-    exact = ReferenceModel(RenderSettings.preset("exact", background=background))
-    images = []
-    for picture, (same, _), camera in zip(pictures, drawn, cameras, strict=True):
-        true, _ = _drawn(exact, raw, camera, False)
-        images.append({"rasterizer": picture.numpy(), "model": same.numpy(), "exact": true.numpy()})
-    return Result(report, images, comparison.groups, comparison.views, found.findings, model, g, cameras)
+    return report
 
 
 def _scope(r: dict) -> list[str]:
@@ -290,13 +327,6 @@ def _scope(r: dict) -> list[str]:
         )
     lines += [f"not compared: the gradient of {name}: {why}" for name, why in r["not_offered"].items()]
     return lines
-
-
-def _presets(rasterizer: Rasterizer | Dump, preset: str) -> list[str]:
-    if preset != "auto":
-        return [preset]
-    own = getattr(rasterizer, "preset", None)
-    return [own] if own else list(_STARTS)
 
 
 def _legal(name: str, fields: dict) -> dict:

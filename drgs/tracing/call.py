@@ -122,19 +122,9 @@ class Call:
         must_be("render", "couple_features", couple, bool, "True or False")
         self.couple = couple
         self.oriented = oriented
-        if settings.planar and camera.is_distorted:
-            raise NotImplementedError(
-                f"render: response={settings.response!r} is a model of a pinhole's image plane, got a camera of model "
-                f"{camera.model!r} with distortion; use camera.undistorted(), or a response along rays "
-                "(--preset exact, fast or 3dgut)"
-            )
         self.free = camera is not None and (pixel_rays is not None or camera.is_rolling)
-        if settings.planar and self.free:
-            raise NotImplementedError(
-                f"render: response={settings.response!r} is a model of a pinhole's image plane, got "
-                f"{'rays' if pixel_rays is not None else 'a rolling shutter'}; use a response along rays "
-                "(--preset exact, fast or 3dgut)"
-            )
+        if settings.planar:
+            _check_planar(settings, camera, self.free, pixel_rays is not None)
         self.pixel_rays = None if pixel_rays is None else numbers("render", "rays", pixel_rays)
         self.table: FreeRays | None = None
         self.holes: UInt32 | None = None
@@ -167,7 +157,20 @@ class Call:
         self.count = len(gaussians)
         self.coefficients = gaussians.sh.shape[1]
         self.width = 0 if gaussians.features is None else gaussians.features.shape[1]
-        self.origin = origin = torch.from_numpy(np.asarray(gaussians.origin, np.float64))
+        self.origin = torch.from_numpy(np.asarray(gaussians.origin, np.float64))
+        pose = self._set_pose_and_rays(rays, lens)
+        self.inputs["w2c"] = self._move(shifted(pose, self.origin))
+        self.pixels = int(np.prod(self.shape))
+        self.extra = {}
+        self.certificate = {}
+
+    def _set_pose_and_rays(self, rays, lens: torch.Tensor | None) -> torch.Tensor:
+        """Set the shape, and rays where they are traced; returns the pose whose depths count.
+
+        Args:
+            rays, lens: Arguments of the call.
+        """
+        camera, settings = self.camera, self.settings
         if rays is not None:
             o, d = checked_rays(*rays, settings)
             self.shape = tuple(d.shape[:-1])
@@ -176,21 +179,18 @@ class Call:
             pose = torch.eye(4, dtype=torch.float64)
             # Rays have no camera: depth keys and colors are of the first origin, whose derivative is not theirs.
             pose[:3, 3] = -(o[0].detach() if len(o) else torch.zeros(3))
-            self._set_rays(o - origin, d)
-        else:
-            self.shape = (camera.height, camera.width)
-            pose = rigid_pose(camera)
-            local = self._moving(lens) if lens is not None else None
-            if self.free:
-                pose = self._set_free_rays(pose, local)
-            elif settings.traversal == "bvh" or settings.sh_direction == "ray":
-                d = (self.local_directions() if local is None else local) @ pose[:3, :3]
-                center = -(pose[:3, 3] @ pose[:3, :3]) - origin
-                self._set_rays(center.expand(d.shape), d)
-        self.inputs["w2c"] = self._move(shifted(pose, origin))
-        self.pixels = int(np.prod(self.shape))
-        self.extra = {}
-        self.certificate = {}
+            self._set_rays(o - self.origin, d)
+            return pose
+        self.shape = (camera.height, camera.width)
+        pose = rigid_pose(camera)
+        local = self._moving(lens) if lens is not None else None
+        if self.free:
+            return self._set_free_rays(pose, local)
+        if settings.traversal == "bvh" or settings.sh_direction == "ray":
+            d = (self.local_directions() if local is None else local) @ pose[:3, :3]
+            center = -(pose[:3, 3] @ pose[:3, :3]) - self.origin
+            self._set_rays(center.expand(d.shape), d)
+        return pose
 
     def _check_memory(self, gaussians, rays):
         """Refuse what cannot fit before anything is allocated for it."""
@@ -366,6 +366,22 @@ class Call:
         flat = {"alpha": pixels, "features": pixels * self.width} | ({"depth": pixels} if "depth" in self.want else {})
         images = {name: zero.expand(size) for name, size in flat.items()}
         return {"rgb": zero + torch.tensor(self.settings.background, device=self.home).repeat(pixels), **images}
+
+
+def _check_planar(settings: RenderSettings, camera: Camera, is_free: bool, has_rays: bool) -> None:
+    """Refuse views that a model of the image plane does not have: lenses, rays of their own, rolling shutters."""
+    if camera.is_distorted:
+        raise NotImplementedError(
+            f"render: response={settings.response!r} is a model of a pinhole's image plane, got a camera of model "
+            f"{camera.model!r} with distortion; use camera.undistorted(), or a response along rays "
+            "(--preset exact, fast or 3dgut)"
+        )
+    if is_free:
+        raise NotImplementedError(
+            f"render: response={settings.response!r} is a model of a pinhole's image plane, got "
+            f"{'rays' if has_rays else 'a rolling shutter'}; use a response along rays "
+            "(--preset exact, fast or 3dgut)"
+        )
 
 
 def _check_names(parameters: dict) -> None:

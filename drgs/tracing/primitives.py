@@ -228,26 +228,33 @@ class Activated:
         stretched = self.rotation_of_inverse = self.rotation
         self.stretching: list[Float] | None = None
         if "strains" in p:
-            # The strain is 0, and moves the Gaussian to first order only: R (I + E), and R (I - E) of W.
-            xx, xy, xz, yy, yz, zz = (column("strains", k, 6) for k in range(6))
-            shears = [[0, xy, xz], [xy, 0, yz], [xz, yz, 0]]
-            moved = [
-                [sum(row[k] * shears[k][c] for k in range(3) if k != c) for c in range(3)] for row in self.rotation
-            ]
-            self.stretching = [xx, yy, zz]
-            stretched = [
-                [a * (1 + e) + b for a, b, e in zip(*rows, self.stretching, strict=True)]
-                for rows in zip(self.rotation, moved, strict=True)
-            ]
-            self.rotation_of_inverse = [
-                [a - b for a, b in zip(*rows, strict=True)] for rows in zip(self.rotation, moved, strict=True)
-            ]
-            others = [yy + zz, zz + xx, xx + yy]
-            self.inverse = [x * (1 + e) for x, e in zip(self.inverse, others, strict=True)]
-            self.norm *= 1 - (xx + yy + zz)
+            stretched = self._strained([column("strains", k, 6) for k in range(6)])
         self.from_local = _rotated(v, stretched)
         same = self.rotation_of_inverse is self.rotation
         self.inverse_from_local = self.from_local if same else _rotated(v, self.rotation_of_inverse)
+
+    def _strained(self, strains: list[Float]) -> list[list[Float]]:
+        """R (I + E), and what else strains change of W.
+
+        The strain E is 0, and moves the Gaussian to first order only: R (I + E), and R (I - E) of W.
+
+        Args:
+            strains: Columns (N,) xx, xy, xz, yy, yz, zz of E in local axes.
+        """
+        xx, xy, xz, yy, yz, zz = strains
+        shears = [[0, xy, xz], [xy, 0, yz], [xz, yz, 0]]
+        moved = [[sum(row[k] * shears[k][c] for k in range(3) if k != c) for c in range(3)] for row in self.rotation]
+        self.stretching = [xx, yy, zz]
+        self.rotation_of_inverse = [
+            [a - b for a, b in zip(*rows, strict=True)] for rows in zip(self.rotation, moved, strict=True)
+        ]
+        others = [yy + zz, zz + xx, xx + yy]
+        self.inverse = [x * (1 + e) for x, e in zip(self.inverse, others, strict=True)]
+        self.norm *= 1 - (xx + yy + zz)
+        return [
+            [a * (1 + e) + b for a, b, e in zip(*rows, self.stretching, strict=True)]
+            for rows in zip(self.rotation, moved, strict=True)
+        ]
 
     def _extent(self, count: int) -> Float:
         """Cut-off radius in standard deviations; a constant of the derivative, as every cut-off is."""
