@@ -197,7 +197,7 @@ def test_the_page(tmp_path):
     """Means, costs, the paper's numbers marked as another data set's, the leak, differences within units."""
     study, experiment = study_of("static", "small", tmp_path), EXPERIMENTS["static"]
     rows = rows_of(study, experiment.policies, units=6, fisherrf=22.0)
-    text = results_page(study, experiment, rows, told=("Something is missing.",))
+    text = results_page(study, experiment, rows, remarks=("Something is missing.",))
     line = next(x for x in text.splitlines() if x.startswith("| FisherRF |"))
     cells = [x.strip() for x in line.strip("|").split("|")]
     assert cells == ["FisherRF", "0.500", "22.25", *["0.500"] * 4, "6", "6", "1.50", "2.50", "1.50", "32.17"]

@@ -248,16 +248,16 @@ def test_uncertainty_is_that_of_fisher():
     )
     with pytest.raises(RuntimeError, match="all 3 views must be added first, 0 are"):
         made.map(cameras[3])
-    for _ in made.learn(lambda: told.append(made.done)):
+    for _ in made.add_views(lambda: told.append(made.done)):
         pass
     assert told == [1, 2, 3]
-    assert made.is_known
+    assert made.is_complete
     H = fisher.diagonal(g, cameras[:3], FAST)
     wanted = fisher.variance_map(g, cameras[3], gain.variances(H, prior), FAST).numpy()
     np.testing.assert_allclose(made.map(cameras[3]), wanted, rtol=1e-3, atol=1e-6 * wanted.max())
 
 
-def test_uncertainty_is_sketched_first():
+def test_uncertainty_has_map_first():
     """Few pixels of few photographs, each for all that it stands for: soon there is about the map of all of them."""
     torch.manual_seed(0)
     g = blobs(torch.randn(40, 3) * 0.4)
@@ -272,21 +272,21 @@ def test_uncertainty_is_sketched_first():
         return fisher.variance_map(g, camera, weights, FAST).numpy()
 
     made = Uncertainty(cameras, said, mapped, gain.Prior(1.0))
-    steps = made.learn(lambda: None)
-    while not made.is_sketched:
+    steps = made.add_views(lambda: None)
+    while not made.has_map:
         next(steps)
     assert len(asked) == 24
     assert max(asked) <= 2400
-    assert not made.is_known
+    assert not made.is_complete
     sketch = made.map(cameras[3])
     for _ in steps:
         pass
-    assert made.is_known
+    assert made.is_complete
     assert asked[24:] == [96 * 80] * 30
     whole = made.map(cameras[3])
     seen = whole > 1e-3 * whole.max()
     assert np.median(np.abs(np.log(sketch[seen] / whole[seen]))) < 0.1
-    assert len(list(Uncertainty(cameras, said, mapped, gain.Prior(1.0)).learn(lambda: None, sketch=False))) == 30
+    assert len(list(Uncertainty(cameras, said, mapped, gain.Prior(1.0)).add_views(lambda: None, sketch=False))) == 30
 
 
 # ------------------------------------------------------------------------------------------------- worker
@@ -558,7 +558,7 @@ def test_uncertainty_is_added_up_once_and_shown(place, viewers, told):  # noqa: 
         picture = client.picture(after=at)
         counts = [text for text in told if text.endswith(" of 4 photographs added")]
         assert counts == [f"uncertainty of step 12 of 12: {done} of 4 photographs added" for done in range(5)]
-        assert looked.uncertainty.is_known
+        assert looked.uncertainty.is_complete
         camera = camera_of(Pose(pose.wxyz, pose.position, 0.8, 4 / 3), *picture.shape[1::-1], looked.origin)
         wanted, (low, high) = map_colors(looked.uncertainty.map(camera))
         html(client, f"{low:.3g} ", after=at)

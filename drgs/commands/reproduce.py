@@ -145,7 +145,7 @@ def _write(plan: StudyPlan, rows: list[dict], out: Path, args: Reproduce, pictur
     where = (
         f"Made by `{_command(args)}` on {cpu_model()}, {datetime.date.today()}, commit {(commit() or 'unknown')[:7]}."
     )
-    text = ["# Policies, compared", where, results_page(plan.study, plan.experiment, rows, told=plan.notes)]
+    text = ["# Policies, compared", where, results_page(plan.study, plan.experiment, rows, remarks=plan.notes)]
     text += [f"![{told}]({name})\n\n{told}." for name, told in pictures]
     with atomic_write(out / f"{args.what}.md") as file:
         file.write(("\n\n".join(text) + "\n").encode())

@@ -147,7 +147,7 @@ class Experiment:
     """A table of the paper.
 
     Attributes:
-        title, told: What it shows.
+        title, description: What it shows.
         study: The study that its cells are of.
         policies: Label -> what the table calls it.
         reference: The label that the others are compared with.
@@ -157,7 +157,7 @@ class Experiment:
     """
 
     title: str
-    told: str
+    description: str
     study: StudyName
     policies: Mapping[str, str]
     reference: str

@@ -21,16 +21,16 @@ StudyScale = Literal["tiny", "small", "paper"]
 
 @dataclasses.dataclass(frozen=True)
 class Protocol:
-    """What a cell's fit is told beyond its study.
+    """What the fit of a cell has beyond its study.
 
     Attributes:
-        told: Description for pages.
+        description: Description for pages.
         points: `init_points` of the fit's data.
         selection: Fields of `SelectionConfig` that replace those of the study.
         static: Whether it is only for loops that add views of one time.
     """
 
-    told: str
+    description: str
     points: InitPoints
     selection: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     static: bool = False

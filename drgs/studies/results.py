@@ -18,12 +18,12 @@ __all__ = ["best_of_units", "results_page", "results_rows"]
 
 ResultRows = Sequence[Mapping[str, Any]]
 _COSTS = {"minutes": "minutes (steps and picks)", "peak_memory": "peak memory, GB", "pick_seconds": "seconds a pick"}
-_BEST_BY = "psnr"
+_BEST_BY = "psnr"  # the metric by which a unit has a best policy
 _UPPER = "all views"  # is given what the others choose from: it wins nothing
 
 
 def results_page(
-    study: Study, experiment: Experiment, rows: ResultRows, level: int = 2, told: Sequence[str] = ()
+    study: Study, experiment: Experiment, rows: ResultRows, level: int = 2, remarks: Sequence[str] = ()
 ) -> str:
     """The section of one experiment as Markdown.
 
@@ -32,13 +32,13 @@ def results_page(
         experiment: The table.
         rows: ResultRows of the study; those of other policies are left out.
         level: Level of its heading.
-        told: More sentences, e.g. of what is not there and why.
+        remarks: More sentences, e.g. of what is not there and why.
     """
     labels = [label for label in experiment.policies if any(row["policy"] == label for row in rows)]
     rows = [row for row in rows if row["study"] == study.name and row["policy"] in experiment.policies]
     renamed = [f"`{label}` ({name})" for label, name in experiment.policies.items() if label != name]
     labels_of = [f"Labels, as `--policy` takes them: {', '.join(renamed)}."] if renamed else []
-    parts = [f"{'#' * level} {experiment.title}", paragraph(" ".join([experiment.told, *told, *labels_of]))]
+    parts = [f"{'#' * level} {experiment.title}", paragraph(" ".join([experiment.description, *remarks, *labels_of]))]
     if not rows:
         return "\n\n".join([*parts, "No cell is finished."])
     for protocol in (name for name in PROTOCOLS if any(row["protocol"] == name for row in rows)):
@@ -116,7 +116,8 @@ def _size(protocol: str, rows: ResultRows) -> str:
     each = ", ".join(f"{scene} {len(found)}" for scene, found in units.items())
     leak = " **Pool leak: points of views that are never picked are known.**" if PROTOCOLS[protocol].leaks else ""
     return (
-        f"Protocol `{protocol}`: {PROTOCOLS[protocol].told}.{leak} {len(rows)} fits on commits {', '.join(commits)}; "
+        f"Protocol `{protocol}`: {PROTOCOLS[protocol].description}.{leak} {len(rows)} fits on commits "
+        f"{', '.join(commits)}; "
         f"units (scene, what is held out, initial views): {each}."
     )
 

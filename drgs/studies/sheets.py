@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 __all__ = ["comparison_sheet"]
 
 _WIDTH = 300  # pixels of a column, about
-_ZOOM = 0.5  # of the width and the height of a view
-_GAP = 6
-_FRAME = (255, 200, 0)
+_ZOOM = 0.5  # of the width and the height of a view: the part that is enlarged
+_GAP = 6  # pixels between pictures
+_FRAME = (255, 200, 0)  # RGB of the frame around the part that is enlarged
 _NONE = np.zeros((1, 1, 3), np.uint8)
 
 

@@ -53,7 +53,7 @@ Unit = tuple[str, tuple[int, int], tuple[str, ...]]
 FEWEST_UNITS = 6
 """Units from which on there is a verdict: five that all agree do so by chance in one of 16 studies (two-sided)."""
 
-_DRAWS = 10_000
+_DRAWS = 10_000  # of the bootstrap: the ends of an interval are then known to 0.5 % of its draws
 # Count -> share of 95 % intervals that hold the true mean: of scenes with one unit, or of units of one scene; of scenes
 # with 3 to 5 units that differ as much as their units do, from 8 on half as much.
 _HELD = {2: 0.50, 3: 0.75, 4: 0.79, 5: 0.83, 6: 0.86, 8: 0.88, 10: 0.89, 12: 0.90, 15: 0.92}

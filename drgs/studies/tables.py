@@ -57,7 +57,7 @@ def study_report(study: Study, rows: StudyRows, level: int = 3) -> str:
     for protocol in protocols:
         mine = [row for row in rows if row["protocol"] == protocol]
         if len(protocols) > 1:
-            parts.append(f"{'#' * level} Protocol `{protocol}`: {PROTOCOLS[protocol].told}")
+            parts.append(f"{'#' * level} Protocol `{protocol}`: {PROTOCOLS[protocol].description}")
         below = "#" * (level + (len(protocols) > 1))
         for scene in dict.fromkeys(row["scene"] for row in mine):
             parts += [f"{below} {scene}", _means(study, [row for row in mine if row["scene"] == scene])]
@@ -133,8 +133,8 @@ def _mixed(rows: StudyRows) -> str:
     for row in rows:
         commits.setdefault((row["protocol"], unit_of(row)), set()).add(row.get("commit"))
     mixed = sum(len(found) > 1 for found in commits.values())
-    told = f" In {mixed} of {len(commits)} units fits are of more than one commit: there the code may matter, too."
-    return told if mixed else ""
+    sentence = f" In {mixed} of {len(commits)} units fits are of more than one commit: there the code may matter, too."
+    return sentence if mixed else ""
 
 
 def _range(numbers: set[int]) -> str:
@@ -188,7 +188,7 @@ def explained(study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]]) -
         return "Differences within a unit; of a single one there is no interval, and no verdict."
     judged = sum(len(values) >= FEWEST_UNITS for values in intervals)
     held = coverage(scenes, units)
-    told = (
+    sentence = (
         f"**Gain** and **loss**: the interval excludes 0. Were all policies equal, about {judged * (1 - held):.1f} of "
         f"the {judged} intervals would exclude it as well."
         if judged
@@ -201,8 +201,8 @@ def explained(study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]]) -
     return (
         f"Differences within a unit: their mean{' (every scene counts alike)' if scenes > 1 else ''}, its 95 % "
         f"interval from a bootstrap over {drawn}, and in how many units the policy was better. Of {count} "
-        f"{kind}{alike} the interval holds the true mean in about {held * 100:.0f} % of studies. {told} The last row, "
-        f"*detectable*, is the true difference that a t test of {count} {kind} ({count - 1} degree"
+        f"{kind}{alike} the interval holds the true mean in about {held * 100:.0f} % of studies. {sentence} The "
+        f"last row, *detectable*, is the true difference that a t test of {count} {kind} ({count - 1} degree"
         f"{'s' if count > 2 else ''} of freedom, 5 % of false alarms) would find in 80 % of studies that spread as "
         "this one does (the median of the rows)."
     )
@@ -251,7 +251,7 @@ def unlike_units(rows: StudyRows) -> str:
 
 def curves(study: Study, rows: StudyRows, counts: Sequence[int]) -> str:
     """Of each metric: policies against numbers of views, on average over scenes; below, what is left of differences."""
-    told = (
+    sentence = (
         "Measured with so many views, on the way just before the next one is picked, with the last number at the end; "
         "every scene counts alike."
     )
@@ -259,8 +259,8 @@ def curves(study: Study, rows: StudyRows, counts: Sequence[int]) -> str:
     labels = _labels(study, rows)
     measured = [at_views(rows, count) for count in counts]
     units = {x: {len({unit_of(row) for row in at if row["policy"] == x}) for at in measured} for x in labels}
-    unlike = next((said for at in measured if (said := unlike_units(at))), "")
-    parts = [paragraph(f"{told} {unlike}".strip())]
+    unlike = next((remark for at in measured if (remark := unlike_units(at))), "")
+    parts = [paragraph(f"{sentence} {unlike}".strip())]
     for metric in study.metrics:
         means = []
         for label in labels:
@@ -290,8 +290,8 @@ def _leaked(study: Study, rows: StudyRows) -> str:
             lines.append([label, *cells])
     if not lines:
         return "No policy has a unit in common yet."
-    told = "The same policy on the same unit; how to read the numbers is said above."
-    return told + "\n\n" + markdown_table(["policy", *(_title(metric) for metric in study.metrics)], lines)
+    sentence = "The same policy on the same unit; how to read the numbers is said above."
+    return sentence + "\n\n" + markdown_table(["policy", *(_title(metric) for metric in study.metrics)], lines)
 
 
 def _estimates(study: Study, rows: StudyRows, policy: str, reference: str) -> dict[str, Effect | None]:
@@ -331,9 +331,9 @@ def _verdicts(study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]]) -
                 words[word].append(metric.title)
         if not any(one and one.units >= FEWEST_UNITS for one in found.values()):
             continue
-        told = [f"{verbs[word]} {', '.join(names)}" for word, names in words.items() if names]
+        sentence = [f"{verbs[word]} {', '.join(names)}" for word, names in words.items() if names]
         lines.append(
-            f"- `{policy}` against `{reference}`: {' and '.join(told) or 'no difference that this study can see'}."
+            f"- `{policy}` against `{reference}`: {' and '.join(sentence) or 'no difference that this study can see'}."
         )
     return "\n".join(lines)
 

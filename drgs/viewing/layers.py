@@ -140,7 +140,7 @@ def over(before: np.ndarray, rows: np.ndarray, height: int) -> np.ndarray:
 UNCERTAINTY = "uncertainty"
 _WIDE_PIXELS = 200_000  # pixels of a picture of features: 100 MB of 128 channels
 _VARIANCE = "variance of the color, as a multiple of the photographs' noise, logarithmic"
-_ROW = 4096  # Gaussians that are painted at once
+_ROW = 4096  # Gaussians that are colored at once: bounds the memory of their features
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,12 +192,12 @@ class Layer:
 
 
 def layers_of(
-    paint: Mapping[str, Callable[[Output], np.ndarray]], uncertainty: Uncertainty | None, pixels: int | None
+    semantic: Mapping[str, Callable[[Output], np.ndarray]], uncertainty: Uncertainty | None, pixels: int | None
 ) -> tuple[Layer, ...]:
     """Layers that a scene has.
 
     Args:
-        paint: Kind -> function that draws it of a rendering with features.
+        semantic: Kind (`features`, `labels`, `overlay`) -> function that colors a rendering with features.
         uncertainty: What the photographs leave uncertain, where there are any.
         pixels: Largest number of pixels of its map; None: as many as of other pictures.
     """
@@ -211,9 +211,9 @@ def layers_of(
         "labels": "the class of each pixel",
         "overlay": "classes over the colors",
     }
-    for kind, painter in paint.items():
-        tint = None if kind == "overlay" else _tint_of(painter)
-        made.append(Layer(kind, hints.get(kind, kind), _painted(painter), _WIDE_PIXELS, tint))
+    for kind, colors_of in semantic.items():
+        tint = None if kind == "overlay" else _tint_of(colors_of)
+        made.append(Layer(kind, hints.get(kind, kind), _semantic(colors_of), _WIDE_PIXELS, tint))
     if uncertainty is not None:
         hint = "variance that the photographs leave to each pixel's color: bright is uncertain, dark is well known"
         made.append(Layer(UNCERTAINTY, hint, _mapped(uncertainty), pixels))
@@ -246,9 +246,9 @@ def _missing(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings
     return Drawing(pictures.inferno(found), ColorScale(0.0, 1.0, "share of the light, none to all"))
 
 
-def _painted(painter: Callable[[Output], np.ndarray]) -> Draw:
+def _semantic(colors_of: Callable[[Output], np.ndarray]) -> Draw:
     def draw(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
-        return Drawing((yield from drawn(scene, camera, settings, painter, True, lambda rows: rows)))
+        return Drawing((yield from drawn(scene, camera, settings, colors_of, True, lambda rows: rows)))
 
     return draw
 
@@ -263,24 +263,24 @@ def _mapped(uncertainty: Uncertainty) -> Draw:
     return draw
 
 
-def _tint_of(painter: Callable[[Output], np.ndarray]) -> Callable[[Gaussians], np.ndarray]:
-    """What paints pixels paints Gaussians, too: as rows of pixels that show one each."""
+def _tint_of(colors_of: Callable[[Output], np.ndarray]) -> Callable[[Gaussians], np.ndarray]:
+    """What colors pixels colors Gaussians, too: as rows of pixels that show one each."""
     import torch
 
     def tint(g: Gaussians) -> np.ndarray:
-        assert g.features is not None  # else there is no such painter
+        assert g.features is not None  # else there is no such layer
         rows = []
         for features in g.features.detach().split(_ROW):  # colors for a browser: NumPy takes no tensor with a gradient
             rgb = torch.zeros(1, len(features), 3)
             alpha = torch.ones(1, len(features))
-            rows.append(painter(Output(rgb=rgb, alpha=alpha, features=features[None]))[0])
+            rows.append(colors_of(Output(rgb=rgb, alpha=alpha, features=features[None]))[0])
         return np.concatenate(rows) if rows else np.zeros((0, 3), np.uint8)
 
     return tint
 
 
-_VIEWS = 24  # of the sketch, at most
-_PIXELS = 2400  # of each, at most
+_SKETCH_VIEWS = 24  # at most: a sketch takes seconds
+_SKETCH_PIXELS = 2400  # of each of its views, at most
 
 
 class Uncertainty:
@@ -288,47 +288,47 @@ class Uncertainty:
 
     Args:
         cameras: The cameras of these views, at least one.
-        said: What a view says about the parameters.
-        mapped: (camera, weights) -> (H, W) sum over the parameters of squared derivatives times weights.
+        information_of: Information of a view about the parameters.
+        variance_of: (camera, weights) -> (H, W) sum over the parameters of squared derivatives times weights.
         prior: lambda.
     """
 
     def __init__(
         self,
         cameras: Sequence[Camera],
-        said: Callable[[Camera], Information],
-        mapped: Callable[[Camera, Information], np.ndarray],
+        information_of: Callable[[Camera], Information],
+        variance_of: Callable[[Camera, Information], np.ndarray],
         prior: Prior,
     ) -> None:
         self.cameras = tuple(cameras)
-        self._said = said
-        self._mapped = mapped
+        self._information_of = information_of
+        self._variance_of = variance_of
         self._prior = prior
         self.done = 0
         self._sum: dict[str, torch.Tensor] = {}
         self._weights: Information | None = None
 
     @property
-    def is_known(self) -> bool:
+    def is_complete(self) -> bool:
         """Whether all views have been added."""
         return self.done == len(self.cameras)
 
     @property
-    def is_sketched(self) -> bool:
+    def has_map(self) -> bool:
         """Whether there is a map, if only a sketch."""
         return self._weights is not None
 
-    def learn(self, told: Callable[[], None], sketch: bool = True) -> Iterator[None]:
+    def add_views(self, progress: Callable[[], None], sketch: bool = True) -> Iterator[None]:
         """Sketch the map, if there is none, then add the views that are not added yet, one a step.
 
         Args:
-            told: Called after the sketch and each view.
+            progress: Called after the sketch and each view.
             sketch: Whether somebody waits for a sketch; of few small views there is none.
         """
-        few = len(self.cameras) <= _VIEWS and max(x.width * x.height for x in self.cameras) <= _PIXELS
-        if sketch and not few and not self.is_sketched:
+        few = len(self.cameras) <= _SKETCH_VIEWS and max(x.width * x.height for x in self.cameras) <= _SKETCH_PIXELS
+        if sketch and not few and not self.has_map:
             yield from self._sketch()
-            told()
+            progress()
             yield
         while self.done < len(self.cameras):
             camera = self.cameras[self.done]
@@ -337,25 +337,25 @@ class Uncertainty:
             if self.done == len(self.cameras):
                 self._weights = variances(self._sum, self._prior)
                 self._sum = {}
-            told()
+            progress()
             yield
 
     def _sketch(self) -> Iterator[None]:
         """Add up few pixels of few views, evenly spaced, each for those of all that it stands for."""
         total: dict[str, torch.Tensor] = {}
-        count = min(len(self.cameras), _VIEWS)
+        count = min(len(self.cameras), _SKETCH_VIEWS)
         for k in range(count):
             camera = self.cameras[k * len(self.cameras) // count]
-            small = at_most(camera, _PIXELS)
+            small = at_most(camera, _SKETCH_PIXELS)
             stands_for = len(self.cameras) / count * (camera.width * camera.height) / (small.width * small.height)
             add(total, {name: x * stands_for for name, x in self._of(small).items()})
             yield
         self._weights = variances(total, self._prior)
 
     def _of(self, camera: Camera) -> Information:
-        said = self._said(camera)
-        check(f"view: {camera.name}", said)
-        return said
+        information = self._information_of(camera)
+        check(f"view: {camera.name}", information)
+        return information
 
     def map(self, camera: Camera) -> np.ndarray:
         """(H, W) predictive variance of a view's pixels, for unit noise.
@@ -365,4 +365,4 @@ class Uncertainty:
         """
         if self._weights is None:
             raise RuntimeError(f"view: all {len(self.cameras)} views must be added first, {self.done} are")
-        return self._mapped(camera, self._weights)
+        return self._variance_of(camera, self._weights)

@@ -23,11 +23,11 @@ _log = logging.getLogger(__name__)
 
 _NEAR = 1e-3  # times the distance to what is looked at: where the client's pictures begin
 # Times that distance: where they end. A skybox is up to 200 extents of the cameras away, of which what is looked at may
-# be a small part. What is near is told apart by the nearer number alone.
+# be a small part. What is near is resolved by the nearer number alone.
 _FAR = 1e5
 # Keys of jobs that can wait.
-_LEARNING = "uncertainty"
-_LEFT = "what browsers have left"
+_UNCERTAINTY_JOB = "uncertainty"
+_FREEING_JOB = "memory of closed browsers"
 
 
 class Viewer:
@@ -62,12 +62,12 @@ class Viewer:
             self._preset = preset
             self._pixels = pixels
             self.sessions: dict[int, Session] = {}
-            self._learnt: Subject | None = None  # the last one whose uncertainty is known
+            self._latest_complete: Subject | None = None  # the last one whose uncertainty is known
             self._server = gated_server(self.gate, listening, host)
         except BaseException:
             listening.close()
             raise
-        self._server.get_event_loop().set_exception_handler(self._misunderstood)
+        self._server.get_event_loop().set_exception_handler(self._on_loop_error)
         self.worker = Worker(self._failed)
         self._place()
         self._server.on_client_connect(self._connected)
@@ -108,13 +108,19 @@ class Viewer:
 
     async def _connected(self, client: Any) -> None:
         self.sessions[client.client_id] = Session(
-            client, self.subject, self.worker, self._preset, self._pixels, self._learn, lambda: self._learnt
+            client,
+            self.subject,
+            self.worker,
+            self._preset,
+            self._pixels,
+            self._want_uncertainty,
+            lambda: self._latest_complete,
         )
 
     async def _disconnected(self, client: Any) -> None:
         if session := self.sessions.pop(client.client_id, None):
             session.close()
-            self.worker.put(_LEFT, self._freeing(), can_wait=True)
+            self.worker.put(_FREEING_JOB, self._freeing(), can_wait=True)
 
     @staticmethod
     def _freeing() -> Iterator[None]:
@@ -124,32 +130,32 @@ class Viewer:
         gc.collect()
         yield
 
-    def _learn(self) -> None:
-        """Have the information of the photographs added up, if nobody has asked for it yet."""
+    def _want_uncertainty(self) -> None:
+        """Begin to add up the information of the photographs, unless that is done or under way."""
         uncertainty = self.subject.uncertainty
-        if uncertainty is not None and not uncertainty.is_known and not self.worker.has(_LEARNING):
-            self.worker.put(_LEARNING, self._learning(), can_wait=True)
+        if uncertainty is not None and not uncertainty.is_complete and not self.worker.has(_UNCERTAINTY_JOB):
+            self.worker.put(_UNCERTAINTY_JOB, self._adding_up(), can_wait=True)
 
-    def _learning(self) -> Iterator[None]:
-        """Job: the information of the photographs; whoever waits for it is told how far it is.
+    def _adding_up(self) -> Iterator[None]:
+        """Job: the information of the photographs; panels that show the layer say how far it is.
 
         What was begun of a checkpoint is finished though a fit has gone on since, and its map shown; then it is the
         newest one's turn. A fit that saves faster than this would else never have a map.
         """
         while True:
             subject = self.subject
-            if (uncertainty := subject.uncertainty) is None or uncertainty.is_known:
+            if (uncertainty := subject.uncertainty) is None or uncertainty.is_complete:
                 return
-            told = functools.partial(self._tell, subject, uncertainty)
-            told()
+            say_progress = functools.partial(self._say_progress, subject, uncertainty)
+            say_progress()
             yield
-            shown = uncertainty.is_sketched
-            for _ in uncertainty.learn(told, sketch=self._learnt is None):
-                if uncertainty.is_sketched and not uncertainty.is_known and not shown:
+            shown = uncertainty.has_map
+            for _ in uncertainty.add_views(say_progress, sketch=self._latest_complete is None):
+                if uncertainty.has_map and not uncertainty.is_complete and not shown:
                     shown = True
                     self._redraw()
                 yield
-            self._learnt = subject
+            self._latest_complete = subject
             self._redraw()
             if not self._waiting():
                 return
@@ -158,10 +164,10 @@ class Viewer:
         """Draw the map once more in each browser that shows it."""
         self._each(lambda session: session.redraw() if session.layer.name == UNCERTAINTY else None)
 
-    def _tell(self, subject: Subject, uncertainty: Uncertainty) -> None:
-        """Tell those who wait for it how many photographs have been added."""
+    def _say_progress(self, subject: Subject, uncertainty: Uncertainty) -> None:
+        """Say in the panels of those who wait for it how many photographs have been added."""
         of = f" of {subject.state}" if subject.state else ""
-        if uncertainty.is_sketched and not uncertainty.is_known:
+        if uncertainty.has_map and not uncertainty.is_complete:
             of += ", a sketch of few pixels"
         for session in self._waiting():
             session.say(
@@ -182,13 +188,13 @@ class Viewer:
             self._server.get_event_loop().call_soon_threadsafe(run)
 
     @staticmethod
-    def _misunderstood(_: Any, context: dict[str, Any]) -> None:
+    def _on_loop_error(_: Any, context: dict[str, Any]) -> None:
         """A browser has sent what viser, or a session, could not make anything of: a line in the log."""
         error = context.get("exception")
         _log.warning("view: %s", context.get("message") if error is None else in_a_line(error))
 
     def _failed(self, key: Hashable, error: Exception) -> None:
-        """A job has ended by an error: whose job it was is told, and the log."""
+        """A job has ended by an error: said in the log, and in the panel of the browser that it was for."""
         text = str(error) or type(error).__name__
         if not isinstance(error, (ValueError, OSError, NotImplementedError)):
             _log.warning("view: %s", text, exc_info=error)

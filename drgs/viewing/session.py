@@ -47,7 +47,7 @@ _WAY_COLOR = (240, 60, 60)
 _FRUSTUM = 0.05  # size of a camera's frustum, of its distance to what is looked at
 _COVERS = 0.5  # share of half a view's narrower side: a frustum that reaches farther is hidden
 _NARROW = 576  # pixels of a window that viser lays its panel over, as over a phone's
-_MOMENTS = 48  # times in a round of playing, at most
+_ROUND = 48  # times in a round of playing, at most
 _FOVS = 1.0, 150.0  # degrees of a keyframe: such as files have, and no wider than our pictures
 _UNKNOWN = 640, 480  # pixels of a window that has not said how large it is
 _PAUSE = 0.08  # seconds between two of them, at least
@@ -63,7 +63,7 @@ class Session:
         preset: Preset that our pictures are drawn by at first.
         pixels: Largest number of pixels of a picture.
         wants: Function that is called when the layer needs what is not known yet.
-        learnt: Function that returns the last subject whose uncertainty is known; None before there is one.
+        latest_complete: Function that returns the last subject whose uncertainty is known; None before there is one.
     """
 
     def __init__(
@@ -74,14 +74,14 @@ class Session:
         preset: str,
         pixels: int,
         wants: Callable[[], None],
-        learnt: Callable[[], Subject | None],
+        latest_complete: Callable[[], Subject | None],
     ) -> None:
         self.client = client
         self.subject = subject
         self._worker = worker
         self._pixels = pixels
         self._wants = wants
-        self._learnt = learnt
+        self._latest_complete = latest_complete
         self._loop = asyncio.get_running_loop()
         self._lock = threading.Lock()  # of what follows: the worker's thread asks whether its picture is still wanted
         self._wanted = 0  # number of the picture that is wanted; another one's is left
@@ -95,7 +95,7 @@ class Session:
         self._frusta: list[Any] = []
         self._reach = 0.0  # of a frustum, from its tip
         self._ways: Any = None  # arrows to places for next photographs
-        self.time = subject.moment(None)
+        self.time = subject.nearest_time(None)
         self._slider: Any = None
         self._button: Any = None
         self.pose, self.size = self._seen_pose() or (subject.first.pose, _UNKNOWN)
@@ -176,11 +176,11 @@ class Session:
         names = tuple(layer.name for layer in subject.layers)
         if names != tuple(self._layer.options):
             self._layer.options = names
-        if keeps := self._lacks_uncertainty() and self._learnt() is not None:
+        if keeps := self._lacks_uncertainty() and self._latest_complete() is not None:
             self._wants()  # an earlier checkpoint's map, and what is half drawn of it, stays until there is another
         else:
             self._hide()
-        self.time = subject.moment(self.time)
+        self.time = subject.nearest_time(self.time)
         self._flight.forget(len(subject.times) > 0)
         if subject.times != before.times:
             self._build_times()
@@ -238,7 +238,7 @@ class Session:
     async def _time_chosen(self, _: Any) -> None:
         if self._slider is None:  # what the browser sent before it knew that nothing moves any longer
             return
-        wanted = self.subject.moment(float(self._slider.value))
+        wanted = self.subject.nearest_time(float(self._slider.value))
         if wanted != self.time:
             self.time = wanted
             self._hide()
@@ -265,12 +265,12 @@ class Session:
         """Go through all times, again and again, as fast as the Gaussians of each can be sent."""
         assert self._slider is not None
         first, last = self.subject.times[0], self.subject.times[-1]
-        count = min(_MOMENTS, len(self.subject.times))
-        moments = np.linspace(first, last, max(count, 2))
-        at = int(np.searchsorted(moments, self.time or first))
+        count = min(_ROUND, len(self.subject.times))
+        times = np.linspace(first, last, max(count, 2))
+        at = int(np.searchsorted(times, self.time or first))
         while True:
-            at = (at + 1) % len(moments)
-            self.time = float(moments[at])
+            at = (at + 1) % len(times)
+            self.time = float(times[at])
             self._slider.value = self.time
             self._hide()
             self._send_gaussians()
@@ -371,7 +371,7 @@ class Session:
         self.pose, self.size = self._seen_pose() or (pose, self.size)  # what it sends back is no movement of its own
         self._show_frusta()
         if self._slider is not None and sight.camera.time is not None and self._playing is None:
-            self._slider.value = self.subject.moment(sight.camera.time)
+            self._slider.value = self.subject.nearest_time(sight.camera.time)
         self._hide()
         self._ask_later()
         self._about.content = panel.photograph(placed, sight)
@@ -399,7 +399,7 @@ class Session:
         if self._slider is not None and key.time is not None:
             self._stop_playing()
             if is_last or not self._worker.has((self, "gaussians")):
-                self._slider.value = self.subject.moment(key.time)
+                self._slider.value = self.subject.nearest_time(key.time)
         self._ask_later()
 
     def _read_photograph(self, read: Callable[[int], np.ndarray]) -> Iterator[None]:
@@ -425,9 +425,9 @@ class Session:
     def _send_gaussians(self) -> None:
         self._worker.put((self, "gaussians"), self._gaussians_sent(self.subject, self.layer, self.time))
 
-    def _gaussians_sent(self, subject: Subject, layer: Layer, moment: float | None) -> Iterator[None]:
+    def _gaussians_sent(self, subject: Subject, layer: Layer, time: float | None) -> Iterator[None]:
         """Job: the Gaussians of a time to the client, in the colors of the layer where it has any for them."""
-        seen = subject.scene.at(moment)
+        seen = subject.scene.at(time)
         found = ClientGaussians.of(seen, tinted(layer, seen))
         arrays = found.centers, found.covariances, found.rgbs, found.opacities
         with self._lock, self.client.atomic():
@@ -479,17 +479,17 @@ class Session:
         subject = self.subject
         if self._lacks_uncertainty():
             self._wants()
-            earlier = self._learnt()
+            earlier = self._latest_complete()
             if earlier is not None and earlier.layer(UNCERTAINTY).name == UNCERTAINTY:
                 subject = earlier
-            elif subject.uncertainty is None or not subject.uncertainty.is_sketched:
+            elif subject.uncertainty is None or not subject.uncertainty.has_map:
                 return
         with self._lock:
             self._wanted += 1
             wanted = self._wanted
         # What is drawn is settled here: when the job begins, another subject may be looked at, at another time.
         pose = dataclasses.replace(self.pose, position=self.pose.position + self.subject.origin)
-        whole = camera_of(pose, *self.size, np.zeros(3), subject.moment(self.time))
+        whole = camera_of(pose, *self.size, np.zeros(3), subject.nearest_time(self.time))
         steps = self._picture(wanted, subject, whole, subject.layer(self.layer.name), self._preset.value)
         self._worker.put((self, "picture"), steps)
 
@@ -566,7 +566,7 @@ class Session:
     def _lacks_uncertainty(self) -> bool:
         """Whether what is to be shown is not known yet."""
         uncertainty = self.subject.uncertainty
-        return self.layer.name == UNCERTAINTY and uncertainty is not None and not uncertainty.is_known
+        return self.layer.name == UNCERTAINTY and uncertainty is not None and not uncertainty.is_complete
 
     def _seen_pose(self) -> tuple[Pose, tuple[int, int]] | None:
         """Pose of the client's camera and pixels of its window; None where it has said nothing that is one."""

@@ -76,7 +76,7 @@ class Subject:
     background: tuple[float, float, float]
     notes: tuple[str, ...] = ()
 
-    def moment(self, time: float | None) -> float | None:
+    def nearest_time(self, time: float | None) -> float | None:
         """The time at which it is looked at by who wants a time: one that it has; None where nothing moves.
 
         Args:
