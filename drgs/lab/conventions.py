@@ -25,7 +25,7 @@ from drgs.oracle import activate, float64, rolling_poses, screen_rows
 from drgs.settings import RenderSettings
 from drgs.shutters import SHUTTERS
 
-__all__ = ["BETWEEN", "DISTORTIONS", "LEAST", "ORDERS", "Finding", "Found", "ReferenceModel", "find"]
+__all__ = ["BETWEEN", "DISTORTIONS", "LEAST", "ORDERS", "Finding", "SearchResult", "ReferenceModel", "find"]
 
 ORDERS = ("rgb", "bgr", "rbg", "grb", "gbr", "brg")
 BETWEEN = "to the mean, from between both poses"  # as gsplat has it
@@ -424,7 +424,7 @@ def find(
     near_ties: Callable[[ReferenceModel], torch.Tensor],
     settled: float = 1e-5,
     suits: Callable[[ReferenceModel], bool] = lambda model: True,
-) -> Found:
+) -> SearchResult:
     """The model whose image is nearest to a given one, and what is unusual about it.
 
     Variations are added one at a time, each time the one that explains most of what is left, as long as that is at
@@ -475,7 +475,7 @@ def find(
         changed = _changed(model, field, usual, start)
         without = distance(changed if suits(changed) else start)
         findings.append(Finding(name, _text(usual), _text(_get(model, field)), without, distance(model), groups))
-    return Found(start, model, distance(start), distance(model), findings)
+    return SearchResult(start, model, distance(start), distance(model), findings)
 
 
 def _countable(ties: torch.Tensor) -> torch.Tensor:
@@ -484,8 +484,8 @@ def _countable(ties: torch.Tensor) -> torch.Tensor:
 
 
 @dataclasses.dataclass(frozen=True)
-class Found:
-    """What `find` found.
+class SearchResult:
+    """What `find` returns.
 
     Attributes:
         start: The preset.

@@ -9,7 +9,7 @@ to be made on purpose may explain it; else the rasterizer's own central differen
     known deviation    it is the model's with a documented choice: view direction detached, clamped alpha passed through
     gradient bug       it disagrees with the rasterizer's own differences, or is not finite
     model difference   it agrees with them, and the model is another one
-    undecided          too few differences converged, or a dump cannot be asked
+    undecided          too few differences converged, or a dump has none
 
 The verdict of the whole is the worst of them; `other convention` if only conventions differ from what was claimed. What
 a rasterizer has no gradient of is not offered, and said so.
@@ -41,9 +41,9 @@ __all__ = ["VERDICTS", "Crop", "Result", "crops", "crossval"]
 VERDICTS = ("gradient bug", "undecided", "model difference", "other convention", "known deviation", "agreement")
 _STARTS = ("gsplat", "inria", "3dgut", "fast", "exact", "mitsuba")  # the first of equally near ones is taken
 _ORACLE_PAIRS = 4_000_000  # (pixel, Gaussian) pairs of a scene that the oracle takes as it is
-_TOLERANCE = {torch.float64: 5e-4, torch.float32: 5e-3}
+_TOLERANCE = {torch.float64: 5e-4, torch.float32: 5e-3}  # relative L2 difference of gradients that agree
 _SETTLED = {torch.float64: 1e-5, torch.float32: 1e-4}  # RMS of images that differ by rounding and its cut-offs
-_ALPHA = 1e-4  # a mean difference of alpha that is worth a word
+_ALPHA = 1e-4  # mean difference of alpha from which on it is reported
 _SIDES = (32, 16, 8)  # pixels of a crop, the largest that the oracle can take
 _STEP = 16  # pixels between the places that are tried for a crop: a rasterizer's tiles stay where they are
 _CROP_PAIRS = 1_000_000  # (pixel, Gaussian) pairs of a crop that take the oracle seconds: image and gradient, by CPU
@@ -62,10 +62,10 @@ class Crop:
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """What `crossval` found.
+    """What `crossval` returns.
 
     Attributes:
-        report: Everything that was found, JSON-serializable.
+        report: All of the comparison, JSON-serializable.
         images: A dict a view: `rasterizer`, `model`, `exact` (H, W, 3) arrays.
         groups: Group -> its row, of each group whose gradient was compared.
         views: A row a view.
@@ -261,7 +261,7 @@ def _images(
 def _report(
     case: Case,
     comparison: Compared,
-    found: conventions.Found,
+    found: conventions.SearchResult,
     claimed: str,
     given: tuple[Gaussians, list[Camera]],
     places: list[Crop | None],
@@ -363,7 +363,7 @@ def crops(g: Gaussians, cameras: list[Camera], settings: RenderSettings) -> tupl
     """
     drawn = []
     for camera in cameras:
-        image, seen = _looked_at(g, camera, settings)
+        image, seen = _drawn_by_us(g, camera, settings)
         if bool(seen.any()):
             drawn.append((camera, image))
     if not drawn:
@@ -374,10 +374,10 @@ def crops(g: Gaussians, cameras: list[Camera], settings: RenderSettings) -> tupl
         in_crops = []
         for camera, image in drawn:
             width, height = min(camera.width, side), min(camera.height, side)
-            x, y = _liveliest(image, width, height)
+            x, y = _most_varied(image, width, height)
             parts.append(cropped(camera, x, y, width, height))
             places.append(Crop(x, y, width, height, [camera.width, camera.height]))
-            in_crops.append(_looked_at(g, parts[-1], settings)[1])
+            in_crops.append(_drawn_by_us(g, parts[-1], settings)[1])
         if max(int(x.sum()) for x in in_crops) * side**2 <= _CROP_PAIRS:
             break
     index = torch.nonzero(torch.stack(in_crops).any(0))[:, 0]
@@ -386,15 +386,15 @@ def crops(g: Gaussians, cameras: list[Camera], settings: RenderSettings) -> tupl
     return Gaussians(**fields, origin=g.origin), parts, places
 
 
-def _looked_at(g: Gaussians, camera: Camera, settings: RenderSettings) -> tuple[torch.Tensor, torch.Tensor]:
+def _drawn_by_us(g: Gaussians, camera: Camera, settings: RenderSettings) -> tuple[torch.Tensor, torch.Tensor]:
     """(H, W, 4) color and alpha, and (N,) bool: what is seen."""
-    with torch.no_grad():  # what is looked for is where to look
+    with torch.no_grad():  # a crop's place has no derivative
         out = render(g, camera, settings, outputs=("visibility",))
     assert out.visibility is not None  # asked for
     return torch.cat([out.rgb, out.alpha[..., None]], -1).cpu(), out.visibility.cpu() > 0
 
 
-def _liveliest(image: torch.Tensor, width: int, height: int) -> tuple[int, int]:
+def _most_varied(image: torch.Tensor, width: int, height: int) -> tuple[int, int]:
     """Corner (x, y) of the crop of an (H, W, 4) image whose colors and alpha vary most."""
     x = image.double().permute(2, 0, 1)[None]  # the difference of two squares cancels in float32 where little varies
 
@@ -415,7 +415,7 @@ def _wide_gradients(
     """Gradients of an image of D channels: the same Gaussians with plain colors (N, D) instead of SH.
 
     Rasterizers carry such channels along other paths than RGB (padding, chunks, a second pass), where gradients get
-    lost. One view is compared, on black. Of the geometry only what the RGB image has right is asked about again.
+    lost. One view is compared, on black. Of the geometry only what the RGB image has right is compared again.
 
     Args:
         case: What was compared in RGB.

@@ -425,12 +425,12 @@ def _not_finite() -> Attempts:
     for field in ("means", "quats", "log_scales", "logit_opacities", "sh", "features"):
         for value in (math.nan, math.inf, -math.inf):
             g = _with(field, value)
-            told = f"{field} must be finite"
+            message = f"{field} must be finite"
             for traversal in ("tiles", "bvh"):
                 settings = RenderSettings.preset("exact", traversal=traversal)
-                yield lambda g=g, settings=settings: render(g, cam, settings), told
+                yield lambda g=g, settings=settings: render(g, cam, settings), message
                 if field != "features":  # which information does not depend on
-                    yield lambda g=g, settings=settings: fisher.diagonal(g, cam, settings), told
+                    yield lambda g=g, settings=settings: fisher.diagonal(g, cam, settings), message
 
 
 def _zero_quaternion() -> Attempts:

@@ -237,9 +237,9 @@ def _transfers(case: _Case) -> Iterator[tuple]:
     encoded = np.where(low, 12.92 * right, 1.055 * np.maximum(right, 1e-9) ** (1 / 2.4) - 0.055)
     yield "transfer", "encoded as sRGB", encoded
     yield "transfer", "decoded as if it were sRGB", np.where(high, right / 12.92, ((right + 0.055) / 1.055) ** 2.4)
-    told = case.counts & ((right > 0.01) & (np.abs(right - 1) > 0.01) & (case.wrong > 0.01)).all(-1)
-    if told.any():
-        power = float(np.median(np.log(case.wrong[told]) / np.log(right[told])))
+    usable = case.counts & ((right > 0.01) & (np.abs(right - 1) > 0.01) & (case.wrong > 0.01)).all(-1)
+    if usable.any():
+        power = float(np.median(np.log(case.wrong[usable]) / np.log(right[usable])))
         if 0.1 < power < 10:
             yield "transfer", f"to the power of {power:.3g}", right**power
 

@@ -91,7 +91,7 @@ class Rasterizer:
             moving = [name for name in MOTIONS if name in raw]
             if not moving:
                 raise
-            # It may make an array of the pose, or refuse one that wants a gradient: the others are asked for alone.
+            # It may make an array of the pose, or refuse one that wants a gradient: the others are taken alone.
             fixed = {name: x for name, x in raw.items() if name not in MOTIONS}
             return {**self.gradient(fixed, camera, background, cotangent), **dict.fromkeys(moving)}
         # Gradients are numbers from here on; a function may have asked for a graph of them.
@@ -121,7 +121,7 @@ def load_rasterizer(
         g: Scene that a dump must be of.
         cameras: Views that a dump must be of.
         fields: Settings that hold whatever the preset is: ours are drawn with them, a dump is of their background.
-        along_rays: Whether a function is asked for Gaussians along rays (`with_ut`, `with_eval3d`), as it always is
+        along_rays: Whether a function is called for Gaussians along rays (`with_ut`, `with_eval3d`), as it always is
             for a lens or a rolling shutter.
     Returns:
         A `Rasterizer` or a `Dump`.
@@ -166,7 +166,7 @@ def function(call: Callable, name: str, along_rays: bool = False) -> Rasterizer:
     Args:
         call: The function.
         name: Its name in messages.
-        along_rays: Whether it is asked for Gaussians along rays, as `load_rasterizer` says.
+        along_rays: Whether it is called for Gaussians along rays, as `load_rasterizer` says.
     """
     accepted = inspect.signature(call).parameters
     open_ended = any(p.kind is p.VAR_KEYWORD for p in accepted.values())
@@ -263,7 +263,7 @@ def _taste(draw: Callable) -> tuple[torch.dtype, str]:
     problem = None
     for dtype, device in places:
         try:
-            with torch.no_grad():  # asked only whether it draws
+            with torch.no_grad():  # only whether it draws is of interest
                 image, _ = draw({k: x.to(device, dtype) for k, x in raw.items()}, camera, (0.0, 0.0, 0.0))
             if image.dtype == dtype:
                 return dtype, device
@@ -293,7 +293,7 @@ def _checked(name: str, returned: object, camera: Camera, channels: int) -> tupl
 # -------------------------------------------------------------------------------------------- scenes and dumps as files
 
 SUFFIXES = (".npz", ".safetensors")
-_EXPORT = "drgs_export"  # an array by which an export can be told from a dump, which holds more
+_EXPORT = "drgs_export"  # an array that an export has, and a dump, which holds more, has not
 _POSE = "grad_viewmat"  # (C, 4, 4); may be left out
 _LARGEST = 4 << 30  # bytes of a dump
 

@@ -152,7 +152,7 @@ def row_of(case: ExtremeCase, traversal: str, truth: Truth) -> StressRow:
         errors = compare(g, cam, settings, oracle)
         information, sound, remark = _information(case, settings, truth)
     seconds = time.perf_counter() - start
-    told = sorted({str(w.message) for w in caught if "traversal='tiles'" in str(w.message)})
+    messages = sorted({str(w.message) for w in caught if "traversal='tiles'" in str(w.message)})
     group = max(errors.gradient, key=errors.gradient.get)
     values = {
         "image": max(errors.image.values(), default=0.0),
@@ -170,10 +170,10 @@ def row_of(case: ExtremeCase, traversal: str, truth: Truth) -> StressRow:
     # A comparison with NaN is False: what is not a number is not within a bound.
     broken = [f"{n} {x:.1e} > {bounds[n]:.0e}" for n, x in values.items() if x is not None and not x <= bounds[n]]
     expected = traversal == "bvh" and case.bvh == "warns"
-    if expected and told and finite:
+    if expected and messages and finite:
         verdict = "warns"
         broken = []
-    elif expected != bool(told):
+    elif expected != bool(messages):
         verdict = "FAILS"
         broken = [*broken, "no warning" if expected else "a warning without need"]
     else:
@@ -183,7 +183,7 @@ def row_of(case: ExtremeCase, traversal: str, truth: Truth) -> StressRow:
         *broken,
         case.remark,
         limits,
-        *told,
+        *messages,
         f"{ties:.2g} % of pixels near a tie, left out" if ties else "",
         remark,
     )
@@ -290,19 +290,19 @@ def refused(case: Refusal) -> StressRow:
     message = ""
     for call, text in case.attempts():
         count += 1
-        told = []
+        messages = []
         result = None
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             try:
                 result = call()
             except ValueError as error:
-                told = [] if case.warns else [str(error)]
+                messages = [] if case.warns else [str(error)]
         if case.warns:
-            told = [str(w.message) for w in caught]
-        message = next((x for x in told if text in x and "\n" not in x), "")
+            messages = [str(w.message) for w in caught]
+        message = next((x for x in messages if text in x and "\n" not in x), "")
         if not message:
-            got = told or f"{type(result).__name__} without a word"
-            return StressRow(case.name, "all", remark=f"attempt {count}: must be told {text!r}, got {got}")
+            got = messages or f"{type(result).__name__} without a word"
+            return StressRow(case.name, "all", remark=f"attempt {count}: must say {text!r}, got {got}")
     seconds = time.perf_counter() - start
     return StressRow(case.name, "all", verdict="warns", remark=f"{count} attempts, e.g. {message}", seconds=seconds)

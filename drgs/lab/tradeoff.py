@@ -451,7 +451,7 @@ class Advice:
     rounds: int | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """The advice as tradeoff.json holds it: what was not found has no numbers."""
+        """The advice as tradeoff.json holds it: what there is no setting for has no numbers."""
         value = dataclasses.asdict(self)
         return value if self.name else {k: value[k] for k in ("use", "budget", "clock", "name", "gain", "reason")}
 
@@ -547,8 +547,8 @@ _Result = TypeVar("_Result")
 # ------------------------------------------------------------------------------------------------------------ measuring
 
 _SECONDS = 100.0  # rounds end after so many of the clock or, where others use the machine, of the processor
-_AT_LEAST = 3  # rounds, before which they do not end
-_RAYS = 200  # rays of a sample on Mitsuba's traversal
+_AT_LEAST = 3  # rounds, before which they do not end: fewer have no middle
+_RAYS = 200  # rays of a sample on Mitsuba's traversal, where a whole view without cut-offs takes minutes
 _PAIRS = 6_000_000  # (ray, Gaussian) pairs of the oracle's sample: 10 s
 _NOTHING = 1e-6  # alpha of a view that shows nothing
 
@@ -571,20 +571,20 @@ def measure(
         fields: Settings that hold in every row that does not say otherwise.
         repeats: Rounds of timing at most; they end after 100 seconds if three are done.
         seed: Seed of the cotangents, of the samples of pixels and of the order within a round.
-        advance: Called after each turn.
+        advance: Called after each measurement.
     Returns:
         A row for each of `variants`. Where there is no number there is None, and the reason in `skipped` or `notes`.
     Raises:
         ValueError: If no view shows a Gaussian, or the truth cannot be computed.
     """
     gaussians = placed(gaussians)
-    stage = _Stage(gaussians, cameras, seed)
+    setup = _Setup(gaussians, cameras, seed)
     rows = rows_of(variants, fields or {})
-    turns = [_Turn(row, stage) for row in rows if row.skipped is None and row.by == "view"]
-    truth = turns[0]
-    others = turns[1:]
+    measurements = [_Measurement(row, setup) for row in rows if row.skipped is None and row.by == "view"]
+    truth = measurements[0]
+    others = measurements[1:]
     # The truth once more in every round: how much equal work scatters.
-    again = _Turn(dataclasses.replace(truth.row), stage)
+    again = _Measurement(dataclasses.replace(truth.row), setup)
     others.append(again)
     order = random.Random(seed)
     done = 0
@@ -595,17 +595,17 @@ def measure(
         spent = min(time.perf_counter() - began[0], time.process_time() - began[1])
         if number >= len(cameras) and done >= _AT_LEAST and spent > _SECONDS:
             break
-        truth.take(number, timed)
+        truth.measure(number, timed)
         if number == 0:
-            stage.check(truth.settings)
-        for turn in order.sample(others, len(others)):
-            turn.take(number, timed)
+            setup.check(truth.settings)
+        for measurement in order.sample(others, len(others)):
+            measurement.measure(number, timed)
             advance()
         advance()
         done += timed
-    for turn in (*turns, again):
-        turn.finish(truth)
-    own = _sampled(rows, stage, truth, seed)
+    for measurement in (*measurements, again):
+        measurement.finish(truth)
+    own = _sampled(rows, setup, truth, seed)
     for row in rows:
         row.errors = row.bound(own)
     pixels = statistics.mean(camera.width * camera.height for camera in cameras)
@@ -615,26 +615,26 @@ def measure(
 def placed(gaussians: Gaussians) -> Gaussians:
     """Gaussians on the device that they are rendered on, without a graph."""
     device = "cuda" if runtime.backend().name == "cuda" else "cpu"
-    # Forward times are of images without derivatives; the leaves of the others are made of these (`_Stage`).
+    # Forward times are of images without derivatives; the leaves of the others are made of these (`_Setup`).
     return gaussians.replace(**{k: x.detach().to(device) for k, x in gaussians.parameters().items()})
 
 
 @dataclasses.dataclass(frozen=True)
-class _Answer:
-    """What a setting makes of a view.
+class _ViewResult:
+    """What a setting gives for one view.
 
     Attributes:
         image: (H, W, 3) colors, on the CPU.
-        slopes: J^T u by group.
+        gradients: J^T u by group.
         information: The Fisher diagonal by group; None where the setting has none.
     """
 
     image: torch.Tensor
-    slopes: Tensors
+    gradients: Tensors
     information: Tensors | None
 
 
-class _Stage:
+class _Setup:
     """What all settings are measured on: Gaussians, views, cotangents, and the truth about each view once it is known.
 
     Attributes:
@@ -653,7 +653,7 @@ class _Stage:
         self.cotangents = [
             (torch.randint(0, 2, size, generator=generator) * 2 - 1).float().to(device) for size in sizes
         ]
-        self.truth: dict[int, _Answer] = {}
+        self.truth: dict[int, _ViewResult] = {}
         self.shown = False
         self.sampled = 0
 
@@ -682,7 +682,7 @@ class _Stage:
         count = len(self.cameras)
         raise ValueError(f"tradeoff: one of {count} cameras must show a Gaussian, all are empty; choose others")
 
-    def pull(self, image: torch.Tensor, cotangent: torch.Tensor) -> Tensors:
+    def gradient(self, image: torch.Tensor, cotangent: torch.Tensor) -> Tensors:
         """J^T u by group."""
         found = torch.autograd.grad((image * cotangent).sum(), list(self.leaves.values()), allow_unused=True)
         pairs = zip(self.leaves.items(), found, strict=True)
@@ -693,55 +693,55 @@ class _Stage:
         return scaled_diagonal(self.gaussians, camera, settings, share)
 
 
-class _Turn:
+class _Measurement:
     """One row's measurements, view by view and round by round."""
 
-    def __init__(self, row: TradeoffRow, stage: _Stage):
+    def __init__(self, row: TradeoffRow, setup: _Setup):
         self.row = row
-        self.stage = stage
+        self.setup = setup
         self.settings = row.settings
         self.seconds = {name: {} for name in CLOCKS}
         self.pixels = []
-        self.slopes = {}
-        self.parts = {}
+        self.gradients = {}
+        self.diagonals = {}
         self.medians = {}
         self.first = 0.0
 
-    def take(self, number: int, timed: bool) -> None:
+    def measure(self, number: int, timed: bool) -> None:
         """Render, differentiate and inform one view; errors if it is new."""
         if self.row.skipped is not None:
             return
         try:
-            self._take(number, timed)
+            self._measure(number, timed)
         except (ValueError, NotImplementedError, OSError, RuntimeError) as error:
-            if number % len(self.stage.cameras) not in self.stage.truth:
+            if number % len(self.setup.cameras) not in self.setup.truth:
                 raise  # this is the truth
             self.row.skipped = why_skipped(error)
 
-    def _take(self, number: int, timed: bool) -> None:
-        """`take`, unless the row is skipped.
+    def _measure(self, number: int, timed: bool) -> None:
+        """`measure`, unless the row is skipped.
 
         Raises:
             ValueError, NotImplementedError, OSError, RuntimeError: If the setting cannot be, or gives no numbers.
         """
-        stage = self.stage
-        view = number % len(self.stage.cameras)
+        setup = self.setup
+        view = number % len(self.setup.cameras)
         share = self.row.share
-        camera = stage.cameras[view]
+        camera = setup.cameras[view]
         took = {}
         with torch.no_grad():  # what an image alone takes
-            _, took["forward"] = clocked(lambda: stage.image(stage.gaussians, camera, self.settings, share).cpu())
+            _, took["forward"] = clocked(lambda: setup.image(setup.gaussians, camera, self.settings, share).cpu())
 
         def both():
-            image = stage.image(stage.moving, camera, self.settings, share)
-            # The image is looked at only: its graph is that of `pull`.
-            return image.detach().cpu(), stage.pull(image, stage.cotangents[view])
+            image = setup.image(setup.moving, camera, self.settings, share)
+            # The image is looked at only: its graph is that of `gradient`.
+            return image.detach().cpu(), setup.gradient(image, setup.cotangents[view])
 
-        (image, slopes), took["forward_backward"] = clocked(both)
-        parts = None
+        (image, gradients), took["forward_backward"] = clocked(both)
+        diagonal = None
         if "information" not in self.row.notes:
             try:
-                parts, took["fisher"] = clocked(lambda: stage.information(camera, self.settings, share))
+                diagonal, took["fisher"] = clocked(lambda: setup.information(camera, self.settings, share))
             except NotImplementedError as error:
                 self.row.notes["information"] = why_skipped(error)
         if number == 0:
@@ -749,37 +749,37 @@ class _Turn:
         if timed:
             for name, seconds in took.items():
                 self.seconds[name][number] = seconds
-        if number < len(stage.cameras):
-            if not all(bool(torch.isfinite(x).all()) for x in (image, *slopes.values(), *(parts or {}).values())):
+        if number < len(setup.cameras):
+            if not all(bool(torch.isfinite(x).all()) for x in (image, *gradients.values(), *(diagonal or {}).values())):
                 raise ValueError(f"{self.row.name}: must be finite, view {camera.name or view} has NaN or Inf")
-            seen = _Answer(image, slopes, parts)
-            self._compare(stage.truth.setdefault(view, seen), seen)
+            result = _ViewResult(image, gradients, diagonal)
+            self._compare(setup.truth.setdefault(view, result), result)
 
-    def _compare(self, truth: _Answer, seen: _Answer) -> None:
+    def _compare(self, truth: _ViewResult, result: _ViewResult) -> None:
         """Add one view's differences from the truth: sizes of pixels', sums by group, medians of entries."""
         # In float64 from here on: squares of differences of 1e-6 are summed over all pixels.
-        self.pixels.append((seen.image - truth.image).abs().double().reshape(-1).numpy())
-        for name, x in seen.slopes.items():
-            a, b = self.slopes.get(name, (0.0, 0.0))
-            y = truth.slopes[name]
-            self.slopes[name] = a + _squares(x - y), b + _squares(y)
-        for name, x in (seen.information or {}).items() if truth.information else ():
+        self.pixels.append((result.image - truth.image).abs().double().reshape(-1).numpy())
+        for name, x in result.gradients.items():
+            a, b = self.gradients.get(name, (0.0, 0.0))
+            y = truth.gradients[name]
+            self.gradients[name] = a + _squares(x - y), b + _squares(y)
+        for name, x in (result.information or {}).items() if truth.information else ():
             y = truth.information[name]
-            a, b = self.parts.get(name, (0.0, 0.0))
-            self.parts[name] = a + float((x - y).abs().sum()), b + float(y.sum())
+            a, b = self.diagonals.get(name, (0.0, 0.0))
+            self.diagonals[name] = a + float((x - y).abs().sum()), b + float(y.sum())
             known = y > _UNSEEN * y.max()
             if bool(known.any()):
                 self.medians.setdefault(name, []).append(float(((x - y).abs()[known] / y[known]).median()))
 
-    def finish(self, truth: _Turn) -> None:
+    def finish(self, truth: _Measurement) -> None:
         """Fill the row."""
         if self.row.skipped is not None:
             return
         self.row.image = ImageError.of(np.concatenate(self.pixels))
-        self.row.gradient = GradientError.of(self.slopes)
-        if self.parts:
+        self.row.gradient = GradientError.of(self.gradients)
+        if self.diagonals:
             medians = {name: statistics.mean(x) for name, x in self.medians.items()}
-            self.row.information = InformationError.of(self.parts, medians)
+            self.row.information = InformationError.of(self.diagonals, medians)
         warm, times = {}, {}
         for name, x in self.seconds.items():
             both = x.keys() & truth.seconds[name].keys()
@@ -791,10 +791,10 @@ class _Turn:
         self.row.first_call = max(self.first - sum(x for x in warm.values() if x is not None), 0.0)
 
 
-def _sampled(rows: list[TradeoffRow], stage: _Stage, truth: _Turn, seed: int) -> WorstErrors:
+def _sampled(rows: list[TradeoffRow], setup: _Setup, truth: _Measurement, seed: int) -> WorstErrors:
     """Rows that are measured on a sample of one view's rays; errors of the truth against the oracle."""
-    camera = stage.cameras[stage.sampled]
-    count = len(stage.gaussians)
+    camera = setup.cameras[setup.sampled]
+    count = len(setup.gaussians)
     pixels = camera.width * camera.height
     places = torch.randperm(pixels, generator=torch.Generator().manual_seed(seed))
     own = WorstErrors()
@@ -804,7 +804,7 @@ def _sampled(rows: list[TradeoffRow], stage: _Stage, truth: _Turn, seed: int) ->
         wanted = _RAYS if row.by == "rays" else max(32, min(_RAYS, _PAIRS // count))
         chosen = places[:wanted].sort().values
         try:
-            found = _by_rays(row, stage, truth, chosen)
+            found = _by_rays(row, setup, truth, chosen)
         except (ValueError, NotImplementedError, OSError, RuntimeError) as error:
             row.skipped = why_skipped(error)
             continue
@@ -813,31 +813,31 @@ def _sampled(rows: list[TradeoffRow], stage: _Stage, truth: _Turn, seed: int) ->
     return own
 
 
-def _by_rays(row: TradeoffRow, stage: _Stage, truth: _Turn, chosen: torch.Tensor) -> WorstErrors:
+def _by_rays(row: TradeoffRow, setup: _Setup, truth: _Measurement, chosen: torch.Tensor) -> WorstErrors:
     """One row on some pixels of a view: errors against the truth's image, time scaled to all of them."""
-    camera = stage.cameras[stage.sampled]
+    camera = setup.cameras[setup.sampled]
     oracle = row.by == "oracle"
-    whole = stage.cotangents[stage.sampled]
+    whole = setup.cotangents[setup.sampled]
     pixels = camera.width * camera.height
-    forward, both = _tracer(stage, row.settings, chosen, oracle)
+    forward, both = _tracer(setup, row.settings, chosen, oracle)
     fixed = [0.0, 0.0]
     start = 0.0
     if not oracle:
         # The acceleration structure does not grow with the number of rays. The first call compiles.
-        few = _tracer(stage, row.settings, chosen[:1], oracle)
+        few = _tracer(setup, row.settings, chosen[:1], oracle)
         start = sum(clocked(work)[1] for work in few)
         fixed = [clocked(work)[1] for work in few]
     out, first = clocked(forward)
     good = ~out.ambiguous if oracle else torch.ones(len(chosen), dtype=torch.bool)
-    slopes, second = clocked(lambda: both(good))
-    off = (out.rgb.cpu().double() - stage.truth[stage.sampled].image.reshape(-1, 3)[chosen].double()).abs()
+    gradients, second = clocked(lambda: both(good))
+    off = (out.rgb.cpu().double() - setup.truth[setup.sampled].image.reshape(-1, 3)[chosen].double()).abs()
     row.image = ImageError.of(off[good].numpy().reshape(-1))
     u = torch.zeros_like(whole)
     u.reshape(-1, 3)[chosen[good]] = whole.reshape(-1, 3)[chosen[good]]
-    right = stage.pull(stage.image(stage.moving, camera, truth.settings, 1), u)
+    right = setup.gradient(setup.image(setup.moving, camera, truth.settings, 1), u)
     # Relative to whichever is the better of the two.
     row.gradient = GradientError.of(
-        {name: (_squares(slopes[name] - x), _squares(slopes[name] if oracle else x)) for name, x in right.items()}
+        {name: (_squares(gradients[name] - x), _squares(gradients[name] if oracle else x)) for name, x in right.items()}
     )
     times = [a + max(b - a, 0.0) * pixels / len(chosen) for a, b in zip(fixed, (first, second), strict=True)]
     names = ("forward", "forward_backward")
@@ -857,10 +857,10 @@ def _by_rays(row: TradeoffRow, stage: _Stage, truth: _Turn, chosen: torch.Tensor
 
 
 def _tracer(
-    stage: _Stage, settings: RenderSettings, chosen: torch.Tensor, oracle: bool
+    setup: _Setup, settings: RenderSettings, chosen: torch.Tensor, oracle: bool
 ) -> tuple[Callable[[], Output], Callable[..., Tensors]]:
     """Functions that trace these pixels' rays: the image, and the gradients of some of them."""
-    camera = stage.cameras[stage.sampled]
+    camera = setup.cameras[setup.sampled]
     directions = torch.from_numpy(camera.pixel_directions().reshape(-1, 3))[chosen]
     origins = torch.from_numpy(camera.center.copy()).expand(directions.shape)
 
@@ -871,12 +871,12 @@ def _tracer(
 
     def forward():
         with torch.no_grad():  # what images alone take
-            return trace(stage.gaussians)
+            return trace(setup.gaussians)
 
     def both(good=None):
-        image = trace(stage.moving).rgb
-        u = stage.cotangents[stage.sampled].reshape(-1, 3)[chosen].to(image)
-        return stage.pull(image, u if good is None else u * good.to(u)[:, None])
+        image = trace(setup.moving).rgb
+        u = setup.cotangents[setup.sampled].reshape(-1, 3)[chosen].to(image)
+        return setup.gradient(image, u if good is None else u * good.to(u)[:, None])
 
     return forward, both
 
@@ -995,7 +995,7 @@ def measure_full(
                 break
             camera = views[number % len(views)]
             for name in (exact.name, *order.sample(names, len(names))):
-                say(_said(clock, camera, name))
+                say(_status(clock, camera, name))
                 took[name].append(work(camera, rows[name]))
                 spent += took[name][-1]
         seconds = max(seconds - spent, 0.0)
@@ -1062,7 +1062,7 @@ def _sized(
     least = pixels = min(pixels, whole)
     while True:
         camera = at_most(cameras[0], int(pixels))
-        say(_said(work.clock, camera, "exact"))
+        say(_status(work.clock, camera, "exact"))
         took = work(camera, exact)
         spent += took
         # Time grows with the pixels at most. What is tried on the way is spent, too.
@@ -1074,7 +1074,7 @@ def _sized(
     return [at_most(camera, int(min(whole, fits))) for camera in cameras if fits >= least], spent
 
 
-def _said(clock: str, camera: Camera, name: str) -> str:
+def _status(clock: str, camera: Camera, name: str) -> str:
     return f"{clock.replace('_', ' + ')} at {camera.width}x{camera.height}: {name}"
 
 

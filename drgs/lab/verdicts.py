@@ -131,7 +131,7 @@ class GroupRow:
         bias: How much too long the gradient is along the model's.
         max: Largest difference.
         norm: L2 norm of the model's gradient.
-        differences: Central differences that decided, where they were asked for.
+        differences: Central differences that decided, where they were taken.
     """
 
     verdict: str | None
@@ -193,7 +193,7 @@ _BETWEEN = Deviation(
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """What is compared, and how: arguments of `crossval`; `first` is the view that is asked for differences."""
+    """What is compared, and how: arguments of `crossval`; `first` is the view whose differences are taken."""
 
     rasterizer: Rasterizer | Dump
     raw: dict
@@ -295,7 +295,7 @@ def judge(case: Case, model: ReferenceModel, compared: Compared) -> None:
         _decide(case, model if agrees else None, compared, names)
     elif names:
         verdict = "undecided"
-        why = "the image is of another model, a dump cannot be asked for central differences"
+        why = "the image is of another model, and a dump has no central differences"
         open_to = dict.fromkeys(names, 0.0)
         if agrees:
             verdict, why = "gradient bug", "the image is the model's, the gradient is not"
@@ -402,7 +402,7 @@ def _group_row(theirs: torch.Tensor | None, ours: torch.Tensor, tolerance: float
         why=why,
         worst=[WorstGaussian(int(i), float(each[i])) for i in worst],
         relative=relative,
-        # Underflow, not 0, is kept from the division: the case of 0 is told apart.
+        # Underflow, not 0, is kept from the division: the case of 0 has a branch of its own.
         cosine=float(a @ b / (a.norm() * b.norm()).clamp_min(1e-300)) if norm > 0 else float(not a.any()),
         # The same floor as of `relative`.
         bias=float(a @ b) / max(norm, 1e-12) ** 2 - 1 if norm > 0 else 0.0,
@@ -435,7 +435,7 @@ def _known(case: Case, model: ReferenceModel, compared: Compared) -> None:
 
 
 def _decide(case: Case, model: ReferenceModel | None, compared: Compared, names: list[str]) -> None:
-    """Ask the rasterizer's own central differences; `model` is given if the image is its."""
+    """Compare with the rasterizer's own central differences; `model` is given if the image is its."""
     groups = compared.groups
     rasterizer = case.rasterizer
     raw = case.raw
@@ -509,7 +509,7 @@ def _own_row(gradient: torch.Tensor, wanted: torch.Tensor | None, own: Differenc
 _STEPS = 4  # each half of the one before
 _FIRST = {torch.float64: 2e-3, torch.float32: 1.6e-2}  # first step, in units of what changes the image by its own size
 _EPS = {torch.float64: 1e-9, torch.float32: 2e-7}  # rounding of an image, of float32 renderers in general
-_LEFT = 0.5  # share of the pixels that an entry changes which must be kept
+_KEPT = 0.5  # share of the pixels that an entry changes which must be kept
 _JUMP = 0.05  # share of the largest slope that no smooth change of half a step reaches
 
 
@@ -574,7 +574,7 @@ def central(
             sums = [float((weight * x).sum()) for x in found]
             changed = found[-1] != 0
             touched = int((changed & kept[..., None]).sum())
-            if touched < _LEFT * int(changed.sum()):  # what is left says nothing about this entry
+            if touched < _KEPT * int(changed.sum()):  # what is left says nothing about this entry
                 left_out[group] += 1
                 continue
             # Each pixel's rounding is divided by the step; random signs add up as a square root.
