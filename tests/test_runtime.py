@@ -8,7 +8,6 @@ import platform
 import re
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -225,16 +224,6 @@ def test_import_is_light_and_prepares():
         if any(x.usable for x in libllvm.find_libraries({})):
             assert libllvm.library_version(path)[0] >= libllvm.MINIMUM_LLVM
     assert best < 0.3
-
-
-def test_search_is_quick():
-    """Listing every usual directory of this machine takes milliseconds (measured 3)."""
-    best = 1e9
-    for _ in range(3):
-        start = time.perf_counter()
-        libllvm.find_libraries({})
-        best = min(best, time.perf_counter() - start)
-    assert best < 0.1
 
 
 def test_lazy_names():
