@@ -6,7 +6,7 @@ have none, although the image does. A small change of C is instead a strain E of
 
     E C + C E = dC,    (R^T E R)_ij = (R^T dC R)_ij / (s_i^2 + s_j^2),
 
-whose denominators are sums, not differences, of eigenvalues. The renderer is told strains of 0 that have this
+whose denominators are sums, not differences, of eigenvalues. The renderer is given strains of 0 that have this
 derivative (`render_with_offsets`), so that it is exact for spheres, discs and needles, too: R^T E R, in the axes of the
 Gaussian, for a disc's derivative across itself is too small for a sum of others to hold.
 """
@@ -19,17 +19,17 @@ from drgs.guards.arguments import ArgumentError
 
 __all__ = ["factors", "strained"]
 
-_LEAST = 1e-24  # of the largest eigenvalue, for one of 0: a flat Gaussian has that instead
-_TINIEST = 1e-40  # of an eigenvalue, for a covariance of 0
+_LEAST = 1e-24  # share of the largest eigenvalue that one of 0 gets: a flat Gaussian has 1e-12 of its size as thickness
+_TINIEST = 1e-40  # scene units squared, least eigenvalue: of a covariance of 0
 
 
 def factors(
     where: str, covars: torch.Tensor, lead: tuple[int, ...] | None = None
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """What covariances (..., 3, 3) are to the renderer, in float64.
+    """Quaternions, standard deviations and strains of covariances (..., 3, 3), in float64.
 
     Args:
-        where: What the caller is called, for messages.
+        where: Name of the caller, for messages.
         covars: Symmetric to rounding, no eigenvalue below 0; differentiable: both elements off the diagonal get half of
             the derivative by their common value.
         lead: Their leading axes; None: any.

@@ -68,7 +68,7 @@ def render(
         An `Output`; of a list of C cameras each tensor has a leading axis C, and `certificate` is a list.
     Raises:
         ValueError: If a parameter is not finite, an output is unknown, or cameras differ in size.
-        NotImplementedError: If a model of the image plane (`ewa`) is asked for with a camera that has distortion or a
+        NotImplementedError: If a model of the image plane (`ewa`) is used with a camera that has distortion or a
             rolling shutter, or with rays.
     Gradients:
         Of rgb, alpha, depth and features, with respect to means, quats, log_scales, logit_opacities, sh, features and

@@ -26,6 +26,7 @@ __all__ = [
 ]
 
 MINIMUM_LLVM = 17
+"""Major version: Dr.Jit 1.5 aborts with 15 and 16, and does not load older ones."""
 
 _INSTALL = (
     "Install it (Debian/Ubuntu: apt-get install libllvm19; conda: conda install -c conda-forge "

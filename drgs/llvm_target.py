@@ -76,7 +76,7 @@ def compile_for(text: str, where: str) -> None:
         where: What an error begins with.
     Raises:
         ValueError: If it is not written so, the lanes are none of `LANES`, this machine lacks instructions, or this
-            Dr.Jit cannot be told.
+            Dr.Jit has no such function.
     """
     found = _WRITTEN.fullmatch(text)
     here = _of_machine()
@@ -110,7 +110,7 @@ def missing_features(target: Target) -> list[str]:
 
 @functools.cache
 def _of_machine() -> Target | None:
-    """This machine's target: first asked for before another one is chosen."""
+    """This machine's target: first read before another one is chosen."""
     return compiled_for()
 
 

@@ -192,11 +192,11 @@ def rasterization(
         colors (..., C, H, W, X), alphas (..., C, H, W, 1), in the precision of `means`, and a dict: `radii` (..., C, N,
         2) int32 in pixels, 0 where a Gaussian is left out; `means2d` (..., C, N, 2), `depths` (..., C, N), `conics`
         (..., C, N, 3), valid where radii > 0; `opacities` (..., C, N); `width`, `height`, `n_batches`, `n_cameras`;
-        None for what only packed arrays have; and what `return_normals` and `extra_signals` ask for. Only `means2d` may
+        None for what only packed arrays have; and what `return_normals` and `extra_signals` add. Only `means2d` may
         have a gradient.
     Raises:
         ValueError: If a shape or value is wrong.
-        NotImplementedError: If an option of gsplat's is asked for that does not exist here; the way round is named.
+        NotImplementedError: If an option of gsplat's is used that does not exist here; the way round is named.
     Gradients:
         With respect to means, quats, scales, covars, opacities, colors, extra signals, viewmats, viewmats_rs, rays and
         backgrounds, in reverse and forward mode; with respect to viewmats along rigid motions only
@@ -379,7 +379,7 @@ class _View:
         meta, compensation = self._on_image(cut)
         if compensation is not None:
             splats = dataclasses.replace(splats, opacities=inside_opacities(splats.opacities * compensation))
-        # `meta` is to be looked at: no gradient passes through it.
+        # `meta` is for reading: no gradient passes through it.
         meta["opacities"] = splats.opacities.detach().to(splats.means.dtype)
         extra = self.extra
         if extra is not None and o.extra_degree is not None:
@@ -527,15 +527,15 @@ def _check_along_rays(
     settings: RenderSettings, rolling: bool, lens: bool, rays: torch.Tensor | None, mode: _Mode, normals: bool
 ) -> None:
     """Refuse what only responses along rays have."""
-    asked = {
+    used = {
         "rolling_shutter": rolling,
         "distortion coefficients and camera models other than pinhole": lens,
         "rays": rays is not None,
         "render modes with d and Ed": mode.depth == "hit",
         "return_normals": normals,
     }
-    for name, is_asked in asked.items():
-        if is_asked and settings.planar:
+    for name, is_used in used.items():
+        if is_used and settings.planar:
             raise ValueError(
                 f"rasterization: {name} must come with with_eval3d=True, or a preset along rays, got the model of the "
                 "image plane; pass with_ut=True, with_eval3d=True"
@@ -566,10 +566,10 @@ def _check_extra(
 # ------------------------------------------------------------------------------------------------ what the options mean
 
 
-def _refuse(**asked: bool) -> None:
-    """Raise NotImplementedError for the first option of gsplat's that is asked for and does not exist here."""
-    for name, is_asked in asked.items():
-        if is_asked:
+def _refuse(**options: bool) -> None:
+    """Raise NotImplementedError for the first of gsplat's options that is used and does not exist here."""
+    for name, is_used in options.items():
+        if is_used:
             raise NotImplementedError(f"rasterization: {name} is not supported; {_INSTEAD[name]}")
 
 

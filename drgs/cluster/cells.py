@@ -47,9 +47,9 @@ def run_cells_on(
 ) -> tuple[list[Cell], dict[Cell, str]]:
     """Work through cells on a cluster, one at a time on each worker; rows are appended here, as they come.
 
-    A fit that fails is told and left for the next call; the others go on. On Ctrl-C, workers of this machine end;
+    A fit that fails is logged and left for the next call; the others go on. On Ctrl-C, workers of this machine end;
     those of a cluster that was joined finish the cell that they have, and its row is found by the next call. All cells
-    are handed out at once: who has left a race (`drgs.studies.statistics`) is asked when the call begins.
+    are handed out at once: who has left a race (`drgs.studies.statistics`) is computed when the call begins.
 
     Args:
         cluster: The workers.

@@ -3,7 +3,7 @@
     with opened("10.0.0.7:8786") as cluster: ...     # joins what `dask scheduler` and `dask worker` have started
     with opened(workers=4) as cluster: ...           # four processes, which end with the block
 
-Every worker is asked what it computes with before it gets work, and again by each task, so that one which joins later
+Every worker states what it computes with before it gets work, and again with each task, so that one which joins later
 is refused as well. Dask runs what anyone sends to its scheduler: see docs/many-machines.md.
 """
 

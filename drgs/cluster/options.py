@@ -21,7 +21,7 @@ def check_address(scheduler: str) -> str:
     if not found or not 1 <= int(found[2]) <= 65535:
         raise ValueError(
             f"cluster: --scheduler must be HOST:PORT, got {scheduler!r}; `dask scheduler` says both, its port is 8786 "
-            "unless it was told another"
+            "unless another was chosen"
         )
     return f"tcp://{found[1]}:{int(found[2])}"
 

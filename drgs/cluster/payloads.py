@@ -16,7 +16,7 @@ import torch
 
 __all__ = ["Missing", "Payload", "keep", "opened_payload"]
 
-_KEPT = 4  # payloads of a worker: one scene, what its views were asked, and a few of the call before
+_KEPT = 4  # payloads of a worker: one scene, the questions about its views, and a few of the call before
 _UNFINISHED = 8  # payloads that pieces are missing of
 _PIECE = 64 << 20  # bytes of a message
 

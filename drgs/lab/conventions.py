@@ -375,6 +375,7 @@ _ALL = ("means", *_SHAPE, "logit_opacities", "sh")
 _CULLINGS = get_args(get_type_hints(RenderSettings)["culling"])
 # exp(-extent^2 / 2) = 0.0113 is the least density that 3DGRUT counts, and gsplat along rays.
 _DENSITY_CUTOFF = math.sqrt(-2 * math.log(0.0113))
+# Pixel centers that are tried, in pixels.
 _POINTS = tuple((x, y) for x in (0.5, 0.0, 1.0) for y in (0.5, 0.0, 1.0))
 # Field of the model or of its settings -> (name, groups, values to be tried).
 _VARIATIONS: dict[str, tuple[str, tuple, tuple]] = {

@@ -295,7 +295,7 @@ def _checked(name: str, returned: object, camera: Camera, channels: int) -> tupl
 SUFFIXES = (".npz", ".safetensors")
 _EXPORT = "drgs_export"  # an array that an export has, and a dump, which holds more, has not
 _POSE = "grad_viewmat"  # (C, 4, 4); may be left out
-_LARGEST = 4 << 30  # bytes of a dump
+_LARGEST = 4 << 30  # bytes of a dump, beyond which it is refused unread: it would not fit beside the comparison
 
 
 @dataclasses.dataclass(frozen=True)

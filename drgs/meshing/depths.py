@@ -35,7 +35,7 @@ class DepthView:
         alpha: (H, W) float32 opacity.
         rgb: (H, W, 3) float32 colors.
         spread: (H, W) float32 standard deviation of the position of what is seen in scene units, for unit noise of
-            colors; None if nobody asked.
+            colors; None where it is not wanted.
     """
 
     camera: Camera
@@ -66,13 +66,13 @@ def depth_views(
     """
     features = None if deviations is None else deviations.clamp_min(_SMALLEST).log()[:, None].to(gaussians.means.dtype)
     plain = gaussians.replace(features=features)
-    asked = "median_depth" if kind == "median" else "depth"
+    output = "median_depth" if kind == "median" else "depth"
     views = []
     for camera in cameras:
         with torch.no_grad():
-            out = render(plain, camera, settings, (asked,))
+            out = render(plain, camera, settings, (output,))
         alpha = out.alpha.cpu().numpy()
-        found = getattr(out, asked).cpu().numpy()
+        found = getattr(out, output).cpu().numpy()
         is_solid = (alpha > _SOLID) & (found > 0)
         depth = np.where(is_solid, found, np.inf).astype(np.float32)
         spread = None

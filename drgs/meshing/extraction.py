@@ -45,7 +45,7 @@ class TriangleMesh:
         colors: (V, 3) float32 in [0, 1], as the photographs have them, without a transfer function.
         views: (V,) int32 number of views that see each vertex.
         spread: (V,) float32 standard deviation of the position of what is there, in scene units, as the information of
-            the known views has it; None if nobody asked.
+            the known views has it; None where it is not wanted.
         voxel: Distance of neighboring points of the lattice in scene units.
         trunc: Truncation of the fused distance in scene units.
     """
@@ -102,7 +102,7 @@ def mesh_of(
         cameras: Views whose depth is fused; what none of them sees is not in the mesh.
         settings: How they are rendered, default `RenderSettings.preset("exact")`.
         options: Default `MeshOptions()`.
-        known: Views whose information says how uncertain the surface is; default the same cameras. Only asked where
+        known: Views whose information says how uncertain the surface is; default the same cameras. Read where
             `options.crop` is above 0.
         advance: Called with a label, the steps done and their number.
     Raises:
@@ -147,8 +147,8 @@ def mesh_of_depths(
     """
     voxel, bricks = _lattice(views, options)
     trunc = options.trunc * voxel
-    told = (lambda done: advance("fusion", done, len(bricks))) if advance else None
-    vertices, faces = surface(views, voxel, trunc, bricks=bricks, empty=empty, advance=told)
+    advance_bricks = (lambda done: advance("fusion", done, len(bricks))) if advance else None
+    vertices, faces = surface(views, voxel, trunc, bricks=bricks, empty=empty, advance=advance_bricks)
     colors, seen, spread = _attributes(views, vertices, trunc)
     mesh = TriangleMesh(vertices, faces, colors, seen, spread, voxel, trunc)
     is_kept = seen >= options.min_views

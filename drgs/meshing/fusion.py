@@ -165,7 +165,7 @@ def surface(
         views: Depth images.
         voxel: Distance of neighboring points of the lattice in scene units.
         trunc: Truncation in scene units.
-        bricks: What `bricks_of` gives; None: it is asked.
+        bricks: What `bricks_of` gives; None: it is called here.
         empty: Weight of a pixel that hits nothing solid.
         advance: Called with the number of bricks that were done.
     """

@@ -43,8 +43,8 @@ class Shown:
         photos: Name of a view -> photograph and rendering.
         semantics: Name of a view -> picture of its labels.
         maps: Name of a view -> its maps.
-        moments: Stills of one camera at several times.
-        moments_of: Name of that camera.
+        stills: One camera at several times.
+        stills_of: Name of that camera.
         notes: Sentences that say what is left out, and why.
     """
 
@@ -54,8 +54,8 @@ class Shown:
     photos: Mapping[str, Picture] = dataclasses.field(default_factory=dict)
     semantics: Mapping[str, Picture] = dataclasses.field(default_factory=dict)
     maps: Mapping[str, Sequence[Picture]] = dataclasses.field(default_factory=dict)
-    moments: Sequence[Picture] = ()
-    moments_of: str = ""
+    stills: Sequence[Picture] = ()
+    stills_of: str = ""
     notes: Sequence[str] = ()
 
 
@@ -91,8 +91,8 @@ def page_html(account: Account, shown: Shown, command: str, command_text: str) -
         **_views(metrics, shown),
         "renderers": renderers_table(metrics),
         "segmentation": _segmentation(metrics),
-        "moments": shown.moments,
-        "moments_text": f"Camera {shown.moments_of}, stopped where it is, at times of the sequence.",
+        "stills": shown.stills,
+        "stills_text": f"Camera {shown.stills_of}, stopped where it is, at times of the sequence.",
         **_picks(account),
         "places": [place["text"] for place in account.places],
         "timings": _timings(account),
@@ -114,7 +114,7 @@ def _sections(context: Mapping[str, Any]) -> list[tuple[str, str]]:
         "views": ("Views", context["views"]),
         "renderers": ("Renderers", context["renderers"][2]),
         "labels": ("Labels", context["segmentation"]),
-        "time": ("Over time", context["moments"]),
+        "time": ("Over time", context["stills"]),
         "cameras": ("Cameras", context["charts"].get("cameras") or context["picks"] or context["places"]),
         "time-spent": ("Time and memory", True),
         "repeat": ("Again", True),

@@ -32,12 +32,12 @@ __all__ = ["Picture", "jpeg", "maps", "previews", "spread", "stills", "uncertain
 
 _QUALITY = 88  # of JPEG; a page of thirty pictures then has about two megabytes
 _WIDEST = 1200  # pixels; more than a page is wide
-_PREVIEWS = 12
+_PREVIEWS = 12  # pictures of how the fit went, evenly spaced: a slider of more is no smoother
 _MAP_WIDTH = 480  # pixels, about
 _LARGEST = 1 << 28  # bytes of a PNG in a run folder that is opened
 _MAPPED: tuple[Block, ...] = ("geometry", "backdrop")
 _KNOWN = 24  # views whose information is added up; of more, these stand for all
-_MOMENTS = 12
+_STILLS = 12  # times of a sequence that one camera is shown at, evenly spaced
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,8 +172,8 @@ def _enlarged(values: np.ndarray) -> np.ndarray:
 def stills(scene: Scene, camera: Camera, times: Sequence[float], settings: RenderSettings) -> list[Picture]:
     """One camera at several times, evenly over all."""
     found = []
-    with Bar("stills of the sequence", min(len(times), _MOMENTS)) as bar:
-        for time in spread(times, _MOMENTS):
+    with Bar("stills of the sequence", min(len(times), _STILLS)) as bar:
+        for time in spread(times, _STILLS):
             now = dataclasses.replace(camera, time=time)
             with torch.no_grad():  # a picture
                 image = render(colors_only(scene, time), now, settings, outputs=()).rgb.cpu().numpy()

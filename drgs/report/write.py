@@ -88,8 +88,8 @@ def _shown(account: Account, dataset: Dataset | None) -> Shown:
         photos=pictures.view_pictures(account, names, "png"),
         semantics=pictures.view_pictures(account, names, "semantics.png") if account.record.semantics else {},
         maps=found,
-        moments=stills,
-        moments_of=still_name,
+        stills=stills,
+        stills_of=still_name,
         notes=notes,
     )
 

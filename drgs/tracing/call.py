@@ -43,7 +43,7 @@ OF_VIEW = (
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Output:
-    """What one view shows (torch tensors; None where not asked for); of a list of views with a leading axis.
+    """What one view shows (torch tensors; None where not in `outputs`); of a list of views with a leading axis.
 
     Attributes:
         rgb: (H, W, 3) linear blend of the colors, background included, not clamped.
@@ -203,7 +203,7 @@ class Call:
         memory.require("render", needed, size, "render a smaller one", self.home.type == "cuda")
 
     def _moving(self, lens: torch.Tensor) -> torch.Tensor:
-        """(P, 3) directions in camera axes that move with the lens, which tiles are told as shifts."""
+        """(P, 3) directions in camera axes that move with the lens, which tiles get as shifts."""
         camera = self.camera
         if self.settings.planar:
             raise NotImplementedError(

@@ -209,7 +209,7 @@ class Adjoint:
         if s.alpha_max < 1 and s.alpha_max_gradient == "zero":
             rho2, _, u = self.m.response.along(record, ray, self.m.world)
             free = self.m.response.opacity(record[self.m.strength] * dr.exp(-0.5 * rho2), u) < self.m.alpha_max
-        response: Any = self.m.response  # a model of the image plane: nobody else is asked
+        response: Any = self.m.response  # a model of the image plane: no other has projected means
         moves = response.moves(record, ray)
         return [dr.select(free, abs(dr.detach(slope) * x), 0) for x in moves]  # as above
 

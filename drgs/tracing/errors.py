@@ -10,8 +10,8 @@ __all__ = ["own_errors"]
 
 @contextlib.contextmanager
 def own_errors() -> Iterator[None]:
-    """Dr.Jit turns an error inside an operation of ours into its own; what was refused is told as it was said, and who
-    interrupted is obeyed."""
+    """Dr.Jit turns an error inside an operation of ours into its own: what was refused, or interrupted, is raised as it
+    was."""
     try:
         yield
     except RuntimeError as error:

@@ -80,7 +80,7 @@ class Ewa(AlphaStrength):
     # -- once a hit --------------------------------------------------------------------------------------------------
 
     def slots(self, world: bool, depth: bool) -> list[int]:
-        """The triangular factor; the Gaussian's depth where it is asked for."""
+        """The triangular factor; the Gaussian's depth where a depth is rendered."""
         L = layout
         return [*range(L.R11, L.R23 + 1), L.ALPHA, *range(L.RGB, L.RGB + 3), *([L.H1] if depth else [])]
 

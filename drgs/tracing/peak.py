@@ -125,7 +125,7 @@ class Peak(AlphaStrength):
     # -- once a hit --------------------------------------------------------------------------------------------------
 
     def slots(self, world: bool, depth: bool) -> list[int]:
-        """All numbers of the shape; those of t* where the depth is asked for."""
+        """All numbers of the shape; those of t* where a depth is rendered."""
         L = layout
         if world:
             return [*range(L.W_MEAN, L.W_ALPHA + 1), *range(L.W_RGB, L.W_RGB + 3)]

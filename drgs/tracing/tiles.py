@@ -34,6 +34,7 @@ from drgs.tracing.weights import PIXELS, Weights, signed
 
 __all__ = ["TABLES", "TILE", "Lists", "TileTraversal", "build", "depth_order"]
 
+# Pixels a side. With 4, 100,000 Gaussians in 512x512 pixels have 1.55 M entries to sort in place of 0.6 M.
 TILE = 8
 TABLES = 128 << 20
 """Bytes of the rows of pixels that are sorted at a time, and of a table that the adjoint fills in exact order
@@ -45,7 +46,7 @@ fits into its memory. To sort the hits of a band torch takes up to a tenth of th
 """
 _FOR_EACH = 10 << 30  # bytes
 _CORNERS = {1: [(0, 0)], 2: [(0, 0), (0, 4)], 4: [(0, 0), (4, 0), (0, 4), (4, 4)]}  # of pixels that share a lane
-_NOWHERE = 2**64 - 1
+_NOWHERE = 2**64 - 1  # key of no entry: sorted behind all others
 _HELD = 128 << 20  # bytes of the orders of all pixels, which derivatives need again
 _TAILS = 5e-6  # what the tails left out of a pixel may add up to
 _LARGE = 8  # tiles of a box, on average, from which on each is looked at

@@ -33,10 +33,10 @@ __all__ = [
     "unscented_boxes",
 ]
 
-_ALPHA, _BETA = 0.1, 2.0
+_ALPHA, _BETA = 0.1, 2.0  # parameters of the transform, gsplat's defaults; kappa is 0
 SPREAD = _ALPHA * math.sqrt(3.0)
 """Distance of the six points from the mean, in standard deviations."""
-_OTHERS = 1 / (2 * SPREAD**2)
+_OTHERS = 1 / (2 * SPREAD**2)  # weight of each of the six points
 OF_MEAN = (1 - 6 * _OTHERS, *[_OTHERS] * 6)
 """Weights of the mean's and the six points' places in the mean on the image."""
 OF_COVARIANCE = (OF_MEAN[0] + 1 - _ALPHA**2 + _BETA, *OF_MEAN[1:])
@@ -46,12 +46,12 @@ MARGIN = 0.1
 DILATION = 0.3
 """px^2, added to the covariance: gsplat's default."""
 LEAST_COMPENSATION = 0.005
-"""The least factor that opacities have for it."""
+"""The least factor by which opacities are compensated for it: gsplat's."""
 EXTENT = 3.33
 """Standard deviations of a box, or where the opacity falls to `LEAST_OPACITY`."""
 LEAST_OPACITY = 1 / 255
 _FINE, _COARSE = 8, 16  # pixels of gsplat's tiles: in images of less than `_HIGH` rows, and in others
-_HIGH = 1080
+_HIGH = 1080  # rows
 _INSIDE = 0.25  # px, off the edge of a tile, so that rounding does not take its neighbor
 
 

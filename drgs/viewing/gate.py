@@ -1,4 +1,4 @@
-"""Who may talk to the viewer: what comes in is asked where it is from before anything is answered.
+"""Which requests the viewer answers: where a request is from is checked before anything is.
 
 A viewer that listens to this machine alone is still reached by every page that the browser on it has open. Such a
 page may open a WebSocket to 127.0.0.1 (it states its own site as `Origin`), or have its own name resolve to 127.0.0.1

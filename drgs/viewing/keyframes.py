@@ -27,7 +27,7 @@ _STEP = 2.0  # seconds from a keyframe to the next
 _SHORTEST, _LONGEST = 0.1, 600.0  # of such a step
 _MANY = 100  # keyframes; of the longest steps they are less long than a file may say
 _SEGMENTS = 24  # of the way's line, from a keyframe to the next
-_COLOR = (66, 135, 245)
+_COLOR = (66, 135, 245)  # RGB of the way and its keyframes: the blue of photographs
 _FRAME = 1 / 20  # seconds, in a preview
 
 

@@ -36,8 +36,8 @@ NEXT = "next.json"
 _ADVICE = "name what drgs select or an active fit has written"
 _SCORED = {"name": str, "score": (None, float), "parts": (None, dict)}
 _WAY = {"origin": [float], "text": str}
-_TRAINING = (66, 135, 245)
-_PLAIN = (150, 150, 150)
+_TRAINING = (66, 135, 245)  # RGB of photographs that were fitted to
+_PLAIN = (150, 150, 150)  # RGB of places without a score
 
 
 @dataclasses.dataclass(frozen=True)

@@ -43,14 +43,14 @@ REST = 0.3
 _PRESETS = ("exact", "fast", "gsplat", "3dgut")
 _ROWS_EVERY = 1.0  # seconds between two pictures of rows that are done
 _PHOTOGRAPH = 360  # pixels of its width in the panel
-_WAY_COLOR = (240, 60, 60)
+_WAY_COLOR = (240, 60, 60)  # RGB of the arrow to a place for a next photograph
 _FRUSTUM = 0.05  # size of a camera's frustum, of its distance to what is looked at
 _COVERS = 0.5  # share of half a view's narrower side: a frustum that reaches farther is hidden
 _NARROW = 576  # pixels of a window that viser lays its panel over, as over a phone's
 _ROUND = 48  # times in a round of playing, at most
 _FOVS = 1.0, 150.0  # degrees of a keyframe: such as files have, and no wider than our pictures
 _UNKNOWN = 640, 480  # pixels of a window that has not said how large it is
-_PAUSE = 0.08  # seconds between two of them, at least
+_PAUSE = 0.08  # seconds between two times that are played, at least: twelve a second
 
 
 class Session:
