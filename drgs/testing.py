@@ -58,10 +58,10 @@ def assert_matches(
     results = []
     for g, views in scenes:
         if isinstance(rasterizer, str):
-            made = load_rasterizer(rasterizer, g, views, {"background": background})
+            tested = load_rasterizer(rasterizer, g, views, {"background": background})
         else:
-            made = function(rasterizer, getattr(rasterizer, "__name__", "rasterizer"))
-        result = crossval(made, g, views, preset, {"background": background}, **options)
+            tested = function(rasterizer, getattr(rasterizer, "__name__", "rasterizer"))
+        result = crossval(tested, g, views, preset, {"background": background}, **options)
         results.append(result)
         if result.verdict not in ("agreement", *allow):
             raise AssertionError("\n".join(result.lines()))

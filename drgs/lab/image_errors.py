@@ -107,10 +107,10 @@ class _Case:
     background: np.ndarray
     counts: np.ndarray
 
-    def explained(self, made: np.ndarray, known: np.ndarray | None = None) -> float:
-        """Share of the squared error that is gone with `made`, which is known at (H, W) pixels, default at all."""
+    def explained(self, changed: np.ndarray, known: np.ndarray | None = None) -> float:
+        """Share of the squared error that is gone with `changed`, which is known at (H, W) pixels, default at all."""
         counts = self.counts if known is None else self.counts & known
-        before, after = (((x - self.wrong) ** 2)[counts].sum() for x in (self.right, made))
+        before, after = (((x - self.wrong) ** 2)[counts].sum() for x in (self.right, changed))
         return 1 - float(after / before) if before > 0 else 0.0
 
 
@@ -183,8 +183,8 @@ def pattern_of(
 def _changes(case: _Case) -> Iterator[Pattern]:
     """Every change of the right image, with its best numbers."""
     for kind in (_flips, _orders, _sums, _backgrounds, _transfers, _moves, _blurs, _blank):
-        for name, what, made, *known in kind(case):
-            yield Pattern(name, what, case.explained(made, *known))
+        for name, what, changed, *known in kind(case):
+            yield Pattern(name, what, case.explained(changed, *known))
 
 
 def _flips(case: _Case) -> Iterator[tuple]:
@@ -258,27 +258,27 @@ def _moves(case: _Case) -> Iterator[tuple]:
         for start in ((0.0, 0.0, 0.0), (far_x, far_y, 0.0)):
             move = np.array(start)
             for _ in range(_MOVES):
-                made, known = _moved(case.right, move)
+                changed, known = _moved(case.right, move)
                 use = case.counts & known
                 if not use.any():
                     break
-                down, across = np.gradient(made, axis=(0, 1))
+                down, across = np.gradient(changed, axis=(0, 1))
                 slopes = [-across, -down, -(across * x[..., None] + down * y[..., None])][:count]
                 table = np.stack([slope[use].ravel() for slope in slopes])
                 square = table @ table.T
-                right = table @ (case.wrong - made)[use].ravel()
+                right = table @ (case.wrong - changed)[use].ravel()
                 step = np.linalg.lstsq(square, right, rcond=None)[0].clip(-2, 2)  # of a flat image no move is best
                 move[:count] += step
                 if np.abs(step * (1, 1, max(width, height))[:count]).max() < _MOVED:
                     break
             move[:2] = move[:2].clip(-width, width)  # a search that diverged stays in numbers that can be warped by
-            made, known = _moved(case.right, move)
+            changed, known = _moved(case.right, move)
             if (case.counts & known).sum() > 0.25 * case.counts.sum():
-                ends.append((case.explained(made, known), move, made, known))
+                ends.append((case.explained(changed, known), move, changed, known))
         if ends:
-            _, move, made, known = max(ends, key=lambda end: end[0])
+            _, move, changed, known = max(ends, key=lambda end: end[0])
             enlarged = f"magnified {1 + move[2]:.4g} times and " if count == 3 else ""
-            yield name, f"{enlarged}moved by {_way(*move[:2])}", made, known
+            yield name, f"{enlarged}moved by {_way(*move[:2])}", changed, known
 
 
 def _moved(image: np.ndarray, move: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -311,8 +311,8 @@ def _blank(case: _Case) -> Iterator[tuple]:
         return
     color = case.wrong[off].mean(0)
     if np.abs(case.wrong[off] - color).max() < OFF < case.right[off].std(0).max():
-        made = np.where(off[..., None], color, case.right)
-        yield "blank", f"with nothing but {_numbers(color)} in the pixels that are off", made
+        changed = np.where(off[..., None], color, case.right)
+        yield "blank", f"with nothing but {_numbers(color)} in the pixels that are off", changed
 
 
 def _place(case: _Case) -> Pattern | None:

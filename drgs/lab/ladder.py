@@ -88,10 +88,10 @@ def ladder(
     Raises:
         ValueError: If there is no camera or Gaussian, or a rung cannot be reached.
     """
-    made = pictures or Pictures(g, cameras, crop, seed, gradients, advance)
+    images = pictures or Pictures(g, cameras, crop, seed, gradients, advance)
     end = RenderSettings.preset("exact", background=start.background)
-    if made.crop and not made.windows:
-        made.place_crops(start)
+    if images.crop and not images.windows:
+        images.place_crops(start)
     orders = sequences(start, end)
     report: dict[str, Any] = {
         "start": dataclasses.asdict(start),
@@ -102,34 +102,34 @@ def ladder(
         "seed": seed,
         "groups": list(PARAMETERS) if gradients else [],
         "image": {"total": None},
-        "crops": {"windows": [list(w) for w in made.windows], "total": None},
+        "crops": {"windows": [list(w) for w in images.windows], "total": None},
     }
     for name, steps in zip(("forward", "reverse"), orders, strict=True):
         names = [rung for rung, _ in steps]
         switched = [_switched(a, b) for a, b in pairwise([start, *(s for _, s in steps)])]
-        states = [made.full(start), *(made.full(s) for _, s in steps)]
+        states = [images.full(start), *(images.full(s) for _, s in steps)]
         report["image"][name], report["image"]["total"] = _rungs(names, switched, states)
-        if not made.windows:
+        if not images.windows:
             continue
-        states = [made.part(start, "float32"), *(made.part(s, "float32") for _, s in steps)]
+        states = [images.part(start, "float32"), *(images.part(s, "float32") for _, s in steps)]
         if name == "forward":
-            rounding = made.part(start, "float64") - states[0]
-            states = [states[0], *(state + rounding for state in states), made.part(end, "float64")]
+            rounding = images.part(start, "float64") - states[0]
+            states = [states[0], *(state + rounding for state in states), images.part(end, "float64")]
             names = ["float32", *names, "rest"]
             switched = [{}, *switched, {}]
         else:
-            states = [*states, made.part(end, "float64")]
+            states = [*states, images.part(end, "float64")]
             names = [*names, "float32"]
             switched = [*switched, {}]
         report["crops"][name], report["crops"]["total"] = _rungs(names, switched, states)
-    if not made.windows:
+    if not images.windows:
         del report["crops"]
     elif volume:
         integral = end.replace(response="integral")
-        states = [made.part(end, "float64"), made.part(integral, "float64"), made.part(integral, "volume")]
+        states = [images.part(end, "float64"), images.part(integral, "float64"), images.part(integral, "volume")]
         rungs, total = _rungs(list(_BEYOND), [_switched(end, integral), {}], states, states[0])
         report["far"] = {"forward": rungs, "total": total}
-    report["asides"] = _asides(made, start, end)
+    report["asides"] = _asides(images, start, end)
     return report
 
 
@@ -149,7 +149,7 @@ def sequences(start: RenderSettings, end: RenderSettings) -> tuple[list, list]:
     if missed:
         raise ValueError(f"ladder: both ends must share {missed[0]}, no rung switches it; set it in both")
     names = [rung for rung, fields in changes.items() if fields]
-    made = []
+    both = []
     for order in (names, names[::-1]):
         now = start
         steps = []
@@ -159,8 +159,8 @@ def sequences(start: RenderSettings, end: RenderSettings) -> tuple[list, list]:
                 now = now.replace(**changes[rung])
                 steps.append((rung, now))
                 done.add(rung)
-        made.append(steps)
-    return made[0], made[1]
+        both.append(steps)
+    return both[0], both[1]
 
 
 def _with_needs(order: list[str]) -> list[str]:
@@ -190,7 +190,7 @@ def _rungs(
     return rows, Step.of(total, total, exact).to_json()
 
 
-def _asides(made: Pictures, start: RenderSettings, end: RenderSettings) -> list[dict]:
+def _asides(images: Pictures, start: RenderSettings, end: RenderSettings) -> list[dict]:
     """Steps outside of the ladder, over all pixels, relative to `exact` and to the ladder's total.
 
     The gradient of the start without the direction's path (training code often detaches the direction that SH are
@@ -198,16 +198,16 @@ def _asides(made: Pictures, start: RenderSettings, end: RenderSettings) -> list[
     projected start also the step to preset `3dgut`, which evaluates the same Gaussians along rays and in the order of
     their centers: how far on the way that is.
     """
-    first, exact = made.full(start), made.full(end)
+    first, exact = images.full(start), images.full(end)
     total = exact - first
     steps = {}
-    if made.gradients and start.sh_direction == "gaussian" and made.g.sh.shape[1] > 1:
-        steps["view direction detached"] = made.full(start, True) - first
+    if images.gradients and start.sh_direction == "gaussian" and images.g.sh.shape[1] > 1:
+        steps["view direction detached"] = images.full(start, True) - first
     if start.planar:
-        steps["3dgut"] = made.full(RenderSettings.preset("3dgut", background=start.background)) - first
-    if made.g.sh.shape[1] > 1:
-        steps["SH along rays"] = made.full(end.replace(sh_direction="ray")) - exact
-    steps["response"] = made.full(end.replace(response="integral")) - exact
+        steps["3dgut"] = images.full(RenderSettings.preset("3dgut", background=start.background)) - first
+    if images.g.sh.shape[1] > 1:
+        steps["SH along rays"] = images.full(end.replace(sh_direction="ray")) - exact
+    steps["response"] = images.full(end.replace(response="integral")) - exact
     return [Step.of(step, total, exact, name).to_json() for name, step in steps.items()]
 
 

@@ -123,9 +123,9 @@ def _sections(context: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _subtitle(account: Account) -> str:
-    made = account.env
+    env = account.env
     when = account.events[-1]["time"][:16].replace("T", " ") + " UTC" if account.events else "before its first step"
-    by = f"drgs {made['drgs']}" + (f", commit {made['commit']}" if made.get("commit") else "") if "drgs" in made else ""
+    by = f"drgs {env['drgs']}" + (f", commit {env['commit']}" if env.get("commit") else "") if "drgs" in env else ""
     kinds = ["active fit"] if account.record.is_active else ["fit"]
     kinds += ["with semantics"] * (account.record.semantics is not None) + ["of what moves"] * bool(
         account.record.times

@@ -344,18 +344,18 @@ class Call:
     def output(self, images: dict) -> Output:
         """Shape the flat images."""
         back = lambda x, *tail: x.reshape(*self.shape, *tail).to(self.device)  # noqa: E731
-        made = {"rgb": back(images["rgb"], 3), "alpha": back(images["alpha"])}
+        outputs = {"rgb": back(images["rgb"], 3), "alpha": back(images["alpha"])}
         if "depth" in images:
-            made["depth"] = back(images["depth"]) / made["alpha"].clamp_min(EPS_ALPHA)
+            outputs["depth"] = back(images["depth"]) / outputs["alpha"].clamp_min(EPS_ALPHA)
         if self.width:
-            made["features"] = back(images["features"], self.width)
+            outputs["features"] = back(images["features"], self.width)
         if "median" in self.extra:
-            made["median_depth"] = back(self.extra["median"].torch())
+            outputs["median_depth"] = back(self.extra["median"].torch())
         if "count" in self.extra:
-            made["count"] = back(self.extra["count"].torch().to(torch.int32))
+            outputs["count"] = back(self.extra["count"].torch().to(torch.int32))
         if "visibility" in self.extra:
-            made["visibility"] = self.extra["visibility"].torch().to(self.device)
-        return Output(**made, certificate=dict(self.certificate))
+            outputs["visibility"] = self.extra["visibility"].torch().to(self.device)
+        return Output(**outputs, certificate=dict(self.certificate))
 
     def nothing(self) -> dict:
         """Flat images of no Gaussians, or without pixels: the background, with a derivative of 0."""

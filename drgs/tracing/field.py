@@ -84,8 +84,8 @@ def wrapped(function: Callable[[_Tensors], _Tensors], seen: _Tensors | None = No
         if any(torch.autograd.forward_ad.unpack_dual(x).tangent is not None for x in inputs.values()):
             return {name: _dual(x) for name, x in function(inputs).items()}
         with torch.enable_grad():  # `dr.wrap` calls it as the thread is, and differentiates it later
-            made = _Kept.apply(function, seen, tuple(inputs), *inputs.values())
-        return dict(zip(seen, made, strict=True))
+            outputs = _Kept.apply(function, seen, tuple(inputs), *inputs.values())
+        return dict(zip(seen, outputs, strict=True))
 
     wrap: Callable = dr.wrap(source="drjit", target="torch")
     return wrap(kept)
@@ -116,12 +116,12 @@ class _Kept(torch.autograd.Function):
         for x in ctx.values:
             x.grad = None
         if ctx.graph is None:
-            # Leaves of their own: the graph that is kept ends here, whatever made the values.
+            # Leaves of their own: the graph that is kept ends here, whatever outputs the values.
             leaves = [x.detach().requires_grad_() for x in ctx.values]
             with torch.enable_grad():
                 ctx.graph = leaves, tuple(ctx.function(dict(zip(ctx.names, leaves, strict=True))).values())
-        leaves, made = ctx.graph
-        ends = [(x, g) for x, g in zip(made, cotangents, strict=True) if x.requires_grad]
+        leaves, outputs = ctx.graph
+        ends = [(x, g) for x, g in zip(outputs, cotangents, strict=True) if x.requires_grad]
         slopes = torch.autograd.grad(
             [x for x, _ in ends], leaves, [g for _, g in ends], retain_graph=True, materialize_grads=True
         )

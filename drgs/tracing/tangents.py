@@ -164,16 +164,16 @@ def _pushed(call: Call, columns: list[dict]) -> tuple[dict, list[dict]]:
 
 def _shaped(call: Call, primal: dict, image: dict) -> dict:
     """One tangent of the `Output`."""
-    made = {name: x.torch() for name, x in image.items()}
-    out = {"rgb": made["rgb"].reshape(*call.shape, 3), "alpha": made["alpha"].reshape(call.shape)}
-    if "depth" in made:
+    tangent = {name: x.torch() for name, x in image.items()}
+    out = {"rgb": tangent["rgb"].reshape(*call.shape, 3), "alpha": tangent["alpha"].reshape(call.shape)}
+    if "depth" in tangent:
         # d(D / max(alpha, eps)) by the quotient rule; the denominator is constant where it is clamped.
         alpha = primal["alpha"].torch().to(torch.float64)
         free = alpha > EPS_ALPHA
         alpha = alpha.clamp_min(EPS_ALPHA)
         depth = primal["depth"].torch().to(torch.float64) / alpha
-        change = (made["depth"] - depth * made["alpha"] * free) / alpha
+        change = (tangent["depth"] - depth * tangent["alpha"] * free) / alpha
         out["depth"] = change.to(torch.float32).reshape(call.shape)
     if call.width:
-        out["features"] = made["features"].reshape(*call.shape, call.width)
+        out["features"] = tangent["features"].reshape(*call.shape, call.width)
     return {name: x.to(call.device) for name, x in out.items()}

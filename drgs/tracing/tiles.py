@@ -116,12 +116,12 @@ class TileTraversal:
         """All pixels, in parts of consecutive tiles whose weights take `size` bytes, or a tile's more, and are held."""
         index = signed(self.lists.index)
         size = min(size, _room(TABLES) // 2) if self.settings.order == "ray" else size
-        made = []
+        parts = []
         for band in self._bands(size):
             pixels = self._pixels(torch.arange(band.begin, band.end, device=band.lengths.device))
             weights = Weights(self.lib, index[band.first : band.last], band.lengths, pixels)
-            made.append(self._band_part(share, band, weights))
-        return made
+            parts.append(self._band_part(share, band, weights))
+        return parts
 
     def _bands(self, size: int) -> Iterator[_Band]:
         """Consecutive tiles whose entries, a float in each pixel, take `size` bytes, or a tile's more."""

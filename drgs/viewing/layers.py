@@ -201,7 +201,7 @@ def layers_of(
         uncertainty: What the photographs leave uncertain, where there are any.
         pixels: Largest number of pixels of its map; None: as many as of other pictures.
     """
-    made = [
+    layers = [
         Layer("rgb", "colors", _rgb),
         Layer("depth", "distance along the ray, near is bright; gray where less than half of the light stops", _depth),
         Layer("missing", "share of the light that no Gaussian stops: black nothing, bright all of it", _missing),
@@ -213,11 +213,11 @@ def layers_of(
     }
     for kind, colors_of in semantic.items():
         tint = None if kind == "overlay" else _tint_of(colors_of)
-        made.append(Layer(kind, hints.get(kind, kind), _semantic(colors_of), _WIDE_PIXELS, tint))
+        layers.append(Layer(kind, hints.get(kind, kind), _semantic(colors_of), _WIDE_PIXELS, tint))
     if uncertainty is not None:
         hint = "variance that the photographs leave to each pixel's color: bright is uncertain, dark is well known"
-        made.append(Layer(UNCERTAINTY, hint, _mapped(uncertainty), pixels))
-    return tuple(made)
+        layers.append(Layer(UNCERTAINTY, hint, _mapped(uncertainty), pixels))
+    return tuple(layers)
 
 
 def tinted(layer: Layer, gaussians: Gaussians) -> np.ndarray | None:

@@ -167,13 +167,13 @@ def placed_views_of(views: Sequence[View], fitted: Iterable[str], ranking: Ranki
             name = camera.name
             way = ranking.ways.get(name) if ranking else None
             add("candidate", Sight(camera.undistorted(), None, scores.get(name), picks.get(name), way))
-    made = []
+    placed_views = []
     for sights in found.values():
         kinds = {kind for kind, _ in sights}
         kind = next(kind for kind in ("training", "candidate", "held out") if kind in kinds)
         ordered = sorted((sight for _, sight in sights), key=lambda sight: sight.camera.time or 0.0)
-        made.append(PlacedView(kind, tuple(ordered)))
-    return tuple(made)
+        placed_views.append(PlacedView(kind, tuple(ordered)))
+    return tuple(placed_views)
 
 
 def read_ranking(path: Path) -> Ranking:
@@ -251,13 +251,13 @@ def _scores(where: str, rows: list[dict[str, Any]]) -> dict[str, Score]:
     """Name -> score, with its rank, of the rows that have one."""
     scored = [row for row in rows if row["score"] is not None]
     ordered = sorted(scored, key=lambda row: -row["score"])
-    made: dict[str, Score] = {}
+    scores: dict[str, Score] = {}
     for rank, row in enumerate(ordered, 1):
         parts = row["parts"] or {}
         check_json(f"{where}: {row['name']}: parts", list(parts.values()), [float], _ADVICE)
         check_json(f"{where}: {row['name']}: parts", list(parts), [str], _ADVICE)
-        made.setdefault(row["name"], Score(float(row["score"]), parts, rank, len(ordered)))
-    return made
+        scores.setdefault(row["name"], Score(float(row["score"]), parts, rank, len(ordered)))
+    return scores
 
 
 def _reader(view: View) -> Callable[[int], np.ndarray]:

@@ -113,7 +113,7 @@ class Viewer:
             self.worker,
             self._preset,
             self._pixels,
-            self._want_uncertainty,
+            self._need_uncertainty,
             lambda: self._latest_complete,
         )
 
@@ -130,7 +130,7 @@ class Viewer:
         gc.collect()
         yield
 
-    def _want_uncertainty(self) -> None:
+    def _need_uncertainty(self) -> None:
         """Begin to add up the information of the photographs, unless that is done or under way."""
         uncertainty = self.subject.uncertainty
         if uncertainty is not None and not uncertainty.is_complete and not self.worker.has(_UNCERTAINTY_JOB):

@@ -62,7 +62,7 @@ class Session:
         worker: The thread that computes.
         preset: Preset that our pictures are drawn by at first.
         pixels: Largest number of pixels of a picture.
-        wants: Function that is called when the layer needs what is not known yet.
+        need_uncertainty: Function that is called when the layer needs a map that is not complete.
         latest_complete: Function that returns the last subject whose uncertainty is known; None before there is one.
     """
 
@@ -73,14 +73,14 @@ class Session:
         worker: Worker,
         preset: str,
         pixels: int,
-        wants: Callable[[], None],
+        need_uncertainty: Callable[[], None],
         latest_complete: Callable[[], Subject | None],
     ) -> None:
         self.client = client
         self.subject = subject
         self._worker = worker
         self._pixels = pixels
-        self._wants = wants
+        self._need_uncertainty = need_uncertainty
         self._latest_complete = latest_complete
         self._loop = asyncio.get_running_loop()
         self._lock = threading.Lock()  # of what follows: the worker's thread asks whether its picture is still wanted
@@ -104,7 +104,7 @@ class Session:
         self._build(preset)
         self._send_gaussians()
         self._show_placed_views()
-        self._ask_later()
+        self._draw_later()
         client.camera.on_update(self._camera_moved)
 
     def _widen(self) -> None:
@@ -177,7 +177,8 @@ class Session:
         if names != tuple(self._layer.options):
             self._layer.options = names
         if keeps := self._lacks_uncertainty() and self._latest_complete() is not None:
-            self._wants()  # an earlier checkpoint's map, and what is half drawn of it, stays until there is another
+            # An earlier checkpoint's map, and what is half drawn of it, stays until there is another.
+            self._need_uncertainty()
         else:
             self._hide()
         self.time = subject.nearest_time(self.time)
@@ -188,7 +189,7 @@ class Session:
         if subject.placed_views is not before.placed_views:
             self._show_placed_views()
         if not keeps:
-            self._ask_later()
+            self._draw_later()
 
     def say(self, text: str, scale: ColorScale | None = None) -> None:
         """Say in the panel what is being done, or shown. From any thread."""
@@ -197,7 +198,7 @@ class Session:
 
     def redraw(self) -> None:
         """Draw what is shown once more: something that it needs has become known."""
-        self._ask_later(0.0)
+        self._draw_later(0.0)
 
     def close(self) -> None:
         """The browser has gone."""
@@ -219,7 +220,7 @@ class Session:
         self._layer.hint = layer.hint
         self._hide()
         self._send_gaussians()
-        self._ask_later(0.0)
+        self._draw_later(0.0)
 
     async def _camera_moved(self, _: Any) -> None:
         seen = self._seen_pose()
@@ -233,7 +234,7 @@ class Session:
         self._widen()
         self._show_frusta()
         self._hide()
-        self._ask_later()
+        self._draw_later()
 
     async def _time_chosen(self, _: Any) -> None:
         if self._slider is None:  # what the browser sent before it knew that nothing moves any longer
@@ -243,14 +244,14 @@ class Session:
             self.time = wanted
             self._hide()
             self._send_gaussians()
-            self._ask_later()
+            self._draw_later()
 
     async def _play_clicked(self, _: Any) -> None:
         if self._button is None:  # as above
             return
         if self._playing is not None:
             self._stop_playing()
-            self._ask_later()
+            self._draw_later()
             return
         self._button.label = "pause"
         self._playing = asyncio.create_task(self._play())
@@ -373,7 +374,7 @@ class Session:
         if self._slider is not None and sight.camera.time is not None and self._playing is None:
             self._slider.value = self.subject.nearest_time(sight.camera.time)
         self._hide()
-        self._ask_later()
+        self._draw_later()
         self._about.content = panel.photograph(placed, sight)
         self._view.visible = True
         self._photograph.visible = False
@@ -400,7 +401,7 @@ class Session:
             self._stop_playing()
             if is_last or not self._worker.has((self, "gaussians")):
                 self._slider.value = self.subject.nearest_time(key.time)
-        self._ask_later()
+        self._draw_later()
 
     def _read_photograph(self, read: Callable[[int], np.ndarray]) -> Iterator[None]:
         """Job: a photograph into the panel."""
@@ -463,13 +464,13 @@ class Session:
                     if self._gaussians is not None:
                         self._gaussians.visible = True
 
-    def _ask_later(self, seconds: float = REST) -> None:
+    def _draw_later(self, seconds: float = REST) -> None:
         """Have our picture drawn if nothing happens for some time."""
         if self._timer:
             self._timer.cancel()
-        self._timer = self._loop.call_later(seconds, self._ask)
+        self._timer = self._loop.call_later(seconds, self._draw)
 
-    def _ask(self) -> None:
+    def _draw(self) -> None:
         """Have our picture drawn."""
         if self._playing is not None:
             return
@@ -478,7 +479,7 @@ class Session:
             return
         subject = self.subject
         if self._lacks_uncertainty():
-            self._wants()
+            self._need_uncertainty()
             earlier = self._latest_complete()
             if earlier is not None and earlier.layer(UNCERTAINTY).name == UNCERTAINTY:
                 subject = earlier
