@@ -100,7 +100,7 @@ def find_libraries(
     if named:
         return [Library(named, library_version(named), "environment")]
 
-    found: dict[str, Library] = {}  # by real path: distributions link one file under many names
+    by_file: dict[str, Library] = {}  # by real path: distributions link one file under many names
     for source, directory in _directories(Path(root), environ, prefix or sys.prefix):
         try:
             names = sorted(n for n in os.listdir(directory) if n.startswith("libLLVM"))
@@ -113,11 +113,11 @@ def find_libraries(
             if not _NAME.fullmatch(name) or not os.path.exists(real) or _foreign_elf(real):
                 continue
             version = library_version(path)
-            if real not in found or len(version) > len(found[real].version):
-                first = found[real].source if real in found else source
-                found[real] = Library(path, version, first)
+            if real not in by_file or len(version) > len(by_file[real].version):
+                first = by_file[real].source if real in by_file else source
+                by_file[real] = Library(path, version, first)
     # sorted() is stable, so the order of _directories decides between equal versions.
-    return sorted(found.values(), key=lambda lib: lib.version[:2], reverse=True)
+    return sorted(by_file.values(), key=lambda lib: lib.version[:2], reverse=True)
 
 
 def require_llvm(libraries: list[Library] | None = None) -> Library:

@@ -134,9 +134,9 @@ def color_corrected(image: torch.Tensor, target: torch.Tensor, mask: torch.Tenso
     wanted = target.detach().double().reshape(-1, 3).numpy()
     # A weighted least squares is one of rows that are scaled by the roots of the weights.
     scale = np.ones(len(colors)) if mask is None else mask.double().reshape(-1).sqrt().numpy()
-    found = [colors, *(_corrected(colors, wanted, scale, saturated) for saturated in (False, True))]
-    errors = [float(np.square((x - wanted) * scale[:, None]).sum()) for x in found]
-    return torch.from_numpy(found[int(np.argmin(errors))]).reshape(image.shape)
+    candidates = [colors, *(_corrected(colors, wanted, scale, saturated) for saturated in (False, True))]
+    errors = [float(np.square((x - wanted) * scale[:, None]).sum()) for x in candidates]
+    return torch.from_numpy(candidates[int(np.argmin(errors))]).reshape(image.shape)
 
 
 def _corrected(colors: np.ndarray, wanted: np.ndarray, scale: np.ndarray, saturated: bool) -> np.ndarray:
@@ -300,9 +300,9 @@ def evaluate(
         result["segmentation"] = None
         result["reasons"]["segmentation"] = segmentation
     elif segmentation is not None:
-        found = result["segmentation"] = segmentation.result()
-        numbers = [name for name in found["variants"] if name != "iou"]  # a list
-        result["scores"] |= {name: found["run"] and found["run"][name] for name in numbers}
+        labels = result["segmentation"] = segmentation.result()
+        numbers = [name for name in labels["variants"] if name != "iou"]  # a list
+        result["scores"] |= {name: labels["run"] and labels["run"][name] for name in numbers}
     return result
 
 
@@ -491,29 +491,29 @@ def renderers_table(metrics: Mapping[str, Any]) -> tuple[str, tuple[str, ...], l
     keys = {"psnr": "PSNR", "cc_psnr": "color-corrected"}
     worst, by = "worst\nPSNR", "psnr"
     rows: list[tuple[str, ...]] = []
-    if (found := metrics.get("renderers")) and found["rows"]:
-        count = len(found["rows"][0]["views"])
+    if (measured := metrics.get("renderers")) and measured["rows"]:
+        count = len(measured["rows"][0]["views"])
         # Older versions measured a part of the test views without saying so.
-        total = found.get("of", metrics.get("count") if found["split"] == metrics.get("split") else None) or count
-        if "psnr_object" in found["rows"][0]["mean"]:
+        total = measured.get("of", metrics.get("count") if measured["split"] == metrics.get("split") else None) or count
+        if "psnr_object" in measured["rows"][0]["mean"]:
             keys = {"psnr_object": "PSNR of\nthe object", "psnr_frame": "PSNR of\nthe frame"} | keys
             del keys["psnr"]  # one of these two, by what says where the object is
             worst, by = "worst PSNR of\nthe object", "psnr_object"
-        for row in found["rows"]:
+        for row in measured["rows"]:
             means = (_decibels(row["mean"].get(key)) for key in keys)
             # The worst of some views may be far better than the worst of all.
             last = (_decibels(row["worst"].get(by)), row["worst"]["name"]) if count == total else ()
             rows.append((row["name"], *means, *last))
         head = ("renderer", *keys.values(), *((worst, "worst view") if count == total else ()))
         several = f"{count}" if count == total else f"{count} of {total}"
-    elif found := metrics.get("viewers"):
-        values = {"the run's own": found["own_psnr"], found["preset"]: found["psnr"]}
+    elif measured := metrics.get("viewers"):
+        values = {"the run's own": measured["own_psnr"], measured["preset"]: measured["psnr"]}
         rows = [(name, f"{value:.2f}") for name, value in values.items()]
         head = ("renderer", "PSNR")
-        several = f"{len(found['views'])}"
+        several = f"{len(measured['views'])}"
     else:
         return "", (), rows
-    shown = f"{several} {found['split']} views of {found['width']}x{found['height']}"
+    shown = f"{several} {measured['split']} views of {measured['width']}x{measured['height']}"
     return f"The same Gaussians in several renderers, {shown}", head, rows
 
 

@@ -197,8 +197,8 @@ class Oracle:
 def _grad(loss: torch.Tensor, groups: Mapping[str, torch.Tensor], **options: bool) -> dict[str, torch.Tensor]:
     if not loss.requires_grad:
         return {name: torch.zeros_like(x) for name, x in groups.items()}
-    found = torch.autograd.grad(loss, list(groups.values()), allow_unused=True, **options)
-    return {n: torch.zeros_like(x) if y is None else y for (n, x), y in zip(groups.items(), found, strict=True)}
+    derivatives = torch.autograd.grad(loss, list(groups.values()), allow_unused=True, **options)
+    return {n: torch.zeros_like(x) if y is None else y for (n, x), y in zip(groups.items(), derivatives, strict=True)}
 
 
 def gradients(
@@ -207,8 +207,8 @@ def gradients(
     """float64 gradient of sum <u, image> by group, `camera` and `camera_end` as twists."""
     # Sums over an image in float64: in float32 they lose more digits than the gradients are compared by.
     loss = sum((getattr(out, name).double() * w).sum() for name, w in u.items())
-    found = {name: x.double() for name, x in _grad(loss, leaves(g, cam)).items()}
-    return found | {name: pose_gradient(pose, found[name]) for name, pose in _poses(cam).items()}
+    derivatives = {name: x.double() for name, x in _grad(loss, leaves(g, cam)).items()}
+    return derivatives | {name: pose_gradient(pose, derivatives[name]) for name, pose in _poses(cam).items()}
 
 
 @dataclasses.dataclass

@@ -150,8 +150,8 @@ class ReferenceModel:
         for (y, x), image, _ in self._pieces(leaves, camera, oracle):
             if image.requires_grad:
                 loss = (image * cotangent[y : y + image.shape[0], x : x + image.shape[1]]).sum()
-                found = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True, retain_graph=True)
-                for name, slope in zip(leaves, found, strict=True):
+                derivatives = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True, retain_graph=True)
+                for name, slope in zip(leaves, derivatives, strict=True):
                     total[name] += 0 if slope is None else slope.double()
         return total
 
@@ -162,7 +162,7 @@ class ReferenceModel:
         `drgs.reference` marks them `ambiguous`: two correct renderers differ there, the gradient more than the image.
         """
         camera = self._camera(camera)
-        found = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+        ties = torch.zeros(camera.height, camera.width, dtype=torch.bool)
         with torch.no_grad():  # marks of pixels have no derivative
             g, _ = gaussians_of(self._parameters(raw, camera))
             for x, y, width, height in _windows(camera, self._is_odd):
@@ -177,8 +177,8 @@ class ReferenceModel:
                     effect=_EFFECT,
                     **self._odd_ones(),
                 )
-                found[y : y + height, x : x + width] = out.ambiguous
-        return self._flipped(found)
+                ties[y : y + height, x : x + width] = out.ambiguous
+        return self._flipped(ties)
 
     def _pieces(self, raw: dict, camera: Camera, oracle: bool) -> Iterator[tuple]:
         """The image before it is flipped, in pieces: (row, column) of its corner, image and alpha."""

@@ -170,7 +170,7 @@ def crossval(
         say("near ties")
         return model.near_ties(raw, cameras[view])
 
-    found = conventions.find(
+    search = conventions.find(
         pictures[first],
         list(starts.values()),
         lambda m: drawn_by(m, first)[0],
@@ -178,11 +178,11 @@ def crossval(
         _SETTLED[dtype],
         lambda m: m.suits(cameras[first], len(g)),
     )
-    model = found.model
-    claimed = next(name for name, start in starts.items() if start == found.start)
+    model = search.model
+    claimed = next(name for name, start in starts.items() if start == search.start)
     drawn = [drawn_by(model, view) for view in range(len(cameras))]
     if not any(bool(alpha.any()) for _, alpha in drawn):
-        if any(bool(drawn_by(found.start, view)[1].any()) for view in range(len(cameras))):
+        if any(bool(drawn_by(search.start, view)[1].any()) for view in range(len(cameras))):
             raise ValueError(
                 f"{rasterizer.name}: its image must show Gaussians, shows the background alone where preset {claimed} "
                 "shows some; correct the rasterizer"
@@ -193,8 +193,8 @@ def crossval(
     judge(case, model, comparison)
     if not comparison.agrees:
         say("what the error looks like")
-        models = {"the model at its conventions": model} if found.findings else {}
-        models |= {f"preset {claimed}": found.start}  # and what else may be meant
+        models = {"the model at its conventions": model} if search.findings else {}
+        models |= {f"preset {claimed}": search.start}  # and what else may be meant
         models |= {f"preset {name}": start for name, start in starts.items()}
         comparison.views = with_errors(comparison, pictures, models, drawn_by)
     not_offered = {k: "its image has no gradient of them" for k in MOTIONS if k in raw and k not in comparison.groups}
@@ -202,14 +202,14 @@ def crossval(
         wide, reason = _wide_gradients(case, model, comparison, channels, seed, functools.partial(ties_of, model))
         comparison.groups |= wide
         not_offered |= {COLORS: reason} if reason else {}
-    report = _report(case, comparison, found, claimed, given, places, not_offered, seed)
+    report = _report(case, comparison, search, claimed, given, places, not_offered, seed)
     say("pictures")
     exact = ReferenceModel(RenderSettings.preset("exact", background=background))
     images = []
     for picture, (same, _), camera in zip(pictures, drawn, cameras, strict=True):
         true, _ = _drawn(exact, raw, camera, False)
         images.append({"rasterizer": picture.numpy(), "model": same.numpy(), "exact": true.numpy()})
-    return Result(report, images, comparison.groups, comparison.views, found.findings, model, g, cameras)
+    return Result(report, images, comparison.groups, comparison.views, search.findings, model, g, cameras)
 
 
 def _starting_models(
@@ -261,7 +261,7 @@ def _images(
 def _report(
     case: Case,
     comparison: Compared,
-    found: conventions.SearchResult,
+    search: conventions.SearchResult,
     claimed: str,
     given: tuple[Gaussians, list[Camera]],
     places: list[Crop | None],
@@ -272,17 +272,17 @@ def _report(
     worst = min((row.verdict for row in comparison.groups.values()), key=VERDICTS.index)
     if not comparison.agrees:
         worst = min(worst, "model difference", key=VERDICTS.index)
-    elif found.findings:
+    elif search.findings:
         worst = min(worst, "other convention", key=VERDICTS.index)
     report = {
         "rasterizer": case.rasterizer.name,
         "verdict": worst,
         "preset": claimed,
-        "conventions": [dataclasses.asdict(finding) for finding in found.findings],
+        "conventions": [dataclasses.asdict(finding) for finding in search.findings],
         "image": {
             "agrees": comparison.agrees,
-            "before": found.before,
-            "after": found.after,
+            "before": search.before,
+            "after": search.after,
             "views": [dataclasses.asdict(row) for row in comparison.views],
         },
         "groups": {name: row.json() for name, row in comparison.groups.items()},
@@ -300,7 +300,7 @@ def _report(
         "background": list(case.background),
         "tolerance": case.tolerance,
         "seed": seed,
-        "settings": dataclasses.asdict(found.model.settings),
+        "settings": dataclasses.asdict(search.model.settings),
     }
     report["scope"] = _scope(report)
     return report
@@ -450,9 +450,9 @@ def _wide_gradients(
         return {}, f"it draws no image of {channels} channels: {one_line(error)}"
     wide = dataclasses.replace(case, raw=raw, cameras=[camera], background=black, first=0)
     drawn = [_drawn(model, raw, camera, case.oracle)]
-    found = compared(wide, model, u, [picture], [alpha], drawn, lambda _: near_ties(case.first))
+    wider = compared(wide, model, u, [picture], [alpha], drawn, lambda _: near_ties(case.first))
     right = [name for name, row in rgb.groups.items() if row.verdict == "agreement"]
-    found.groups = {name: row for name, row in found.groups.items() if name == COLORS or name in right}
-    judge(wide, model, found)
-    rows = {COLORS: found.groups.pop(COLORS)}
-    return rows | {f"{k}, {channels} channels": x for k, x in found.groups.items() if x.verdict != "agreement"}, ""
+    wider.groups = {name: row for name, row in wider.groups.items() if name == COLORS or name in right}
+    judge(wide, model, wider)
+    rows = {COLORS: wider.groups.pop(COLORS)}
+    return rows | {f"{k}, {channels} channels": x for k, x in wider.groups.items() if x.verdict != "agreement"}, ""

@@ -173,10 +173,10 @@ def pattern_of(
     case = _Case(*(np.asarray(x, np.float64) for x in (wrong, right, alpha, background)), np.asarray(counts, bool))
     if not np.any((case.wrong - case.right)[case.counts]):
         return Pattern("none", "no error where pixels count", math.nan)
-    found = sorted(_changes(case), key=lambda pattern: list(PATTERNS).index(pattern.name))
-    best = max(pattern.explained for pattern in found)
+    patterns = sorted(_changes(case), key=lambda pattern: list(PATTERNS).index(pattern.name))
+    best = max(pattern.explained for pattern in patterns)
     if best >= _FOUND:
-        return next(pattern for pattern in found if pattern.explained >= best - _AS_GOOD)
+        return next(pattern for pattern in patterns if pattern.explained >= best - _AS_GOOD)
     return _place(case) or Pattern("none", "no known pattern", math.nan)
 
 

@@ -315,10 +315,10 @@ class Pictures:
             # In float64, so that rounding of the sum is no rung of the ladder.
             loss: Any = sum((image.double() * u).sum() for image, u in zip(images, cotangents, strict=True))
             leaves = [g.parameters()[name] for name in PARAMETERS]
-            found: Sequence[torch.Tensor | None] = [None] * len(leaves)
+            derivatives: Sequence[torch.Tensor | None] = [None] * len(leaves)
             if loss.requires_grad:
-                found = torch.autograd.grad(loss, leaves, allow_unused=True)
-            for name, leaf, x in zip(PARAMETERS, leaves, found, strict=True):
+                derivatives = torch.autograd.grad(loss, leaves, allow_unused=True)
+            for name, leaf, x in zip(PARAMETERS, leaves, derivatives, strict=True):
                 gradient[name] = torch.zeros_like(leaf) if x is None else x.detach().cpu()
         # What is kept are numbers: a graph would hold every picture's intermediates.
         return State(torch.cat([x.detach().cpu().double().reshape(-1, 3) for x in images]), gradient)

@@ -86,7 +86,7 @@ class Rasterizer:
             if not image.requires_grad:
                 raise ValueError(f"--rasterizer {self.name}: its image must be differentiable by torch, has no graph")
             loss = (image * cotangent.to(image)).sum()
-            found = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
+            derivatives = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
         except Exception:
             moving = [name for name in MOTIONS if name in raw]
             if not moving:
@@ -95,7 +95,9 @@ class Rasterizer:
             fixed = {name: x for name, x in raw.items() if name not in MOTIONS}
             return {**self.gradient(fixed, camera, background, cotangent), **dict.fromkeys(moving)}
         # Gradients are numbers from here on; a function may have asked for a graph of them.
-        return {name: None if x is None else x.detach().double().cpu() for name, x in zip(leaves, found, strict=True)}
+        return {
+            name: None if x is None else x.detach().double().cpu() for name, x in zip(leaves, derivatives, strict=True)
+        }
 
     def taken(self, raw: dict) -> dict:
         """Copies of the parameters as it wants them."""
@@ -145,8 +147,8 @@ def load_rasterizer(
         if not torch.cuda.is_available():
             raise ValueError("--rasterizer gsplat: must have a CUDA card, torch finds none; use a dump made on one")
         return function(_three_channels_along_rays(rasterization), text, along_rays)
-    found = imported_function("--rasterizer", text, "drgs:PRESET, gsplat, a file .npz or .safetensors, or ")
-    return function(found, text, along_rays)
+    imported = imported_function("--rasterizer", text, "drgs:PRESET, gsplat, a file .npz or .safetensors, or ")
+    return function(imported, text, along_rays)
 
 
 def ours(settings: RenderSettings, name: str, preset: str | None = None) -> Rasterizer:
@@ -226,25 +228,25 @@ def _three_channels_along_rays(rasterization: Callable) -> Callable:
 
 def _lens_arguments(camera: Camera, like: dict, accepted: Mapping[str, inspect.Parameter]) -> dict:
     """A camera's lens and shutter as gsplat's arguments; none of a pinhole that stands still."""
-    found: dict[str, Any] = {}
+    arguments: dict[str, Any] = {}
     if camera.model == "opencv_fisheye":
-        found |= {"camera_model": "fisheye", "radial_coeffs": torch.tensor([camera.distortion], **like)}
+        arguments |= {"camera_model": "fisheye", "radial_coeffs": torch.tensor([camera.distortion], **like)}
     elif camera.is_distorted:
         k1, k2, p1, p2, *rest = camera.distortion
         rest = [*rest, *[0.0] * (8 - len(rest))]  # k3 to k6, and a thin prism's s1 to s4
-        found |= {
+        arguments |= {
             "camera_model": "pinhole",
             "radial_coeffs": torch.tensor([[k1, k2, *rest[:4]]], **like),
             "tangential_coeffs": torch.tensor([[p1, p2]], **like),
         }
         if any(rest[4:]):
-            found["thin_prism_coeffs"] = torch.tensor([rest[4:]], **like)
+            arguments["thin_prism_coeffs"] = torch.tensor([rest[4:]], **like)
     if camera.is_rolling:
         # gsplat's is a member of an enumeration, whose type its default has.
         kinds = type(accepted["rolling_shutter"].default) if "rolling_shutter" in accepted else str
         kind = kinds[camera.shutter.upper()] if issubclass(kinds, enum.Enum) else camera.shutter
-        found |= {"rolling_shutter": kind, "viewmats_rs": float64(camera.w2c_end).to(**like)[None]}
-    return found
+        arguments |= {"rolling_shutter": kind, "viewmats_rs": float64(camera.w2c_end).to(**like)[None]}
+    return arguments
 
 
 def _taste(draw: Callable) -> tuple[torch.dtype, str]:
@@ -385,22 +387,22 @@ def read_dump(path: Path, g: Gaussians, cameras: list[Camera], background: tuple
     Raises:
         ValueError: If it is damaged, or of another scene; one line.
     """
-    found = _arrays(path)
+    arrays = _arrays(path)
     scene = scene_arrays(g, cameras, background)
     count = len(cameras)
     size = (cameras[0].height, cameras[0].width)
     shapes = {"image": (*size, 3), "alpha": size, "cotangent": (*size, 3)}
     names = [*shapes, *(f"grad_{name}" for name in PARAMETERS), *scene]
-    pose = [_POSE] if _POSE in found else []
-    if missing := [name for name in names if name not in found]:
+    pose = [_POSE] if _POSE in arrays else []
+    if missing := [name for name in names if name not in arrays]:
         raise ValueError(f"{path}: must hold {', '.join(names)}; {missing[0]} is missing; write it anew from --export")
-    for name, array in found.items():
+    for name, array in arrays.items():
         if name in (*names, *pose) and not np.isfinite(array).all():
             index = tuple(int(i) for i in np.argwhere(~np.isfinite(np.atleast_1d(array)))[0])
             if not name.startswith("grad_"):  # a gradient that is not finite is a finding
                 raise ValueError(f"{path}: {name} must be finite, is {np.atleast_1d(array)[index]} at {index}")
     for name, wanted in scene.items():
-        got = found[name].reshape(wanted.shape) if found[name].size == wanted.size else found[name]
+        got = arrays[name].reshape(wanted.shape) if arrays[name].size == wanted.size else arrays[name]
         if got.shape != wanted.shape:
             raise ValueError(f"{path}: {name} must have shape {wanted.shape}, got {got.shape}: it is of another scene")
         # Arrays of float32, which the other side may have computed again from its own parameters.
@@ -408,24 +410,24 @@ def read_dump(path: Path, g: Gaussians, cameras: list[Camera], background: tuple
             what = "the same scene, cameras and background"
             raise ValueError(f"{path}: must be of {what}, its {name} differs; write it anew from --export")
     for name, shape in shapes.items():
-        got = found[name].squeeze(-1) if name == "alpha" and found[name].shape[-1:] == (1,) else found[name]
+        got = arrays[name].squeeze(-1) if name == "alpha" and arrays[name].shape[-1:] == (1,) else arrays[name]
         if got.shape == shape and count == 1:
             got = got[None]
         if got.shape != (count, *shape):
-            raise ValueError(f"{path}: {name} must have shape {(count, *shape)}, got {found[name].shape}")
-        found[name] = got
+            raise ValueError(f"{path}: {name} must have shape {(count, *shape)}, got {arrays[name].shape}")
+        arrays[name] = got
     for name in PARAMETERS:
-        if found[f"grad_{name}"].shape != scene[name].shape:
+        if arrays[f"grad_{name}"].shape != scene[name].shape:
             wanted = scene[name].shape
-            got = found[f"grad_{name}"].shape
+            got = arrays[f"grad_{name}"].shape
             raise ValueError(f"{path}: grad_{name} must have shape {wanted}, got {got}")
-    if pose and found[_POSE].reshape(-1).shape != scene["viewmat"].reshape(-1).shape:
-        raise ValueError(f"{path}: {_POSE} must have shape {scene['viewmat'].shape}, got {found[_POSE].shape}")
+    if pose and arrays[_POSE].reshape(-1).shape != scene["viewmat"].reshape(-1).shape:
+        raise ValueError(f"{path}: {_POSE} must have shape {scene['viewmat'].shape}, got {arrays[_POSE].shape}")
     # Through float64 of this machine: files may have another byte order, which torch refuses.
-    as_tensor = {name: torch.from_numpy(found[name].astype(np.float64)) for name in names if name not in scene}
+    as_tensor = {name: torch.from_numpy(arrays[name].astype(np.float64)) for name in names if name not in scene}
     gradients = {name: as_tensor[f"grad_{name}"] for name in PARAMETERS}
     if pose:
-        slopes = torch.from_numpy(found[_POSE].astype(np.float64)).reshape(count, 4, 4)
+        slopes = torch.from_numpy(arrays[_POSE].astype(np.float64)).reshape(count, 4, 4)
         gradients[POSE] = along_motions(g, cameras, slopes)
     return Dump(str(path), as_tensor["image"], as_tensor["alpha"], as_tensor["cotangent"], gradients)
 

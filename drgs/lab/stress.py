@@ -214,17 +214,17 @@ def _information(case: ExtremeCase, settings: RenderSettings, truth: Truth) -> t
     from drgs.lab.accuracy import entry_error
 
     g, cam, view = truth.g, truth.cam, truth.view
-    found = fisher.diagonal(g, cam, settings)
+    diagonal = fisher.diagonal(g, cam, settings)
     blocks = fisher.blocks(g, cam, settings)
-    finite = all(bool(torch.isfinite(x).all()) for x in (*found.values(), blocks))
+    finite = all(bool(torch.isfinite(x).all()) for x in (*diagonal.values(), blocks))
     if view is None:
         return None, finite, truth.remark
     if view is not cam:
-        found = fisher.diagonal(g, view, settings)
-    error = max(entry_error(found[name], x) for name, x in truth.information.items())
+        diagonal = fisher.diagonal(g, view, settings)
+    error = max(entry_error(diagonal[name], x) for name, x in truth.information.items())
     if not case.gain:
         return error, finite, truth.remark
-    gain, remark = _gain(g, view, settings, found, truth.information)
+    gain, remark = _gain(g, view, settings, diagonal, truth.information)
     return max(error, gain), finite, remark
 
 

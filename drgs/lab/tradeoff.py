@@ -337,14 +337,14 @@ class TradeoffRow:
         """`errors`, where the truth's own are known."""
         if self.skipped is not None or self.by == "oracle":
             return WorstErrors()
-        found = {}
+        errors = {}
         if self.image:
-            found["image"] = max(self.image.rms, self.image.p999)
+            errors["image"] = max(self.image.rms, self.image.p999)
         if self.gradient and self.gradient.worst is not None:
-            found["gradient"] = self.gradient.worst
+            errors["gradient"] = self.gradient.worst
         if self.information and self.information.group:
-            found["information"] = max(self.information.l1, self.information.median)
-        return WorstErrors(**{kind: x + (getattr(own, kind) or 0.0) for kind, x in found.items()})
+            errors["information"] = max(self.information.l1, self.information.median)
+        return WorstErrors(**{kind: x + (getattr(own, kind) or 0.0) for kind, x in errors.items()})
 
     def to_json(self) -> dict[str, Any]:
         """As tradeoff.json holds it."""
@@ -515,9 +515,9 @@ def recommend(measured: Measured, use: str, budgets: Sequence[float]) -> list[Ad
                 row, error, times = exact
                 times = times or row.times[clock]
                 pick = dataclasses.replace(pick, reason="no measurable gain over exact")
-            found = {"name": row.name, "kind": row.kind, "flags": row.flags, "gain": bool(faster), "full": full}
+            fields = {"name": row.name, "kind": row.kind, "flags": row.flags, "gain": bool(faster), "full": full}
             numbers = {name: getattr(times, name) for name in ("ratio", "low", "high", "rounds")}
-            pick = dataclasses.replace(pick, error=error, **found, **numbers)
+            pick = dataclasses.replace(pick, error=error, **fields, **numbers)
         else:
             pick = dataclasses.replace(pick, reason=_why_none(measured, use))
         picks.append(pick)
@@ -537,8 +537,8 @@ def _within(measured: Measured, use: str, budget: float) -> list[tuple[TradeoffR
     """Candidates whose errors are within the budget, with the largest of them."""
     clock, kinds = USES[use]
     rows = [row for row in measured.rows if row.skipped is None and row.share == 1 and row.by == "view"]
-    found = [(row, row.errors.worst(kinds)) for row in rows if row.times[clock] is not None]
-    return [(row, error) for row, error in found if error is not None and error <= budget]
+    errors = [(row, row.errors.worst(kinds)) for row in rows if row.times[clock] is not None]
+    return [(row, error) for row, error in errors if error is not None and error <= budget]
 
 
 Tensors = dict[str, torch.Tensor]
@@ -684,8 +684,8 @@ class _Setup:
 
     def gradient(self, image: torch.Tensor, cotangent: torch.Tensor) -> Tensors:
         """J^T u by group."""
-        found = torch.autograd.grad((image * cotangent).sum(), list(self.leaves.values()), allow_unused=True)
-        pairs = zip(self.leaves.items(), found, strict=True)
+        derivatives = torch.autograd.grad((image * cotangent).sum(), list(self.leaves.values()), allow_unused=True)
+        pairs = zip(self.leaves.items(), derivatives, strict=True)
         return {name: torch.zeros_like(x) if y is None else y for (name, x), y in pairs}
 
     def information(self, camera: Camera, settings: RenderSettings, share: float) -> Tensors:
@@ -804,12 +804,12 @@ def _sampled(rows: list[TradeoffRow], setup: _Setup, truth: _Measurement, seed: 
         wanted = _RAYS if row.by == "rays" else max(32, min(_RAYS, _PAIRS // count))
         chosen = places[:wanted].sort().values
         try:
-            found = _by_rays(row, setup, truth, chosen)
+            errors = _by_rays(row, setup, truth, chosen)
         except (ValueError, NotImplementedError, OSError, RuntimeError) as error:
             row.skipped = why_skipped(error)
             continue
         if row.by == "oracle":
-            own = found
+            own = errors
     return own
 
 
@@ -898,9 +898,9 @@ def scaled_diagonal(
         method: Method of `drgs.fisher.diagonal`.
     """
     small = by_share(camera, share)
-    found = fisher.diagonal(gaussians, small, settings, method)
+    diagonal = fisher.diagonal(gaussians, small, settings, method)
     scale = camera.width * camera.height / (small.width * small.height)
-    return {name: x * scale for name, x in found.items()} if share != 1 else found
+    return {name: x * scale for name, x in diagonal.items()} if share != 1 else diagonal
 
 
 def clocked(work: Callable[[], _Result]) -> tuple[_Result, float]:
@@ -1000,10 +1000,10 @@ def measure_full(
                 spent += took[name][-1]
         seconds = max(seconds - spent, 0.0)
         for name, times in took.items():
-            found = interval([a / b for a, b in zip(times, took[exact.name], strict=True)])
-            if found.rounds < _ROUNDS and name != exact.name:
-                found = _widened(found, measured.scatter[clock])
-            rows[name].full[clock] = FullTime(**dataclasses.asdict(found), seconds=statistics.median(times))
+            ratios = interval([a / b for a, b in zip(times, took[exact.name], strict=True)])
+            if ratios.rounds < _ROUNDS and name != exact.name:
+                ratios = _widened(ratios, measured.scatter[clock])
+            rows[name].full[clock] = FullTime(**dataclasses.asdict(ratios), seconds=statistics.median(times))
         report[clock] = FullSize([views[0].width, views[0].height], drawn, len(took[exact.name]), list(took))
     return report
 

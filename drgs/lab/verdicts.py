@@ -275,13 +275,13 @@ def compared(
         poses = any(theirs.get(name) is not None for name in MOTIONS)
         offered = [name for name, x in theirs.items() if name not in MOTIONS or poses]
         groups = {name: _group_row(theirs[name], ours[name], case.tolerance) for name in offered}
-        found = Compared(views, agrees, u, theirs, groups, ties, counted)
+        comparison = Compared(views, agrees, u, theirs, groups, ties, counted)
         if ties.any() or (agrees and all(row.verdict for row in groups.values())):
-            return found
+            return comparison
         ties = torch.stack([near_ties(view) for view in range(len(case.cameras))])
         counted = float((~ties).double().mean()) < LEAST
         if counted or not ties.any():
-            return dataclasses.replace(found, ties=ties, counted=counted)
+            return dataclasses.replace(comparison, ties=ties, counted=counted)
 
 
 def judge(case: Case, model: ReferenceModel, compared: Compared) -> None:
@@ -317,7 +317,7 @@ def judge(case: Case, model: ReferenceModel, compared: Compared) -> None:
 
 
 def with_errors(
-    found: Compared,
+    comparison: Compared,
     pictures: list[torch.Tensor],
     models: dict[str, ReferenceModel],
     draw: Callable[[ReferenceModel, int], tuple[torch.Tensor, torch.Tensor]],
@@ -328,14 +328,14 @@ def with_errors(
     been taken for conventions that explain a part of it. The model whose images they explain best is named.
 
     Args:
-        found: The comparison of these views.
+        comparison: That of these views.
         pictures: (H, W, 3) images of the rasterizer.
         models: Name in words -> the model; the first is the one at the rasterizer's conventions, whose pixels are
             compared.
         draw: Function of a model and a view's index: its (H, W, 3) image and (H, W) alpha.
     """
-    off = [k for k, row in enumerate(found.views) if not _is_same(row)]
-    counts = {k: (~found.ties[k] | found.counted).numpy() for k in off}
+    off = [k for k, row in enumerate(comparison.views) if not _is_same(row)]
+    counts = {k: (~comparison.ties[k] | comparison.counted).numpy() for k in off}
     wrong = {k: pictures[k].numpy() for k in off}
     seen: dict[str, dict[int, Pattern]] = {}
     for name, model in models.items():
@@ -343,7 +343,7 @@ def with_errors(
         seen[name] = {k: pattern_of(wrong[k], *drawn[k], model.settings.background, counts[k]) for k in off}
     name = max(models, key=lambda name: sum(x.explained for x in seen[name].values() if x.is_change))
     first = next(iter(models.values()))
-    rows = list(found.views)
+    rows = list(comparison.views)
     for k in off:
         image = draw(first, k)[0].numpy()
         rows[k] = dataclasses.replace(rows[k], error=error_row(wrong[k], image, counts[k], seen[name][k], name))
@@ -441,10 +441,10 @@ def _decide(case: Case, model: ReferenceModel | None, compared: Compared, names:
     raw = case.raw
     background = case.background
     camera, u = case.cameras[case.first], compared.u[case.first]
-    found = rasterizer.gradient(raw, camera, background, u)
-    found = {name: torch.zeros_like(raw[name]) if x is None else x for name, x in found.items()}
-    wanted = found if model is None else model.gradient(raw, camera, u)
-    chosen = {name: _entries(found[name], wanted[name], case.entries) for name in names}
+    gradients = rasterizer.gradient(raw, camera, background, u)
+    gradients = {name: torch.zeros_like(raw[name]) if x is None else x for name, x in gradients.items()}
+    wanted = gradients if model is None else model.gradient(raw, camera, u)
+    chosen = {name: _entries(gradients[name], wanted[name], case.entries) for name in names}
     own = central(rasterizer, raw, camera, background, u, chosen)
     kept = rasterizer.gradient(raw, camera, background, u * own.kept[..., None])
     wanted = None if model is None else model.gradient(raw, camera, u * own.kept[..., None])
@@ -559,20 +559,20 @@ def central(
         slopes[group] = []
         steps[group] = []
         for index in indices:
-            found, used = _slopes(rasterizer, raw, camera, background, group, index)
-            largest = max(float(x.abs().max()) for x in found)
-            for a, b, h in zip(found, found[1:], used[1:], strict=False):
+            differences, used = _slopes(rasterizer, raw, camera, background, group, index)
+            largest = max(float(x.abs().max()) for x in differences)
+            for a, b, h in zip(differences, differences[1:], used[1:], strict=False):
                 kept &= ~((a - b).abs() > _JUMP * largest + 8 * noise / h).any(-1)
-            slopes[group].append(found)
+            slopes[group].append(differences)
             steps[group].append(used)
     weight = cotangent * kept[..., None]
     good = {group: [] for group in entries}
     values, bars = ({group: [] for group in entries} for _ in range(2))
     left_out = dict.fromkeys(entries, 0)
     for group, indices in entries.items():
-        for index, found, used in zip(indices, slopes[group], steps[group], strict=True):
-            sums = [float((weight * x).sum()) for x in found]
-            changed = found[-1] != 0
+        for index, differences, used in zip(indices, slopes[group], steps[group], strict=True):
+            sums = [float((weight * x).sum()) for x in differences]
+            changed = differences[-1] != 0
             touched = int((changed & kept[..., None]).sum())
             if touched < _KEPT * int(changed.sum()):  # what is left says nothing about this entry
                 left_out[group] += 1

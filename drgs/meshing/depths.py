@@ -72,9 +72,9 @@ def depth_views(
         with torch.no_grad():
             out = render(plain, camera, settings, (output,))
         alpha = out.alpha.cpu().numpy()
-        found = getattr(out, output).cpu().numpy()
-        is_solid = (alpha > _SOLID) & (found > 0)
-        depth = np.where(is_solid, found, np.inf).astype(np.float32)
+        measured = getattr(out, output).cpu().numpy()
+        is_solid = (alpha > _SOLID) & (measured > 0)
+        depth = np.where(is_solid, measured, np.inf).astype(np.float32)
         spread = None
         if out.features is not None:
             # The mean of the logarithm, over the weights of what is seen.

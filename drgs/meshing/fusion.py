@@ -47,7 +47,7 @@ def bricks_of(views: Sequence[DepthView], voxel: float, trunc: float, most: int 
     for view in views:
         if most is not None and len(keys) > most:
             break
-        found = []
+        keys_of_views = []
         is_solid = np.isfinite(view.depth)
         directions, origins = view.camera.pixel_directions()[is_solid], view.camera.pixel_origins()[is_solid]
         depth = view.depth[is_solid].astype(np.float64)
@@ -55,8 +55,8 @@ def bricks_of(views: Sequence[DepthView], voxel: float, trunc: float, most: int 
             at = origins + np.maximum(depth + shift, 0.0)[:, None] * directions
             index = np.floor(at / (voxel * BRICK))
             index = index[(np.abs(index) < _MOST).all(axis=1)].astype(np.int64) + _MOST
-            found.append(np.unique((index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]))
-        keys = np.unique(np.concatenate([keys, *found]))
+            keys_of_views.append(np.unique((index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]))
+        keys = np.unique(np.concatenate([keys, *keys_of_views]))
     mask = (1 << 21) - 1
     return np.stack([keys >> 42, (keys >> 21) & mask, keys & mask], axis=1) - _MOST
 
@@ -116,10 +116,10 @@ def sampled(view: DepthView, points: np.ndarray, trunc: float) -> tuple[np.ndarr
     with np.errstate(invalid="ignore"):
         agree = corners.max(0) - corners.min(0) < trunc
         smooth = (parts * corners).sum(0)
-    found = np.where(agree, smooth, nearest) - distance[is_inside]
+    difference = np.where(agree, smooth, nearest) - distance[is_inside]
     with np.errstate(invalid="ignore"):
-        is_at_edge = (found >= trunc) & (corners.min(0) - distance[is_inside] < trunc)
-    signed[is_inside] = np.where(is_at_edge, np.nan, found)
+        is_at_edge = (difference >= trunc) & (corners.min(0) - distance[is_inside] < trunc)
+    signed[is_inside] = np.where(is_at_edge, np.nan, difference)
     weight[is_inside] = view.weight[row, column]
     return signed, weight, pixels
 

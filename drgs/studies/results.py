@@ -70,7 +70,7 @@ def results_page(
 
 def results_rows(study: Study, experiment: Experiment, rows: ResultRows) -> list[dict[str, Any]]:
     """The same numbers for machines: one for each protocol and policy."""
-    found = []
+    lines = []
     for protocol in PROTOCOLS:
         mine = [row for row in rows if row["protocol"] == protocol and row["policy"] in experiment.policies]
         wins, compared_units = best_of_units(mine)
@@ -85,8 +85,8 @@ def results_rows(study: Study, experiment: Experiment, rows: ResultRows) -> list
                 line[metric.key] = estimate(values).mean if values else None
             line["best"] = {"units": wins.get(label, 0), "of": compared_units}
             line |= {key: _cost(own, key) for key in _COSTS} | {"paper": dict(experiment.paper.get(label, {}))}
-            found.append(line)
-    return found
+            lines.append(line)
+    return lines
 
 
 def best_of_units(rows: ResultRows, metric: str = _BEST_BY) -> tuple[dict[str, int], int]:
@@ -156,8 +156,8 @@ def _mean(metric: Metric, values: Mapping[Unit, float]) -> str:
 
 def _cost(rows: ResultRows, key: str) -> float | None:
     """Mean over the fits that recorded it, in the unit of the table."""
-    found = [x for row in rows if (x := _one_cost(row, key)) is not None]
-    return float(np.mean(found)) if found else None
+    costs = [x for row in rows if (x := _one_cost(row, key)) is not None]
+    return float(np.mean(costs)) if costs else None
 
 
 def _one_cost(row: Mapping[str, Any], key: str) -> float | None:

@@ -104,12 +104,12 @@ def view_counts(rows: Iterable[Mapping[str, Any]]) -> list[int]:
 
 def at_views(rows: Iterable[Mapping[str, Any]], count: int) -> list[dict[str, Any]]:
     """The rows that were measured with so many views, on the way or at the end, with the metrics of then."""
-    found = []
+    measured = []
     for row in rows:
         metrics = row["metrics"] if _last(row) == count else row.get("curve", {}).get(str(count))
         if metrics is not None:
-            found.append({**row, "metrics": metrics})
-    return found
+            measured.append({**row, "metrics": metrics})
+    return measured
 
 
 def _last(row: Mapping[str, Any]) -> int:
@@ -119,11 +119,11 @@ def _last(row: Mapping[str, Any]) -> int:
 
 def values_of(rows: Iterable[Mapping[str, Any]], metric: str, policy: str) -> dict[Unit, float]:
     """Unit -> mean of a metric over the fits of a policy; fits that have none are left out."""
-    found: dict[Unit, list[float]] = {}
+    by_unit: dict[Unit, list[float]] = {}
     for row in rows:
         if row["policy"] == policy and row["metrics"].get(metric) is not None:
-            found.setdefault(unit_of(row), []).append(row["metrics"][metric])
-    return {unit: float(np.mean(values)) for unit, values in found.items()}
+            by_unit.setdefault(unit_of(row), []).append(row["metrics"][metric])
+    return {unit: float(np.mean(values)) for unit, values in by_unit.items()}
 
 
 def differences(rows: Sequence[Mapping[str, Any]], metric: str, policy: str, reference: str) -> dict[Unit, float]:
@@ -204,7 +204,7 @@ def decided(rows: Sequence[Mapping[str, Any]], reference: str, protocol: str) ->
         protocol: Protocol of the rows that count.
     """
     mine = [over_views(row, _RACE_METRIC) for row in rows if row["protocol"] == protocol]
-    found = {}
+    sentences = {}
     for label in dict.fromkeys(row["policy"] for row in mine if row["policy"] != reference):
         values = differences(mine, _RACE_METRIC, label, reference)
         if len(values) < FEWEST_UNITS:
@@ -212,11 +212,11 @@ def decided(rows: Sequence[Mapping[str, Any]], reference: str, protocol: str) ->
         effect = estimate(values, share=_RACE_SHARE)
         if effect.low <= 0 <= effect.high:
             continue
-        found[label] = (
+        sentences[label] = (
             f"{label} has left after {effect.units} units: {effect.mean:+.2f} dB [{effect.low:+.2f}, "
             f"{effect.high:+.2f}] against {reference}, on average over numbers of views."
         )
-    return found
+    return sentences
 
 
 def over_views(row: Mapping[str, Any], metric: str) -> dict[str, Any]:

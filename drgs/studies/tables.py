@@ -180,8 +180,8 @@ def _title(metric: Metric) -> str:
 
 def explained(study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]]) -> str:
     """How to read the table of the differences of pairs (`comparison_table`), by what it has."""
-    found = [differences(rows, metric.key, *pair) for pair in pairs for metric in study.metrics]
-    intervals = [values for values in found if len(values) > 1]
+    all_differences = [differences(rows, metric.key, *pair) for pair in pairs for metric in study.metrics]
+    intervals = [values for values in all_differences if len(values) > 1]
     scenes = len({unit[0] for values in intervals for unit in values})
     units = len({unit for values in intervals for unit in values})
     if not intervals:
@@ -222,12 +222,12 @@ def comparison_table(
     lines: list[list[str]] = []
     sizes: dict[str, list[float]] = {metric.key: [] for metric in study.metrics}
     for policy, reference in pairs:
-        found = _estimates(study, rows, policy, reference)
-        if not any(found.values()):
+        estimates = _estimates(study, rows, policy, reference)
+        if not any(estimates.values()):
             continue
         cells = []
         for metric in study.metrics:
-            one = found[metric.key]
+            one = estimates[metric.key]
             cells.append(_difference(metric, one) if one else "none")
             if one and one.detectable is not None:
                 sizes[metric.key].append(one.detectable)
@@ -284,9 +284,9 @@ def _leaked(study: Study, rows: StudyRows) -> str:
     lines = []
     for label in _labels(study, rows):
         both = [{**row, "policy": row["protocol"]} for row in rows if row["policy"] == label]
-        found = _estimates(study, both, "paper", "blind")
-        if any(found.values()):
-            cells = [_difference(metric, one) if (one := found[metric.key]) else "none" for metric in study.metrics]
+        estimates = _estimates(study, both, "paper", "blind")
+        if any(estimates.values()):
+            cells = [_difference(metric, one) if (one := estimates[metric.key]) else "none" for metric in study.metrics]
             lines.append([label, *cells])
     if not lines:
         return "No policy has a unit in common yet."
@@ -296,26 +296,26 @@ def _leaked(study: Study, rows: StudyRows) -> str:
 
 def _estimates(study: Study, rows: StudyRows, policy: str, reference: str) -> dict[str, Effect | None]:
     """Metric -> what the pair's differences say; None where they have no unit in common."""
-    found = {metric.key: differences(rows, metric.key, policy, reference) for metric in study.metrics}
-    return {key: estimate(values) if values else None for key, values in found.items()}
+    by_metric = {metric.key: differences(rows, metric.key, policy, reference) for metric in study.metrics}
+    return {key: estimate(values) if values else None for key, values in by_metric.items()}
 
 
-def _difference(metric: Metric, found: Effect) -> str:
+def _difference(metric: Metric, effect: Effect) -> str:
     """Mean, interval, verdict, and in how many units it is better; of a single unit the difference alone."""
-    numbers = f"{found.mean:+.{metric.digits}f}"
-    if found.units == 1:
+    numbers = f"{effect.mean:+.{metric.digits}f}"
+    if effect.units == 1:
         return f"{numbers}, 1 unit"
-    numbers += f" [{found.low:+.{metric.digits}f}, {found.high:+.{metric.digits}f}]"
-    better = found.positive if metric.larger else found.negative
-    word = _verdict(metric, found)
-    return f"{numbers}{f' **{word}**' if word else ''}, {better} of {found.units}"
+    numbers += f" [{effect.low:+.{metric.digits}f}, {effect.high:+.{metric.digits}f}]"
+    better = effect.positive if metric.larger else effect.negative
+    word = _verdict(metric, effect)
+    return f"{numbers}{f' **{word}**' if word else ''}, {better} of {effect.units}"
 
 
-def _verdict(metric: Metric, found: Effect) -> str:
+def _verdict(metric: Metric, effect: Effect) -> str:
     """`gain`, `loss`, or nothing where the interval holds 0 or is of too few units."""
-    if found.units < FEWEST_UNITS or found.low <= 0 <= found.high:
+    if effect.units < FEWEST_UNITS or effect.low <= 0 <= effect.high:
         return ""
-    return "gain" if (found.mean > 0) == metric.larger else "loss"
+    return "gain" if (effect.mean > 0) == metric.larger else "loss"
 
 
 def _verdicts(study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]]) -> str:
@@ -323,13 +323,13 @@ def _verdicts(study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]]) -
     lines = []
     verbs = {"gain": "gains in", "loss": "loses in"}
     for policy, reference in pairs:
-        found = _estimates(study, rows, policy, reference)
+        estimates = _estimates(study, rows, policy, reference)
         words: dict[str, list[str]] = {word: [] for word in verbs}
         for metric in study.metrics:
-            one = found[metric.key]
+            one = estimates[metric.key]
             if one and (word := _verdict(metric, one)):
                 words[word].append(metric.title)
-        if not any(one and one.units >= FEWEST_UNITS for one in found.values()):
+        if not any(one and one.units >= FEWEST_UNITS for one in estimates.values()):
             continue
         sentence = [f"{verbs[word]} {', '.join(names)}" for word, names in words.items() if names]
         lines.append(
@@ -353,11 +353,11 @@ def _points(study: Study, rows: StudyRows) -> str:
     for metric in study.metrics:
         lines = []
         for label in _labels(study, rows):
-            found: dict[Unit, list[str]] = {unit: [] for unit in units}
+            by_unit: dict[Unit, list[str]] = {unit: [] for unit in units}
             for row in sorted((row for row in rows if row["policy"] == label), key=lambda row: row["seed"]):
                 value = row["metrics"].get(metric.key)
-                found[unit_of(row)].append("none" if value is None else f"{value:.{metric.digits}f}")
-            lines.append([label, *(" ".join(numbers) for numbers in found.values())])
+                by_unit[unit_of(row)].append("none" if value is None else f"{value:.{metric.digits}f}")
+            lines.append([label, *(" ".join(numbers) for numbers in by_unit.values())])
         title = f"<details><summary>{_title(metric)}</summary>"
         parts.append(f"{title}\n\n{markdown_table(['policy', *(names[u] for u in units)], lines)}\n\n</details>")
     return "\n\n".join(parts)
@@ -413,8 +413,8 @@ def draw_curves(study: Study, rows: Sequence[Mapping[str, Any]], metric: Metric,
     for axis, scene in zip(axes.flat, scenes, strict=False):
         mine = [row for row in rows if row["scene"] == scene]
         for number, label in enumerate(study.policies):
-            found = [(count, values_of(at_views(mine, count), metric.key, label)) for count in counts]
-            points = [(count, float(np.mean(list(values.values())))) for count, values in found if values]
+            means = [(count, values_of(at_views(mine, count), metric.key, label)) for count in counts]
+            points = [(count, float(np.mean(list(values.values())))) for count, values in means if values]
             if points:
                 style: dict[str, Any] = {
                     "ls": "--" if label == study.reference else "-",

@@ -345,27 +345,27 @@ class _ProxyStream:
         count, at, step, last, member, end, some = s
         inside = member < end
         trace = active & ~inside & (some != 0)
-        found = lib.Bool(False)
+        hit = lib.Bool(False)
         primitive = lib.UInt32(0)
         entry = at
         if p.scene is not None:
             o = [dr.fma(d, at, x) for x, d in zip(self.o, self.d, strict=True)]
             ray = mi.Ray3f(mi.Point3f(*o), mi.Vector3f(*[d * p.scale for d in self.d]))
             pi = p.scene.ray_intersect_preliminary(ray, coherent=False, active=trace)
-            found = trace & pi.is_valid()
-            primitive = dr.select(found, pi.prim_index, 0)
-            entry = at + dr.select(found, pi.t, 0) * p.scale
-        again = found & (primitive == last)
-        fresh = found & ~again
+            hit = trace & pi.is_valid()
+            primitive = dr.select(hit, pi.prim_index, 0)
+            entry = at + dr.select(hit, pi.t, 0) * p.scale
+        again = hit & (primitive == last)
+        fresh = hit & ~again
         first = dr.gather(lib.UInt32, p.first, primitive, fresh)
         behind = dr.gather(lib.UInt32, p.first, primitive + 1, fresh)
         member, end = dr.select(fresh, first, member), dr.select(fresh, behind, end)
         step = dr.select(again, 2 * step, dr.select(fresh, self.step, step))
         # Far along the ray the step is less than one unit in the last place: 1.2e-7.
         forward = dr.maximum(step, 1.2e-7 * abs(entry))
-        at = dr.select(found, entry + forward, at)
+        at = dr.select(hit, entry + forward, at)
         last = dr.select(fresh, primitive, last)
-        some = dr.select(trace & ~found, 0, some)
+        some = dr.select(trace & ~hit, 0, some)
         valid = active & (member < end)
         index = dr.gather(lib.UInt32, p.members, member, valid)
         bound = lib.Float(EMPTY)

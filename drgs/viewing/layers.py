@@ -235,15 +235,15 @@ def _depth(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
         assert out.depth is not None  # asked for
         return np.stack([out.depth.cpu().numpy(), out.alpha.cpu().numpy()], axis=-1)
 
-    found = yield from drawn(scene, camera, settings, read)
-    picture, (near, far) = pictures.depth_colors(found[..., 0], found[..., 1])
+    values = yield from drawn(scene, camera, settings, read)
+    picture, (near, far) = pictures.depth_colors(values[..., 0], values[..., 1])
     return Drawing(picture, ColorScale(far, near, "distance, in the scene's unit"))
 
 
 def _missing(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
     read = lambda out: 1 - out.alpha.cpu().numpy()  # noqa: E731
-    found = yield from drawn(scene, camera, settings, read, colors=pictures.inferno)
-    return Drawing(pictures.inferno(found), ColorScale(0.0, 1.0, "share of the light, none to all"))
+    shares = yield from drawn(scene, camera, settings, read, colors=pictures.inferno)
+    return Drawing(pictures.inferno(shares), ColorScale(0.0, 1.0, "share of the light, none to all"))
 
 
 def _semantic(colors_of: Callable[[Output], np.ndarray]) -> Draw:
@@ -255,9 +255,9 @@ def _semantic(colors_of: Callable[[Output], np.ndarray]) -> Draw:
 
 def _mapped(uncertainty: Uncertainty) -> Draw:
     def draw(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
-        found = uncertainty.map(camera)
+        variance = uncertainty.map(camera)
         yield Done(1.0)
-        picture, (low, high) = pictures.map_colors(found)
+        picture, (low, high) = pictures.map_colors(variance)
         return Drawing(picture, ColorScale(low, high, _VARIANCE))
 
     return draw

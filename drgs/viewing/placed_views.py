@@ -183,23 +183,23 @@ def read_ranking(path: Path) -> Ranking:
         FileNotFoundError: If there is no such file.
         ValueError: If it is damaged, or of something else.
     """
-    found = read_json(path, "a selection", _ADVICE)
+    selection = read_json(path, "a selection", _ADVICE)
     where = str(path)
-    check_json(where, found, {"picks": [{"name": str}]}, _ADVICE)
-    if found.get("command") in ("select", "capture"):
-        check_json(where, found, {"policy": str, "criterion": (None, str), "candidates": [_SCORED]}, _ADVICE)
-        rows = found["candidates"]
-        if found["command"] == "capture":
+    check_json(where, selection, {"picks": [{"name": str}]}, _ADVICE)
+    if selection.get("command") in ("select", "capture"):
+        check_json(where, selection, {"policy": str, "criterion": (None, str), "candidates": [_SCORED]}, _ADVICE)
+        rows = selection["candidates"]
+        if selection["command"] == "capture":
             check_json(where, rows, [_WAY], _ADVICE)
             if odd := [len(row["origin"]) for row in rows if len(row["origin"]) != 3]:
                 raise ValueError(f"{where}: origin must be 3 numbers, got {odd[0]}; {_ADVICE}")
-        criterion = found["criterion"]
-        policy = found["policy"]
+        criterion = selection["criterion"]
+        policy = selection["policy"]
     else:
         check_json(
-            where, found, {"picks": [{"policy": str, "criterion": (None, str), "candidates": [_SCORED]}]}, _ADVICE
+            where, selection, {"picks": [{"policy": str, "criterion": (None, str), "candidates": [_SCORED]}]}, _ADVICE
         )
-        last = found["picks"][-1] if found["picks"] else {"candidates": [], "criterion": None, "policy": ""}
+        last = selection["picks"][-1] if selection["picks"] else {"candidates": [], "criterion": None, "policy": ""}
         rows, criterion, policy = last["candidates"], last["criterion"], last["policy"]
     cameras = [
         dataclasses.replace(camera_described(f"{where}: {row['name']}", row["camera"]), name=row["name"])
@@ -209,7 +209,7 @@ def read_ranking(path: Path) -> Ranking:
     return Ranking(
         f"{policy}, {criterion}" if criterion else policy,
         _scores(where, rows),
-        tuple(pick["name"] for pick in found["picks"]),
+        tuple(pick["name"] for pick in selection["picks"]),
         tuple(cameras),
         {row["name"]: Way(tuple(row["origin"]), row["text"]) for row in rows if "origin" in row and "text" in row},
     )

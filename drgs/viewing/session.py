@@ -429,18 +429,18 @@ class Session:
     def _gaussians_sent(self, subject: Subject, layer: Layer, time: float | None) -> Iterator[None]:
         """Job: the Gaussians of a time to the client, in the colors of the layer where it has any for them."""
         seen = subject.scene.at(time)
-        found = ClientGaussians.of(seen, tinted(layer, seen))
-        arrays = found.centers, found.covariances, found.rgbs, found.opacities
+        gaussians = ClientGaussians.of(seen, tinted(layer, seen))
+        arrays = gaussians.centers, gaussians.covariances, gaussians.rgbs, gaussians.opacities
         with self._lock, self.client.atomic():
             if self._is_closed:
                 return
             if self._gaussians is None:
                 self._clear()
                 self._gaussians = self.client.scene.add_gaussian_splats(
-                    "/gaussians", *arrays, scale=found.scale, visible=not self._is_over
+                    "/gaussians", *arrays, scale=gaussians.scale, visible=not self._is_over
                 )
             else:
-                self._gaussians.scale = found.scale
+                self._gaussians.scale = gaussians.scale
                 self._gaussians.set_gaussians(*arrays)
         yield
 
