@@ -149,7 +149,11 @@ def _started(count: int, folder: str) -> tuple[Client, LocalCluster]:
 
 
 def _watched(ended: list[int]) -> type:
-    """Dask's keeper of a worker process, which also notes the exit code of one that ends."""
+    """Dask's keeper of a worker process, which also notes the exit code of one that ends.
+
+    By a private method, for Dask 2026.8 has no public way to the code: where it is called otherwise, the message of
+    `_why` has none.
+    """
     from distributed import Nanny
 
     class Watched(Nanny):
