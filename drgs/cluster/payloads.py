@@ -38,18 +38,18 @@ class Payload:
     data: bytes
 
     @classmethod
-    def of(cls, thing: object) -> Payload:
-        """Of anything that can be pickled, closures included.
+    def of(cls, content: object) -> Payload:
+        """Pickle anything that can be, closures included.
 
         Raises:
             ValueError: If it cannot.
         """
         file = io.BytesIO()
         try:
-            _pickler()(file, protocol=5).dump(thing)
+            _pickler()(file, protocol=5).dump(content)
         except (pickle.PicklingError, TypeError, AttributeError) as error:
             raise ValueError(
-                f"cluster: what is sent to workers must be picklable, {type(thing).__name__} is not ({error}); "
+                f"cluster: what is sent to workers must be picklable, {type(content).__name__} is not ({error}); "
                 "make it of plain data and functions"
             ) from None
         data = file.getvalue()
@@ -87,12 +87,12 @@ def _tensor(array: np.ndarray, shape: tuple[int, ...], has_gradient: bool, is_pa
 
 _pieces: dict[str, dict[int, bytes]] = {}
 _payloads: dict[str, bytes] = {}  # whole, not opened yet
-_things: dict[str, Any] = {}  # opened; the one that was used last comes last
+_opened: dict[str, Any] = {}  # opened; the one that was used last comes last
 
 
 def keep(digest: str, number: int, count: int, data: bytes) -> None:
     """Take a piece of a payload; only the worker's event loop calls it."""
-    if digest in _payloads or digest in _things:
+    if digest in _payloads or digest in _opened:
         return
     found = _pieces.setdefault(digest, {})
     found[number] = data
@@ -109,14 +109,14 @@ def opened_payload(digest: str) -> Any:
     Raises:
         Missing: If the worker has not got it.
     """
-    if digest in _things:
-        _things[digest] = _things.pop(digest)
-        return _things[digest]
+    if digest in _opened:
+        _opened[digest] = _opened.pop(digest)
+        return _opened[digest]
     data = _payloads.pop(digest, None)
     if data is None:
         raise Missing(digest)
-    for old in (*_things, *_payloads)[: max(len(_things) + len(_payloads) + 1 - _KEPT, 0)]:
-        _things.pop(old, None)
+    for old in (*_opened, *_payloads)[: max(len(_opened) + len(_payloads) + 1 - _KEPT, 0)]:
+        _opened.pop(old, None)
         _payloads.pop(old, None)
-    _things[digest] = pickle.loads(data)
-    return _things[digest]
+    _opened[digest] = pickle.loads(data)
+    return _opened[digest]

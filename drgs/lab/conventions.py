@@ -39,7 +39,9 @@ DISTORTIONS = {
     "in the order k1, k2, k3, p1, p2": lambda k1, k2, p1, p2, *rest: (k1, k2, *_later(p1, p2, *rest)),
 }
 _WINDOW = 16  # pixels a side of the squares that the oracle draws one at a time, to bound its memory
-_ODD_PAIRS = 4_000_000  # (pixel, Gaussian) pairs of a view that are drawn densely where our renderer lacks a convention
+_DENSE_PAIRS = (
+    4_000_000  # (pixel, Gaussian) pairs of a view that are drawn densely where our renderer lacks a convention
+)
 _NEAR = 2e-6  # share of the distance: some ten times what float32 loses where it computes a depth
 _EFFECT = 1e-5  # part of a weight: what moves less moves no gradient by what counts
 _COMPENSATION_FLOOR = 0.005**2  # smallest ratio of determinants
@@ -112,10 +114,10 @@ class ReferenceModel:
         if self.shutter != "as given" and (not camera.is_rolling or self.shutter == camera.shutter):
             return False
         pairs = camera.width * camera.height * count
-        return not self._is_odd or (self.settings.response == "peak" and pairs <= _ODD_PAIRS)
+        return not self._needs_oracle or (self.settings.response == "peak" and pairs <= _DENSE_PAIRS)
 
     @property
-    def _is_odd(self) -> bool:
+    def _needs_oracle(self) -> bool:
         """Whether a ray meets Gaussians as in none of our renderers: the oracle draws that, every pair of a view."""
         return (self.ray_direction, self.peaks) != ("normalized", "in front")
 
@@ -165,8 +167,8 @@ class ReferenceModel:
         ties = torch.zeros(camera.height, camera.width, dtype=torch.bool)
         with torch.no_grad():  # marks of pixels have no derivative
             g, _ = gaussians_of(self._parameters(raw, camera))
-            for x, y, width, height in _windows(camera, self._is_odd):
-                window = None if self._is_odd else (x, y, width, height)
+            for x, y, width, height in _windows(camera, self._needs_oracle):
+                window = None if self._needs_oracle else (x, y, width, height)
                 out = reference.render(
                     g,
                     camera,
@@ -175,7 +177,7 @@ class ReferenceModel:
                     window=window,
                     exact_ties=True,
                     effect=_EFFECT,
-                    **self._odd_ones(),
+                    **self._oracle_arguments(),
                 )
                 ties[y : y + height, x : x + width] = out.ambiguous
         return self._flipped(ties)
@@ -185,8 +187,8 @@ class ReferenceModel:
         camera = self._camera(posed(raw, camera))
         g, shift = gaussians_of(self._parameters(raw, camera))
         settings = self.settings.replace(background=(0.0, 0.0, 0.0)) if COLORS in raw else self.settings
-        if self._is_odd:
-            out = reference.render(g, camera, settings, **self._odd_ones())
+        if self._needs_oracle:
+            out = reference.render(g, camera, settings, **self._oracle_arguments())
             yield ((0, 0), *self._developed(image_of(out, raw, shift), out.alpha))
             return
         if not oracle:
@@ -197,7 +199,7 @@ class ReferenceModel:
             out = reference.render(g, camera, settings, window=(x, y, width, height))
             yield ((y, x), *self._developed(image_of(out, raw, shift), out.alpha))
 
-    def _odd_ones(self) -> dict[str, bool]:
+    def _oracle_arguments(self) -> dict[str, bool]:
         """Arguments of the oracle for what our renderer does not have."""
         return {
             "plain_directions": self.ray_direction != "normalized",
@@ -459,8 +461,8 @@ def find(
     if distance(start) > settled:
         counts = _countable(near_ties(start))
     model = _descend(distance, legal, start, start, settled)
-    odd = [field for field in _different(model, start) if not hasattr(model, field) and field != "background"]
-    for other in starts if odd or distance(model) > settled else ():
+    unusual = [field for field in _different(model, start) if not hasattr(model, field) and field != "background"]
+    for other in starts if unusual or distance(model) > settled else ():
         # Beside a gross difference the nearest preset need not be the right one.
         moved = dataclasses.replace(model, settings=other.settings.replace(background=model.settings.background))
         if other != start and suits(moved) and distance(moved) < 2 * distance(start):

@@ -363,8 +363,8 @@ def crops(g: Gaussians, cameras: list[Camera], settings: RenderSettings) -> tupl
     """
     drawn = []
     for camera in cameras:
-        image, seen = _drawn_by_us(g, camera, settings)
-        if bool(seen.any()):
+        image, visible = _drawn_by_us(g, camera, settings)
+        if bool(visible.any()):
             drawn.append((camera, image))
     if not drawn:
         raise ValueError("crossval: the cameras must show Gaussians, none of them shows any; choose others")

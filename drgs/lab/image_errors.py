@@ -218,17 +218,17 @@ def _sums(case: _Case) -> Iterator[tuple]:
 
 def _backgrounds(case: _Case) -> Iterator[tuple]:
     """The two parts of an image: what Gaussians add, and what is seen of the background."""
-    seen = (1 - case.alpha)[..., None]
-    front = case.right - seen * case.background
+    transmittance = (1 - case.alpha)[..., None]
+    front = case.right - transmittance * case.background
     difference = case.wrong - case.right
     factor = 1 + _ratio(front[case.counts], difference[case.counts])
     yield "foreground", f"what its Gaussians add times {factor:.4g}", case.right + (factor - 1) * front
-    added = np.array([_ratio(seen[..., 0][case.counts], difference[..., k][case.counts]) for k in range(3)])
+    added = np.array([_ratio(transmittance[..., 0][case.counts], difference[..., k][case.counts]) for k in range(3)])
     now = case.background + added
     was = _numbers(case.background)
     missing = np.abs(now).max() < 0.01 < np.abs(case.background).max()
     what = f"its background {was} missing" if missing else f"its background {_numbers(now)} instead of {was}"
-    yield "background", what, case.right + seen * added
+    yield "background", what, case.right + transmittance * added
 
 
 def _transfers(case: _Case) -> Iterator[tuple]:

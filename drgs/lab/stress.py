@@ -241,16 +241,16 @@ def _gain(g: Gaussians, cam: Camera, settings: RenderSettings, H: Information, t
     Hc = fisher.diagonal(g, other, settings)
     true = squares(jacobian(g, reference.render(g, other, settings), features=True))
     worst = 0.0
-    seen = {name: x > 0 for name, x in truth.items()}
+    informed = {name: x > 0 for name, x in truth.items()}
     for criterion in _CRITERIA:
         gain = information_gain(Hc, H, criterion, prior)
         want = 0.0
-        for name, keep in seen.items():
+        for name, keep in informed.items():
             a, c = truth[name][keep], true[name][keep]
             terms = {"logdet": (c / a).log1p(), "eig": c / a, "trace_cov": 1 / a - 1 / (a + c)}
             want += float(terms[criterion].sum())
         worst = max(worst, abs(gain.total - want) / max(abs(want), 1e-12))  # a gain of 0 is compared absolutely
-    left = {name: int((~keep).sum()) for name, keep in seen.items()}
+    left = {name: int((~keep).sum()) for name, keep in informed.items()}
     blocks = information_gain(
         {"blocks": fisher.blocks(g, other, settings)},
         {"blocks": fisher.blocks(g, cam, settings)},

@@ -387,7 +387,7 @@ class Measured:
 def rows_of(variants: Sequence[Variant], fields: dict[str, Any]) -> list[TradeoffRow]:
     """Rows without numbers; those that cannot or need not be measured say why."""
     rows = []
-    seen = {}
+    first_names = {}
     for variant in variants:
         row = TradeoffRow(name=variant.name, kind=variant.kind, share=variant.share, by=variant.by)
         try:
@@ -397,7 +397,7 @@ def rows_of(variants: Sequence[Variant], fields: dict[str, Any]) -> list[Tradeof
                 raise  # the truth itself
             row.skipped = why_skipped(error)
         else:
-            same = seen.setdefault((row.settings, variant.share, variant.by == "oracle"), variant.name)
+            same = first_names.setdefault((row.settings, variant.share, variant.by == "oracle"), variant.name)
             if same != variant.name:
                 row.skipped = f"the same as {same}, with these --set"
         rows.append(row)
@@ -801,8 +801,8 @@ def _sampled(rows: list[TradeoffRow], setup: _Setup, truth: _Measurement, seed: 
     for row in rows:
         if row.skipped is not None or row.by == "view":
             continue
-        wanted = _RAYS if row.by == "rays" else max(32, min(_RAYS, _PAIRS // count))
-        chosen = places[:wanted].sort().values
+        count_of_rays = _RAYS if row.by == "rays" else max(32, min(_RAYS, _PAIRS // count))
+        chosen = places[:count_of_rays].sort().values
         try:
             errors = _by_rays(row, setup, truth, chosen)
         except (ValueError, NotImplementedError, OSError, RuntimeError) as error:

@@ -337,16 +337,16 @@ def with_errors(
     off = [k for k, row in enumerate(comparison.views) if not _is_same(row)]
     counts = {k: (~comparison.ties[k] | comparison.counted).numpy() for k in off}
     wrong = {k: pictures[k].numpy() for k in off}
-    seen: dict[str, dict[int, Pattern]] = {}
+    patterns: dict[str, dict[int, Pattern]] = {}
     for name, model in models.items():
         drawn = {k: (x.numpy() for x in draw(model, k)) for k in off}
-        seen[name] = {k: pattern_of(wrong[k], *drawn[k], model.settings.background, counts[k]) for k in off}
-    name = max(models, key=lambda name: sum(x.explained for x in seen[name].values() if x.is_change))
+        patterns[name] = {k: pattern_of(wrong[k], *drawn[k], model.settings.background, counts[k]) for k in off}
+    name = max(models, key=lambda name: sum(x.explained for x in patterns[name].values() if x.is_change))
     first = next(iter(models.values()))
     rows = list(comparison.views)
     for k in off:
         image = draw(first, k)[0].numpy()
-        rows[k] = dataclasses.replace(rows[k], error=error_row(wrong[k], image, counts[k], seen[name][k], name))
+        rows[k] = dataclasses.replace(rows[k], error=error_row(wrong[k], image, counts[k], patterns[name][k], name))
     return rows
 
 
@@ -443,14 +443,14 @@ def _decide(case: Case, model: ReferenceModel | None, compared: Compared, names:
     camera, u = case.cameras[case.first], compared.u[case.first]
     gradients = rasterizer.gradient(raw, camera, background, u)
     gradients = {name: torch.zeros_like(raw[name]) if x is None else x for name, x in gradients.items()}
-    wanted = gradients if model is None else model.gradient(raw, camera, u)
-    chosen = {name: _entries(gradients[name], wanted[name], case.entries) for name in names}
+    expected = gradients if model is None else model.gradient(raw, camera, u)
+    chosen = {name: _entries(gradients[name], expected[name], case.entries) for name in names}
     own = central(rasterizer, raw, camera, background, u, chosen)
     kept = rasterizer.gradient(raw, camera, background, u * own.kept[..., None])
-    wanted = None if model is None else model.gradient(raw, camera, u * own.kept[..., None])
+    expected = None if model is None else model.gradient(raw, camera, u * own.kept[..., None])
     for name in names:
         there = torch.zeros_like(raw[name]) if kept[name] is None else kept[name]
-        row = _own_row(there, None if wanted is None else wanted[name], own, name)
+        row = _own_row(there, None if expected is None else expected[name], own, name)
         groups[name].differences = row
         if len(own.entries[name]) < _ENOUGH:
             groups[name].settle("undecided", f"{row.left_out} of its differences did not converge")
@@ -470,7 +470,7 @@ def _entries(theirs: torch.Tensor, ours: torch.Tensor, count: int) -> list[int]:
     return list(dict.fromkeys(order[0][: count // 2] + order[1][:count]))[:count]
 
 
-def _own_row(gradient: torch.Tensor, wanted: torch.Tensor | None, own: Differences, name: str) -> OwnRow:
+def _own_row(gradient: torch.Tensor, expected: torch.Tensor | None, own: Differences, name: str) -> OwnRow:
     """A gradient, and the model's if it has the same image, against central differences at their entries."""
     values, bars = own.values[name], own.uncertainty[name]
     there = gradient.reshape(-1)[own.entries[name]]
@@ -481,8 +481,8 @@ def _own_row(gradient: torch.Tensor, wanted: torch.Tensor | None, own: Differenc
     ratio = float(ratios.median()) if len(ratios) else float("nan")
     spread = float((ratios - ratio).abs().median()) if len(ratios) else float("nan")
     bug = error > _OWN * size + 3 * noise
-    if wanted is not None:  # a small error, too, if the differences clearly side with the model
-        other = float((wanted.reshape(-1)[own.entries[name]] - values).norm())
+    if expected is not None:  # a small error, too, if the differences clearly side with the model
+        other = float((expected.reshape(-1)[own.entries[name]] - values).norm())
         bug |= error > 3 * max(noise, other)
     if not there.any() and bug:
         what = "it is 0, its own central differences are not"

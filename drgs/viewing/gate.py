@@ -77,8 +77,8 @@ class Gate:
             path: Path of the request, with its query.
             headers: Headers of the request, as `websockets` has them.
         """
-        if (odd := _odd(path, headers)) is not None:
-            return http.HTTPStatus.BAD_REQUEST, odd
+        if (problem := _malformed(path, headers)) is not None:
+            return http.HTTPStatus.BAD_REQUEST, problem
         host = headers["Host"].lower()
         origins = headers.get_all("Origin")
         named = _HOST.fullmatch(host)
@@ -131,7 +131,7 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def _odd(path: str, headers: Any) -> str | None:
+def _malformed(path: str, headers: Any) -> str | None:
     """What is wrong with a request whoever sends it; None where nothing is."""
     if not headers.get_all("Host"):
         return "the request must name one host"

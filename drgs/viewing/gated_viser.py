@@ -92,7 +92,7 @@ def guarded(gate: Gate, listening: socket.socket) -> Iterator[None]:
         handler: Any, host: Any, port: Any, *, process_request: Callable[..., Any], **options: Any
     ) -> Any:
         started.append(port)
-        options |= {"process_request": _asked(gate, process_request), "create_connection": _Answering, "logger": _log}
+        options |= {"process_request": _gated(gate, process_request), "create_connection": _Answering, "logger": _log}
         return serve(handler, sock=listening, **options)
 
     before = _infra.websockets
@@ -125,19 +125,19 @@ class _Answering(ServerConnection):
         super().send_data()
 
 
-def _asked(gate: Gate, process_request: Callable[..., Any]) -> Callable[..., Any]:
+def _gated(gate: Gate, process_request: Callable[..., Any]) -> Callable[..., Any]:
     """viser's answer to a request, where the gate has nothing against it."""
     import viser
 
-    spoken = f"viser-v{viser.__version__}"
+    protocol = f"viser-v{viser.__version__}"
 
     def process(connection: Any, request: Request) -> Response | None:
         if found := gate.refusal(request.path, request.headers):
             return _refused(*found)
         if request.headers.get("Upgrade", "").lower() == "websocket":
             offered = ",".join(request.headers.get_all("Sec-WebSocket-Protocol"))
-            if spoken not in (name.strip() for name in offered.split(",")):
-                return _refused(http.HTTPStatus.BAD_REQUEST, f"the page must speak {spoken}; load it again")
+            if protocol not in (name.strip() for name in offered.split(",")):
+                return _refused(http.HTTPStatus.BAD_REQUEST, f"the page must speak {protocol}; load it again")
         elif moved := gate.answer(request.path, request.headers):
             return Response(http.HTTPStatus.SEE_OTHER, "See Other", Headers(moved))
         try:
@@ -155,9 +155,9 @@ def _asked(gate: Gate, process_request: Callable[..., Any]) -> Callable[..., Any
 def _refused(status: http.HTTPStatus, why: str) -> Response:
     """An answer that says why there is none."""
     body = f"drgs view: {why}\n".encode()
-    said = Headers([("Content-Type", "text/plain; charset=utf-8"), ("Content-Length", str(len(body)))])
-    said["Connection"] = "close"
-    return Response(status, status.phrase, said, body)
+    headers = Headers([("Content-Type", "text/plain; charset=utf-8"), ("Content-Length", str(len(body)))])
+    headers["Connection"] = "close"
+    return Response(status, status.phrase, headers, body)
 
 
 def in_a_line(error: BaseException) -> str:

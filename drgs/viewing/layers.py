@@ -110,11 +110,11 @@ def drawn(
     parts = []
     shown: list[np.ndarray] = []
     with torch.no_grad():  # a picture is looked at only; a graph would keep every band's intermediates
-        seen = scene.at(camera.time) if features else colors_only(scene.at(camera.time), None)
+        shown_scene = scene.at(camera.time) if features else colors_only(scene.at(camera.time), None)
     below = 0
     for part in bands(camera):
         with torch.no_grad():  # entered for each band: between two of them the thread does other work
-            parts.append(read(render(seen, part, settings, ("depth",))))
+            parts.append(read(render(shown_scene, part, settings, ("depth",))))
         below += part.height
         if colors is not None:
             shown.append(colors(parts[-1]))

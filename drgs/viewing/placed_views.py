@@ -191,8 +191,8 @@ def read_ranking(path: Path) -> Ranking:
         rows = selection["candidates"]
         if selection["command"] == "capture":
             check_json(where, rows, [_WAY], _ADVICE)
-            if odd := [len(row["origin"]) for row in rows if len(row["origin"]) != 3]:
-                raise ValueError(f"{where}: origin must be 3 numbers, got {odd[0]}; {_ADVICE}")
+            if wrong := [len(row["origin"]) for row in rows if len(row["origin"]) != 3]:
+                raise ValueError(f"{where}: origin must be 3 numbers, got {wrong[0]}; {_ADVICE}")
         criterion = selection["criterion"]
         policy = selection["policy"]
     else:

@@ -428,8 +428,8 @@ class Session:
 
     def _gaussians_sent(self, subject: Subject, layer: Layer, time: float | None) -> Iterator[None]:
         """Job: the Gaussians of a time to the client, in the colors of the layer where it has any for them."""
-        seen = subject.scene.at(time)
-        gaussians = ClientGaussians.of(seen, tinted(layer, seen))
+        at_time = subject.scene.at(time)
+        gaussians = ClientGaussians.of(at_time, tinted(layer, at_time))
         arrays = gaussians.centers, gaussians.covariances, gaussians.rgbs, gaussians.opacities
         with self._lock, self.client.atomic():
             if self._is_closed:
