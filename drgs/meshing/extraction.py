@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from drgs import fisher
 from drgs.guards import memory
@@ -75,9 +77,6 @@ class TriangleMesh:
 
     def pieces(self) -> np.ndarray:
         """(F,) int number of the connected piece that each triangle is of."""
-        from scipy.sparse import coo_array
-        from scipy.sparse.csgraph import connected_components
-
         count = len(self.vertices)
         ends = self.faces[:, [0, 1, 1, 2]].reshape(-1, 2).T
         graph = coo_array((np.ones(ends.shape[1], bool), tuple(ends)), shape=(count, count))

@@ -116,7 +116,7 @@ class _Kept(torch.autograd.Function):
         for x in ctx.values:
             x.grad = None
         if ctx.graph is None:
-            # Leaves of their own: the graph that is kept ends here, whatever outputs the values.
+            # Leaves of their own: the graph that is kept ends here, whatever made the values.
             leaves = [x.detach().requires_grad_() for x in ctx.values]
             with torch.enable_grad():
                 ctx.graph = leaves, tuple(ctx.function(dict(zip(ctx.names, leaves, strict=True))).values())
