@@ -1,5 +1,10 @@
 """Build step of setuptools: the viewer's code from npm goes into the wheel, with its licenses, so that `drgs share`
-needs no network. Runs where nothing of drgs can be imported.
+needs no network.
+
+The code (5 MB of three.js and Spark, pinned by version and hash in npm.py) is not in the repository, so a wheel is the
+one place where it is fetched before a user's machine. `build_py` is setuptools' public hook for files that are made at
+build time; without a network the wheel goes without them, and says so. Nothing of drgs can be imported here: its
+dependencies are not installed while a wheel is built, so npm.py is loaded by its path.
 """
 
 from __future__ import annotations
