@@ -70,7 +70,7 @@ class Rasterizer:
     def image(self, raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
         """Image and alpha without derivatives, float64 on the CPU."""
         with torch.no_grad():
-            image, alpha = self.draw(self.taken(raw), camera, background)
+            image, alpha = self.draw(self.prepared(raw), camera, background)
         # A function may turn gradients on for itself: its graph would be kept with the image.
         return image.detach().double().cpu(), alpha.detach().double().cpu()
 
@@ -80,7 +80,7 @@ class Rasterizer:
         Raises:
             ValueError: If torch finds no graph at all.
         """
-        leaves = {name: x.requires_grad_() for name, x in self.taken(raw).items()}
+        leaves = {name: x.requires_grad_() for name, x in self.prepared(raw).items()}
         try:
             image, _ = self.draw(leaves, camera, background)
             if not image.requires_grad:
@@ -99,8 +99,8 @@ class Rasterizer:
             name: None if x is None else x.detach().double().cpu() for name, x in zip(leaves, derivatives, strict=True)
         }
 
-    def taken(self, raw: dict) -> dict:
-        """Copies of the parameters as it wants them."""
+    def prepared(self, raw: dict) -> dict:
+        """Copies of the parameters in the precision and on the device of the rasterizer."""
         # New leaves: gradients are to end at these, whatever the raw parameters were made of.
         return {name: x.detach().to(self.device, self.dtype, copy=True) for name, x in raw.items()}
 
@@ -210,7 +210,7 @@ def function(call: Callable, name: str, along_rays: bool = False) -> Rasterizer:
             image = image + (1 - alpha[..., None]) * torch.tensor(background, **like)
         return image, alpha
 
-    return Rasterizer(name, draw, *_taste(draw))
+    return Rasterizer(name, draw, *_precision_and_device(draw))
 
 
 def _three_channels_along_rays(rasterization: Callable) -> Callable:
@@ -249,7 +249,7 @@ def _lens_arguments(camera: Camera, like: dict, accepted: Mapping[str, inspect.P
     return arguments
 
 
-def _taste(draw: Callable) -> tuple[torch.dtype, str]:
+def _precision_and_device(draw: Callable) -> tuple[torch.dtype, str]:
     """The precision and the place that a function works in, tried on one Gaussian."""
     camera = Camera(K=np.array([[8.0, 0, 4], [0, 8.0, 4], [0, 0, 1]]), w2c=np.eye(4), width=8, height=8)
     raw = {
