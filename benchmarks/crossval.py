@@ -49,11 +49,7 @@ from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.files import load_ply  # noqa: E402
 from drgs.lab.crossval import VERDICTS, crops, crossval  # noqa: E402
 from drgs.lab.parameters import PARAMETERS, POSE_END, raw_of, with_pose  # noqa: E402
-from drgs.lab.rasterizers import (  # noqa: E402
-    cotangents,  # noqa: E402
-    function,
-    load_rasterizer,
-)
+from drgs.lab.rasterizers import cotangents, function, load_rasterizer  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.sizes import at_most  # noqa: E402
 from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
