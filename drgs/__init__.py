@@ -84,12 +84,12 @@ _MODULES = frozenset(
         "oracle",
         "planner",
         "plugin",
-        "policies",
         "rasterize",
         "reference",
         "report",
         "runtime",
         "select",
+        "selection",
         "settings",
         "sharing",
         "shutters",
@@ -163,9 +163,9 @@ if TYPE_CHECKING:
     from drgs import oracle as oracle
     from drgs import planner as planner
     from drgs import plugin as plugin
-    from drgs import policies as policies
     from drgs import rasterize as rasterize
     from drgs import report as report
+    from drgs import selection as selection
     from drgs import settings as settings
     from drgs import sharing as sharing
     from drgs import shutters as shutters

@@ -10,7 +10,7 @@
     planner.save("planner.safetensors")        # and after a crash: planner = drgs.Planner.load(...)
 
 What lasts from call to call: the model, what each view tells about it, and the candidates. What a view tells is asked
-again once what it sees has changed by more than a bound (`drgs.information.drift`), so that a new photograph costs what
+again once what it sees has changed by more than a bound (`drgs.selection.drift`), so that a new photograph costs what
 is new. An answer within a time budget goes by what is known by then, and says how much that is.
 
 Nothing here knows ROS, threads of its own, or maps: all methods may be called from any thread, `observe` and `fit` from
@@ -42,11 +42,11 @@ from drgs.fitting.online import OnlineFit
 from drgs.gain import Information
 from drgs.guards.arguments import ArgumentError, kind_of, must_be
 from drgs.guards.inputs import camera_list
-from drgs.information.drift import DriftCache, Unanswered, named_by
-from drgs.information.pool import Pick, Pool, Selection
-from drgs.information.refining import Refine
-from drgs.policies.informed import ask_views
 from drgs.select import Scoring, select
+from drgs.selection.drift import DriftCache, Unanswered, named_by
+from drgs.selection.informed import ask_views
+from drgs.selection.pool import Pick, Pool, Selection
+from drgs.selection.refining import Refine
 from drgs.settings import RenderSettings
 from drgs.sizes import at_most
 

@@ -65,7 +65,7 @@ if TYPE_CHECKING:
     from drgs.data import Dataset
     from drgs.ellipsoids import Gaussians
     from drgs.fitting.parts import Parts
-    from drgs.information.pool import Workers
+    from drgs.selection.pool import Workers
 
 __all__ = [
     "ActiveConfig",

@@ -182,7 +182,7 @@ def test_a_cache_that_is_too_small_asks_workers_again(cluster, moving, size):
 
 def test_memory_that_is_short_asks_twice(cluster, moving, monkeypatch):
     """Where not all views fit into memory at once, v_opt asks for candidates again, of workers as of this process."""
-    from drgs.information import greedy
+    from drgs.selection import greedy
 
     monkeypatch.setattr(greedy, "_fits", lambda *_: False)
     _, still, cams = moving

@@ -14,8 +14,8 @@ from drgs import fisher, reference
 from drgs.deform import DeformationField, Deltas, DynamicGaussians, FieldConfig
 from drgs.dynamics.regularizers import plane_smoothness, time_l1, time_smoothness
 from drgs.ellipsoids import DeformableScene, Gaussians
-from drgs.information.cache import Cache, camera_key
 from drgs.integrator import render, render_jvp
+from drgs.selection.cache import Cache, camera_key
 from drgs.settings import RenderSettings
 
 FAST = RenderSettings.preset("fast", transmittance_min=1e-10)

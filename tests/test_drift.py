@@ -12,8 +12,8 @@ from scenes_random import gaussians
 
 from drgs.cameras import orbit
 from drgs.ellipsoids import Gaussians
-from drgs.information.drift import DriftCache, Shapes, Unanswered
-from drgs.information.pool import ViewQuestion
+from drgs.selection.drift import DriftCache, Shapes, Unanswered
+from drgs.selection.pool import ViewQuestion
 
 pytestmark = pytest.mark.core
 

@@ -15,11 +15,11 @@ from drgs.fitting.config import SelectionConfig
 from drgs.gain import Prior, information_gain
 from drgs.information import diagonal
 from drgs.information.blocks import NetworkQuestion, SceneBlocks
-from drgs.information.combine import Questions, asked_of
 from drgs.information.once_per_time import once_per_time
 from drgs.information.replay import Replay
 from drgs.information.seen_view import SeenView
 from drgs.select import POLICIES, Cache, Scoring, select
+from drgs.selection.combine import Questions, asked_of
 from drgs.settings import RenderSettings
 
 FAST = RenderSettings.preset("fast")

@@ -20,9 +20,9 @@ from test_planner import config, photograph, planner_of
 import drgs
 from drgs.cameras import orbit
 from drgs.files import load_state, save_state
-from drgs.information.drift import named_by
 from drgs.planner import Planner
 from drgs.select import Scoring
+from drgs.selection.drift import named_by
 
 HERE = Path(__file__).resolve().parent
 ROUNDS = 6

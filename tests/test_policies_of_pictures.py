@@ -10,8 +10,8 @@ import torch
 from test_semantic_information import gaussians, ring
 
 import drgs
-from drgs.policies.pictures import _Blur, _Renderers
 from drgs.select import select
+from drgs.selection.pictures import _Blur, _Renderers
 from drgs.settings import RenderSettings
 
 

@@ -14,8 +14,8 @@ from drgs.cameras import Camera, orbit
 from drgs.data.camera_lists import described
 from drgs.files import save_ply
 from drgs.information.criteria import criterion_named
-from drgs.information.refining import _moved
 from drgs.select import Refine, Scoring, select
+from drgs.selection.refining import _moved
 from drgs.settings import RenderSettings
 
 pytestmark = pytest.mark.core

@@ -20,8 +20,8 @@ from drgs import fisher, reference
 from drgs.cameras import Camera, intrinsics_from_fov, look_at
 from drgs.ellipsoids import Gaussians
 from drgs.gain import CRITERIA, Prior, dense, information_gain
-from drgs.information.cache import camera_key
 from drgs.select import POLICIES, Cache, Scoring, select
+from drgs.selection.cache import camera_key
 from drgs.settings import RenderSettings
 
 SIZE = (12, 10)
@@ -550,7 +550,7 @@ def test_progress():
 def test_pool_that_does_not_fit_into_memory(rng, monkeypatch):
     """`v_opt` asks for what cannot be kept a second time: the same scores, and `progress` knows of it."""
     pool, seen, gone = random_pool(rng, 6), [], []
-    monkeypatch.setattr("drgs.information.greedy.available", lambda: 0 if gone else 1 << 30)
+    monkeypatch.setattr("drgs.selection.greedy.available", lambda: 0 if gone else 1 << 30)
     kept = choose(pool, ["c0"], criterion="v_opt", progress=lambda *x: seen.append(x))
     assert (kept.computed, seen[-1]) == (6, (6, 6))
     gone.append(True)

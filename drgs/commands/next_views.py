@@ -20,10 +20,10 @@ from drgs.files import SCHEMA, write_json
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import fitted_views
 from drgs.guards.outputs import claim
-from drgs.information.cache import Cache
 from drgs.information.scoring import Scoring
 from drgs.integrator import render
 from drgs.select import select
+from drgs.selection.cache import Cache
 from drgs.sizes import at_most
 from drgs.viewing.placed_views import NEXT
 

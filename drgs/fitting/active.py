@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from drgs.fitting.config import FitConfig
     from drgs.information.choices import Block
     from drgs.information.nuisances import Nuisance
-    from drgs.information.pool import Workers
+    from drgs.selection.pool import Workers
 
 __all__ = ["SELECTION", "ActiveViews"]
 

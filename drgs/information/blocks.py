@@ -67,7 +67,7 @@ TAKEN = "taken"
 _NO_NUISANCES = Nuisances()
 
 Answers = Callable[[Callable, Sequence["Camera"]], Iterable["Information"]]
-"""Asks views one question, as `drgs.information.pool.Pool.answers`."""
+"""Asks views one question, as `drgs.selection.pool.Pool.answers`."""
 
 
 # -------------------------------------------------- what a view is asked

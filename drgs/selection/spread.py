@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from drgs.cameras import Camera, places_in_time
-from drgs.information.pool import Pool, Selection
+from drgs.selection.pool import Pool, Selection
 
 __all__ = ["farthest", "random", "uniform"]
 

@@ -23,12 +23,12 @@ from drgs.cameras import Camera
 from drgs.gain import Gain, Information, Prior, check
 from drgs.guards.memory import available
 from drgs.information.blocks import TAKEN, add
-from drgs.information.cache import Cache, size_of
-from drgs.information.combine import Combination
 from drgs.information.criteria import criterion_named
 from drgs.information.network_groups import NETWORK_GROUPS
-from drgs.information.pool import Pool, Question, Selection, ViewQuestion
-from drgs.information.refining import refined
+from drgs.selection.cache import Cache, size_of
+from drgs.selection.combine import Combination
+from drgs.selection.pool import Pool, Question, Selection, ViewQuestion
+from drgs.selection.refining import refined
 
 __all__ = ["AskedView", "InformationSource", "ViewInformation", "greedy"]
 

@@ -1,7 +1,7 @@
 """Policies by the information of views.
 
 Those whose scores depend on what has been picked are greedy: take the best, add its information to H, score again
-(`drgs.information.greedy`). How a score comes from information is a `Scoring`; its criteria are in gain.py.
+(`drgs.selection.greedy`). How a score comes from information is a `Scoring`; its criteria are in gain.py.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from drgs.information.blocks import CoverageQuestion, DiagonalQuestion, SceneBlocks
-from drgs.information.combine import Asked, Combination, Questions, asked_of
-from drgs.information.greedy import AskedView, InformationSource, ViewInformation, greedy
-from drgs.information.pool import Pool, Selection
+from drgs.selection.combine import Asked, Combination, Questions, asked_of
+from drgs.selection.greedy import AskedView, InformationSource, ViewInformation, greedy
+from drgs.selection.pool import Pool, Selection
 
 __all__ = ["ask_views", "coverage", "fisher", "fisherrf"]
 

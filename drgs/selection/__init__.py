@@ -1,4 +1,4 @@
-"""Policies: functions from a `Pool` to a `Selection`, by what they look at; `drgs.select` names them.
+"""Choosing among views: the pool, the greedy choice, its cache, and the policies that `drgs.select` names.
 
 informed.py   the information of views: `fisher`, `fisherrf`, `coverage`
 pictures.py   what candidates show, each by itself: `moments`, `blur`, `renderers`

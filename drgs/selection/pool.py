@@ -14,11 +14,11 @@ import torch
 from drgs.cameras import Camera
 from drgs.ellipsoids import Scene
 from drgs.gain import Information
-from drgs.information.cache import Cache, camera_key, value_key
 from drgs.information.choices import Combine
 from drgs.information.once_per_time import once_per_time
-from drgs.information.refining import Refine
 from drgs.information.scoring import Scoring
+from drgs.selection.cache import Cache, camera_key, value_key
+from drgs.selection.refining import Refine
 
 __all__ = ["Pick", "Pool", "Question", "Selection", "ViewQuestion", "Workers"]
 
@@ -171,7 +171,7 @@ class Pool:
         scoring: How views are scored, where the policy scores them by information.
         rng: Generator that policies that draw take their numbers from.
         cache: Cache where information of single views is looked up and kept; None: nowhere.
-        lazy: Whether greedy policies leave out scores that cannot win; see `drgs.information.greedy`.
+        lazy: Whether greedy policies leave out scores that cannot win; see `drgs.selection.greedy`.
         progress: Called with (views done, views) after each view whose information is known.
         information: Camera -> Information, in place of what `drgs.fisher` computes.
         workers: Processes that compute information; None: this one.

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from drgs.information.pool import Pool, Question, Selection
+from drgs.selection.pool import Pool, Question, Selection
 from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:

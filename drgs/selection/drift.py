@@ -31,8 +31,8 @@ from drgs.cameras import Camera
 from drgs.ellipsoids import Y_00, Gaussians, Scene
 from drgs.gain import Information
 from drgs.guards.json_files import check_json
-from drgs.information.cache import Cache, camera_key, value_key
 from drgs.information.groups import GROUPS
+from drgs.selection.cache import Cache, camera_key, value_key
 
 __all__ = ["DriftCache", "Shapes", "Unanswered", "named_by"]
 
