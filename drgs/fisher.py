@@ -28,7 +28,6 @@ import torch
 
 from drgs.cameras import Camera
 from drgs.ellipsoids import Scene
-from drgs.gain import Prior, information_gain
 from drgs.guards.arguments import ArgumentError, must_be
 from drgs.guards.inputs import (
     Masks,
@@ -53,9 +52,11 @@ from drgs.information.choices import METHODS
 from drgs.information.columns import jacobian_columns
 from drgs.information.diagonal import check_same_parameters, diagonal_and_opacity
 from drgs.information.elimination import BLOCK_INPUTS, ViewRows, backdrop_taken
+from drgs.information.gains import information_gain
 from drgs.information.groups import GROUPS, Information, groups_of
 from drgs.information.jacobian import GEOMETRY
 from drgs.information.nuisances import Nuisances
+from drgs.information.prior import Prior
 from drgs.information.replay import Replay
 from drgs.information.semantics import SemanticMetric
 from drgs.runtime import alone

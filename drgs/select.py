@@ -27,11 +27,12 @@ import torch
 
 from drgs.cameras import Camera
 from drgs.ellipsoids import Scene
-from drgs.gain import CRITERIA, METHODS, Information, criterion_named
 from drgs.guards.arguments import kind_of, must_be
 from drgs.guards.inputs import Masks, camera_list, check_any_scene, mask_list
-from drgs.information.choices import POLICIES, check_named
+from drgs.information.choices import METHODS, POLICIES, check_named
+from drgs.information.criteria import CRITERIA, criterion_named
 from drgs.information.scoring import Scoring
+from drgs.information.sums import Information
 from drgs.selection.cache import Cache
 from drgs.selection.pool import Pick, Pool, Selection, Workers
 from drgs.selection.refining import Refine

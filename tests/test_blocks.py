@@ -15,11 +15,12 @@ from drgs.cameras import orbit
 from drgs.fitting.config import SelectionConfig
 from drgs.gain import CRITERIA, Prior, ViewCriterion, criterion_named, information_gain, scorer
 from drgs.guards import registry
-from drgs.information.blocks import BlockQuestion, ImageBlock, SceneBlocks, add, together
+from drgs.information.blocks import BlockQuestion, ImageBlock, SceneBlocks
 from drgs.information.choices import BLOCK_NAMES, BLOCKS, CRITERION_NAMES, POLICIES, POLICY_NAMES
 from drgs.information.groups import GROUPS
 from drgs.information.network_groups import NETWORK_GROUPS
 from drgs.information.seen_view import SeenView
+from drgs.information.sums import add, together
 from drgs.select import Cache, Scoring, select
 from drgs.settings import RenderSettings
 

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
     from drgs.cameras import Camera
     from drgs.ellipsoids import Scene
-    from drgs.gain import Information
+    from drgs.information.sums import Information
     from drgs.selection.pool import Question
 
 __all__ = ["WORKER_SECONDS", "Cluster", "ask"]

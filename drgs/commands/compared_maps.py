@@ -9,8 +9,8 @@ import torch
 
 from drgs import fisher
 from drgs.display import pictures
-from drgs.information.blocks import add
 from drgs.information.maps import fisherrf_map, moments_map
+from drgs.information.sums import add
 from drgs.integrator import render
 
 if TYPE_CHECKING:

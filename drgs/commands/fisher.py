@@ -33,7 +33,8 @@ from drgs.display.progress import Bar
 from drgs.files import SCHEMA, save_state, write_json
 from drgs.gain import Information, Prior, check, information_gain, variances
 from drgs.guards.outputs import claim
-from drgs.information.blocks import MAP_PRIOR, SceneBlocks, add, together
+from drgs.information.blocks import MAP_PRIOR, SceneBlocks
+from drgs.information.sums import add, together
 from drgs.select import Scoring
 
 if TYPE_CHECKING:

@@ -18,7 +18,8 @@ from drgs.ellipsoids import Gaussians
 from drgs.files import Run, state_header
 from drgs.fitting.records import fitted_views
 from drgs.guards.foreign import refuse_foreign
-from drgs.information.blocks import MAP_PRIOR, together
+from drgs.information.blocks import MAP_PRIOR
+from drgs.information.sums import together
 from drgs.viewing.client import pose_of
 from drgs.viewing.layers import Uncertainty, layers_of
 from drgs.viewing.placed_views import NEXT, PlacedView, Ranking, placed_views_of, read_ranking

@@ -34,10 +34,10 @@ from drgs.information.semantics import SemanticMetric
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians, Scene
-    from drgs.gain import Information
     from drgs.information.backdrop import Sphere
     from drgs.information.choices import Block, NetworkEstimate
     from drgs.information.network import NetworkProbes
+    from drgs.information.sums import Information
 
 __all__ = [
     "BACKDROP_BLOCK",
@@ -51,8 +51,6 @@ __all__ = [
     "DiagonalQuestion",
     "ImageBlock",
     "SceneBlocks",
-    "add",
-    "together",
 ]
 
 MAP_PRIOR = Prior(1.0)
@@ -176,7 +174,7 @@ class DenseBlocksQuestion(BlockQuestion):
     def information(self, view: SeenView) -> Information:
         """One dense block a Gaussian."""
         from drgs import fisher
-        from drgs.gain import DENSE
+        from drgs.information.gains import DENSE
 
         found = fisher.blocks(
             view.gaussians,
@@ -539,36 +537,3 @@ BACKDROP_BLOCK = ImageBlock(
     _of_backdrop,
     prepare=lambda of, seen, cameras, answers: backdrop_sphere(of.scene, cameras, answers),
 )
-
-
-# -------------------------------------------------- sums
-
-
-def add(total: dict[str, torch.Tensor], part: Information) -> None:
-    """Add what one more view, or one more block, says to what others have said, group by group.
-
-    Args:
-        total: Group -> float64 tensor; changed, groups that are new become its own.
-        part: The information that is added.
-    Raises:
-        ValueError: If a group is of other parameters than in the total.
-    """
-    for name, x in part.items():
-        if name not in total:
-            # float64: of thousands of views a float32 sum would lose what the last ones say.
-            total[name] = x.to(torch.float64, copy=True)
-        elif total[name].shape != x.shape:
-            raise ValueError(
-                f"information: {name} must be of the same parameters in every view, got shapes "
-                f"{tuple(total[name].shape)} and {tuple(x.shape)}; take views of one scene"
-            )
-        else:
-            total[name] += x
-
-
-def together(by_block: Mapping[str, Information]) -> dict[str, torch.Tensor]:
-    """What all blocks together say, of what each says alone."""
-    total: dict[str, torch.Tensor] = {}
-    for part in by_block.values():
-        add(total, part)
-    return total

@@ -24,10 +24,10 @@ from drgs.tracing.tangents import push_forward
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians, Scene
-    from drgs.gain import Information
     from drgs.information.groups import Group
     from drgs.information.nuisances import Nuisances
     from drgs.information.semantics import SemanticMetric
+    from drgs.information.sums import Information
     from drgs.settings import RenderSettings
 
 __all__ = ["BLOCK_INPUTS", "ViewRows", "backdrop_taken", "eliminated_of"]

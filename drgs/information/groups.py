@@ -14,8 +14,8 @@ from typing import Any
 import torch
 
 from drgs.ellipsoids import DeformableScene, Gaussians, Scene
-from drgs.gain import Information
 from drgs.information.jacobian import GEOMETRY
+from drgs.information.sums import Information
 from drgs.tracing.pose import quaternion_product
 
 __all__ = ["GROUPS", "Group", "Information", "groups_of", "scene_groups"]

@@ -18,9 +18,11 @@ from typing import TYPE_CHECKING
 import torch
 
 from drgs.ellipsoids import Y_00
-from drgs.gain import Information, Prior, variances
+from drgs.information.gains import variances
 from drgs.information.groups import groups_of
+from drgs.information.prior import Prior
 from drgs.information.replay import Replay
+from drgs.information.sums import Information
 from drgs.integrator import render
 from drgs.oracle import sh_colors
 

@@ -62,8 +62,8 @@ from drgs.tracing.tangents import push_forward
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians, Scene
-    from drgs.gain import Information
     from drgs.information.semantics import SemanticMetric
+    from drgs.information.sums import Information
 
 __all__ = ["NetworkProbes", "network", "network_variance_map"]
 

@@ -16,8 +16,9 @@ from drgs.display import pictures
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
 from drgs.gain import variances
-from drgs.information.blocks import MAP_PRIOR, SceneBlocks, add, together
+from drgs.information.blocks import MAP_PRIOR, SceneBlocks
 from drgs.information.scoring import Scoring
+from drgs.information.sums import add, together
 from drgs.integrator import render
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ import torch
 
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians, Scene
-from drgs.gain import Information
 from drgs.guards.arguments import must_be
+from drgs.information.sums import Information
 
 __all__ = ["Cache", "camera_key", "size_of", "value_key"]
 

@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from drgs.gain import Gain, Information, scorer
 from drgs.information.blocks import BlockQuestion, SceneBlocks
 from drgs.information.criteria import criterion_named
+from drgs.information.gains import Gain, scorer
 from drgs.information.once_per_time import once_per_time
 from drgs.information.seen_view import SeenView
+from drgs.information.sums import Information
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

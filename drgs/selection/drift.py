@@ -29,9 +29,9 @@ import torch
 
 from drgs.cameras import Camera
 from drgs.ellipsoids import Y_00, Gaussians, Scene
-from drgs.gain import Information
 from drgs.guards.json_files import check_json
 from drgs.information.groups import GROUPS
+from drgs.information.sums import Information
 from drgs.selection.cache import Cache, camera_key, value_key
 
 __all__ = ["DriftCache", "Shapes", "Unanswered", "named_by"]

@@ -20,11 +20,13 @@ from collections.abc import Callable, Hashable, Iterator, Sequence
 import torch
 
 from drgs.cameras import Camera
-from drgs.gain import Gain, Information, Prior, check
 from drgs.guards.memory import available
-from drgs.information.blocks import TAKEN, add
+from drgs.information.blocks import TAKEN
 from drgs.information.criteria import criterion_named
+from drgs.information.gains import Gain, check
 from drgs.information.network_groups import NETWORK_GROUPS
+from drgs.information.prior import Prior
+from drgs.information.sums import Information, add
 from drgs.selection.cache import Cache, size_of
 from drgs.selection.combine import Combination
 from drgs.selection.pool import Pool, Question, Selection, ViewQuestion

@@ -19,7 +19,7 @@ from drgs.settings import RenderSettings
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Scene
-    from drgs.gain import Information
+    from drgs.information.sums import Information
 
 __all__ = ["blur", "moments", "renderers"]
 

@@ -13,10 +13,10 @@ import torch
 
 from drgs.cameras import Camera
 from drgs.ellipsoids import Scene
-from drgs.gain import Information
 from drgs.information.choices import Combine
 from drgs.information.once_per_time import once_per_time
 from drgs.information.scoring import Scoring
+from drgs.information.sums import Information
 from drgs.selection.cache import Cache, camera_key, value_key
 from drgs.selection.refining import Refine
 

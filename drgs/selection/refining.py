@@ -21,7 +21,8 @@ from drgs.guards.arguments import ArgumentError, kind_of
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Scene
-    from drgs.gain import Gain, Information
+    from drgs.information.gains import Gain
+    from drgs.information.sums import Information
 
 __all__ = ["Refine", "refined"]
 

@@ -11,8 +11,9 @@ import torch
 from drgs.display.pictures import inferno
 from drgs.display.progress import Bar
 from drgs.gain import variances
-from drgs.information.blocks import MAP_PRIOR, SceneBlocks, add, together
+from drgs.information.blocks import MAP_PRIOR, SceneBlocks
 from drgs.information.scoring import Scoring
+from drgs.information.sums import add, together
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

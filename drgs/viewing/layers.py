@@ -20,7 +20,7 @@ import torch
 from drgs.display import pictures
 from drgs.ellipsoids import colors_only
 from drgs.gain import Information, Prior, check, variances
-from drgs.information.blocks import add
+from drgs.information.sums import add
 from drgs.integrator import Output, render
 from drgs.sizes import at_most, cropped
 
