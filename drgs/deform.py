@@ -13,13 +13,14 @@ from __future__ import annotations
 import dataclasses
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 
 from drgs.dynamics.hexplane import HexPlane, corners_of, features, product
+from drgs.dynamics.jacobian import scene_jacobian
 from drgs.dynamics.lives import LIVES, Lives, drift, living, logit_at
 from drgs.ellipsoids import Gaussians
 from drgs.guards.arguments import ArgumentError, must_be
@@ -389,6 +390,24 @@ class DynamicGaussians:
         fields["means"] = fields["means"].index_add(0, index, drift(mortal, time).to(fields["means"].dtype))
         logits = fields["logit_opacities"]
         fields["logit_opacities"] = logits.index_copy(0, index, logit_at(logits[index], mortal, time))
+
+
+@scene_jacobian.register(DynamicGaussians)
+class _FieldJacobian:
+    """J^T by a field's parameters: all images at once, and only of nodes that moving Gaussians read."""
+
+    fields = frozenset(Deltas._fields)
+
+    def __init__(self, scene: DynamicGaussians, time: float, names: Sequence[str]) -> None:
+        self.moving = scene.moving
+        self._scene = scene
+        self._time = time
+        self._names = names
+
+    def squared_slopes(self, index: torch.Tensor, slopes: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """As `drgs.dynamics.jacobian.SceneJacobian`."""
+        found = self._scene.squared_slopes(self._time, index, slopes)
+        return {name: found[name] for name in self._names}
 
 
 def is_finite(x: torch.Tensor) -> bool:

@@ -81,9 +81,8 @@ class Scene(Protocol):
 class DeformableScene(Scene, Protocol):
     """A scene whose Gaussians are a pure function of its parameters: these, too, have tangents and information.
 
-    `render_jvp` takes tangents named after `parameters()`, and of the time; `fisher.diagonal` groups. One that has
-    `moving`, (N,) bool, says which Gaussians its other parameters reach: `fisher.network` asks these alone. One that
-    also has `squared_slopes`, as `drgs.deform.DynamicGaussians` has, pulls back what all random images say at once.
+    `render_jvp` takes tangents named after `parameters()`, and of the time; `fisher.diagonal` groups. Its J^T is
+    torch's reverse mode through `deform`, unless it registers a faster one (`drgs.dynamics.jacobian.scene_jacobian`).
     """
 
     def deform(self, parameters: dict[str, torch.Tensor], time: float | torch.Tensor | None) -> Gaussians:

@@ -11,60 +11,41 @@ J^T J of the Jacobian J of S (Gauss-Newton; no photograph is needed). Parameters
     features (N,)            every channel of a feature has the same information, sum_p w_p^2
 
 With `semantics` the features that are composited are part of the image, decoded: y = [RGB; sqrt(gamma) W F]. Then they
-tell about means, rotations, log-scales and opacities, too (coupled), and a channel of a feature has gamma tr(W^T W) / D
-sum_p w_p^2 on average. Without, they tell about themselves only (uncoupled).
+inform about means, rotations, log-scales and opacities, too (coupled), and a channel of a feature has on average gamma
+tr(W^T W) / D sum_p w_p^2. Without, they inform about themselves only (uncoupled).
 
 Sources: Jiang et al. 2024 (FisherRF) for the criterion, with what its code computes instead under method "fisherrf";
-Wilson et al. 2025 (POp-GS) for blocks. `exact` costs one more traversal than rendering (replay.py, jacobian.py).
-What views say about a network that moves the Gaussians is in information/network.py.
+Wilson et al. 2025 (POp-GS) for blocks. `exact` costs one more traversal than rendering. All of it stands on the
+quantities of a view (`drgs.information.quantity`), which scores of candidates and all maps use as well.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import Unpack
 
 import torch
 
 from drgs.cameras import Camera
 from drgs.ellipsoids import Scene
 from drgs.guards.arguments import ArgumentError, must_be
-from drgs.guards.inputs import (
-    Masks,
-    check_any_scene,
-    check_scene,
-    check_view,
-    gaussians_at,
-    mask_list,
-    some_cameras,
-    three_weights,
-)
-from drgs.information.backdrop import (
-    BACKDROP,
-    CELLS,
-    Sphere,
-    backdrop_sphere,
-    backdrop_variance,
-    opacity_of,
-    painted_opacity,
-)
-from drgs.information.choices import METHODS
-from drgs.information.columns import jacobian_columns
-from drgs.information.diagonal import check_same_parameters, diagonal_and_opacity
-from drgs.information.elimination import BLOCK_INPUTS, ViewRows, backdrop_taken
-from drgs.information.gains import information_gain
-from drgs.information.groups import GROUPS, Information, groups_of
-from drgs.information.jacobian import GEOMETRY
+from drgs.guards.inputs import Masks, check_view, gaussians_at, three_weights
+from drgs.information.backdrop import BACKDROP, Backdrop, Sphere, backdrop_sphere
+from drgs.information.choices import METHODS, Method, NetworkEstimate
+from drgs.information.columns import PoseInformation, jacobian_columns
+from drgs.information.diagonal import Coverage, DenseBlocks, Diagonal
+from drgs.information.gains import DENSE, information_gain
+from drgs.information.groups import GROUPS
+from drgs.information.jacobian import Blocks
+from drgs.information.maps import variance_map as map_of_variance
 from drgs.information.nuisances import Nuisances
 from drgs.information.prior import Prior
-from drgs.information.replay import Replay
+from drgs.information.quantity import ViewContext, checked_views, sum_over_views
 from drgs.information.semantics import SemanticMetric
+from drgs.information.sums import Information
 from drgs.runtime import alone
 from drgs.settings import RenderSettings
 from drgs.splats import SplatScene, SplatTensors, scene_of
-
-if TYPE_CHECKING:
-    from drgs.information.network import network, network_variance_map
 
 __all__ = [
     "BLOCK",
@@ -87,16 +68,7 @@ __all__ = [
     "variance_map",
 ]
 
-BLOCK = 13  # means 3, rotations 3, log-scales 3, logit-opacity 1, base color 3
-
-
-def __getattr__(name: str) -> Any:
-    """What is about networks is loaded at first access (PEP 562): scenes that do not move have none."""
-    if name not in ("network", "network_variance_map"):
-        raise AttributeError(f"module 'drgs.fisher' has no attribute {name!r}")
-    from drgs.information import network as module
-
-    return getattr(module, name)
+BLOCK = Blocks.SIZE  # 13: means 3, rotations 3, log-scales 3, logit-opacity 1, base color 3
 
 
 @alone
@@ -104,7 +76,7 @@ def diagonal(
     gaussians: Scene | None = None,
     cameras: Camera | Sequence[Camera] | None = None,
     settings: RenderSettings | None = None,
-    method: str = "exact",
+    method: Method = "exact",
     *,
     groups: Sequence[str] | None = None,
     channel_weights: Sequence[float] = (1.0, 1.0, 1.0),
@@ -135,12 +107,12 @@ def diagonal(
         channel_weights: Inverse noise variances of R, G and B (`exact`, `columns`, `probes`).
         probes: Number of random images of method `probes`, of each view.
         seed: Seed of these.
-        semantics: The metric in which features tell about the geometry; None: they do not (`exact`, `columns`,
+        semantics: The metric in which features inform about the geometry; None: they do not (`exact`, `columns`,
             `probes`; only `exact` makes use of its `estimate`).
         masks: One for each camera: (H, W) in [0, 1] what its image is multiplied by before it is compared, as a fit
-            does, so that squares are multiplied by its square; or None: 1. Outside, a view tells nothing.
-        nuisances: Unknowns of each view that are eliminated from what it tells, its exposure and its pose
-            (`drgs.information.elimination`); None: there are none. Not of `fisherrf`. Features tell about themselves
+            does, so that squares are multiplied by its square; or None: 1. Outside, a view has no information.
+        nuisances: Unknowns of each view that are eliminated from its information, its exposure and its pose
+            (`drgs.information.elimination`); None: there are none. Not of `fisherrf`. Features inform about themselves
             alone, as they are, unless semantics make them a part of the image.
         splats: Instead of Gaussians and cameras the tensors of `drgs.rasterization`, by its names and in its shapes
             without leading axes: `means`, `quats`, `scales`, `opacities`, `colors`, `viewmats`, `Ks`, `width`,
@@ -158,34 +130,34 @@ def diagonal(
     weights = three_weights("fisher.diagonal", channel_weights)
     channels = 3
     if splats or isinstance(gaussians, torch.Tensor):
-        scene = _scene_of_tensors(gaussians, cameras, splats)
+        given = _scene_of_tensors(gaussians, cameras, splats)
         settings = settings or RenderSettings.preset("gsplat")
-        gaussians = scene.gaussians
-        cameras = scene.cameras
-        backgrounds = scene.backgrounds
-        channels = scene.channels
+        gaussians = given.gaussians
+        cameras = given.cameras
+        backgrounds = given.backgrounds
+        channels = given.channels
         weights = [weight if k < channels else 0.0 for k, weight in enumerate(weights)]
-    total, _ = diagonal_and_opacity(
-        gaussians,
-        cameras,
-        settings,
+    views, each, shown = checked_views("fisher.diagonal", gaussians, cameras, settings, masks)
+    assert gaussians is not None  # which has been refused
+    if backgrounds:  # every view has its own
+        each = [own.replace(background=color) for own, color in zip(each, backgrounds, strict=True)]
+    quantity = Diagonal(
         method,
-        groups=groups,
-        channel_weights=weights,
+        groups,
         probes=probes,
         seed=seed,
+        channel_weights=weights,
         semantics=semantics,
-        masks=masks,
-        nuisances=nuisances,
-        backgrounds=backgrounds,
+        nuisances=nuisances or Nuisances(),
     )
+    total = sum_over_views(quantity, gaussians, views, each, shown)
     if "sh" in total:
         total["sh"] = total["sh"][..., :channels]
     return total
 
 
 def _scene_of_tensors(gaussians: object, cameras: object, splats: SplatTensors) -> SplatScene:
-    """What `diagonal` is asked about by the tensors of `drgs.rasterization`, which must then be all that it gets."""
+    """The scene and cameras that the tensors of `drgs.rasterization` are; `diagonal` must get nothing beside them."""
     if isinstance(gaussians, torch.Tensor):
         raise ArgumentError(
             "fisher.diagonal: tensors must be passed by name, got one by place; use means=..., quats=..."
@@ -215,22 +187,9 @@ def blocks(
     Returns:
         (N, 13, 13) float64: means 3, rotations 3, log-scales 3, logit-opacity 1, base color sh[0] 3.
     """
-    cameras = _cameras_of("fisher.blocks", gaussians, cameras, settings)
-    settings = settings or RenderSettings.preset("exact")
-    count = len(gaussians_at("fisher.blocks", gaussians, cameras[0]))
+    views = checked_views("fisher.blocks", gaussians, cameras, settings, masks)
     weights = three_weights("fisher.blocks", channel_weights)
-    total = torch.zeros(count, BLOCK, BLOCK, dtype=torch.float64)
-    for camera, mask in zip(cameras, mask_list("fisher.blocks", masks, cameras), strict=True):
-        seen = gaussians_at("fisher.blocks", gaussians, camera)
-        check_same_parameters("fisher.blocks", "blocks", tuple(total.shape), (len(seen), BLOCK, BLOCK))
-        if semantics is not None:
-            semantics.check("fisher.blocks", seen)
-        if len(seen):
-            total += Replay(seen, camera, settings, semantics=semantics, mask=mask).blocks(weights)
-            rows = ViewRows.of(seen, camera, settings, weights, semantics, mask, nuisances)
-            if rows is not None:
-                total -= rows.taken_of_blocks(groups_of(seen, BLOCK_INPUTS))
-    return total
+    return sum_over_views(DenseBlocks(weights, semantics, nuisances or Nuisances()), gaussians, *views)[DENSE]
 
 
 @alone
@@ -245,16 +204,8 @@ def coverage(
     Args:
         gaussians, cameras, settings, masks: The same as for `diagonal`.
     """
-    cameras = _cameras_of("fisher.coverage", gaussians, cameras, settings)
-    settings = settings or RenderSettings.preset("exact")
-    total = torch.zeros(len(gaussians_at("fisher.coverage", gaussians, cameras[0])), dtype=torch.float64)
-    for camera, mask in zip(cameras, mask_list("fisher.coverage", masks, cameras), strict=True):
-        seen = gaussians_at("fisher.coverage", gaussians, camera)
-        check_same_parameters("fisher.coverage", "coverage", tuple(total.shape), (len(seen),))
-        if len(seen):
-            replay = Replay(seen, camera, settings, geometry=False, mask=mask)
-            total += replay.sums((GEOMETRY,), [1.0] * 3)[:, GEOMETRY].cpu()
-    return total
+    views = checked_views("fisher.coverage", gaussians, cameras, settings, masks)
+    return sum_over_views(Coverage(), gaussians, *views)["coverage"]
 
 
 @alone
@@ -280,21 +231,89 @@ def backdrop(
         nuisances: The same as for `diagonal`.
         semantics: The metric of the features, which show where the camera stands, too; None: only colors do.
     """
-    cameras = _cameras_of("fisher.backdrop", gaussians, cameras, settings)
+    cameras, each, shown = checked_views("fisher.backdrop", gaussians, cameras, settings, masks)
     if seen_opacity is not None and [x.shape for x in seen_opacity] != [(c.height, c.width) for c in cameras]:
         raise ValueError(
             f"fisher.backdrop: seen_opacity must be of the {len(cameras)} views and their sizes, got "
             f"{[tuple(x.shape) for x in seen_opacity]}; pass the alpha that drgs.render gives of the same views"
         )
-    settings = settings or RenderSettings.preset("exact")
     weights = three_weights("fisher.backdrop", channel_weights)
-    total = torch.zeros(CELLS, 3, dtype=torch.float64)
-    known: Sequence[torch.Tensor | None] = seen_opacity or [None] * len(cameras)
-    for camera, mask, opacity in zip(cameras, mask_list("fisher.backdrop", masks, cameras), known, strict=True):
-        seen = opacity_of(gaussians, camera, settings) if opacity is None else opacity
-        taken = backdrop_taken(gaussians, camera, settings, weights, semantics, mask, nuisances)
-        total += painted_opacity(seen, camera, weights, mask, sphere, taken)
-    return total
+    quantity = Backdrop(sphere, False, weights, semantics, nuisances or Nuisances())
+    return sum_over_views(quantity, gaussians, cameras, each, shown, seen_opacity)[BACKDROP]
+
+
+@alone
+def network(
+    scene: Scene,
+    cameras: Camera | Sequence[Camera],
+    settings: RenderSettings | None = None,
+    *,
+    estimate: NetworkEstimate = "diagonal",
+    mode: str = "reverse",
+    probes: int = 16,
+    seed: int = 0,
+    channel_weights: Sequence[float] = (1.0, 1.0, 1.0),
+    semantics: SemanticMetric | None = None,
+    masks: Masks = None,
+    nuisances: Nuisances | None = None,
+) -> Information:
+    """Information of views about a scene's deformation network, summed over views; an estimate.
+
+    Args:
+        scene: A `drgs.ellipsoids.DeformableScene` with parameters named `phi.grid.*` or `phi.mlp.*`.
+        cameras: One or several; each has a time.
+        settings: Default `RenderSettings.preset("exact")`.
+        estimate: `diagonal`, `trace` or `paper`, see `drgs.information.network`.
+        mode: Mode of `trace`: `reverse`, or `forward`, whose tangents are carried some at a time through one
+            traversal. `diagonal` has reverse mode only, `paper` needs both.
+        probes: K, of each view; the error falls as 1 / sqrt(K).
+        seed: Seed of the random signs, the same in all views.
+        channel_weights: Inverse noise variances of R, G and B.
+        semantics: The metric in which decoded features are rows, too; its `estimate` says how many channels they take.
+        masks, nuisances: The same as for `drgs.fisher.diagonal`. J is then W^(1/2) J, W what the unknowns leave of the
+            rows (`drgs.information.elimination`): each estimate is of H = J^T W J, and as unbiased as without.
+    Returns:
+        Group (`grid`, `mlp`; those that there are) -> float64 on the CPU: (P,) of its P parameters in the order of
+        `scene.parameters()`, of `trace` and `paper` a number ().
+    Raises:
+        ValueError: If the scene has no such parameters, a name is unknown or a number out of range.
+    """
+    from drgs.information.network import NetworkInformation  # scenes that do not move have none
+
+    views = checked_views("fisher.network", scene, cameras, settings, masks)
+    quantity = NetworkInformation(
+        estimate, mode, probes, seed, None, channel_weights, semantics, nuisances or Nuisances()
+    )
+    return sum_over_views(quantity, scene, *views)
+
+
+@alone
+def network_variance_map(
+    scene: Scene,
+    camera: Camera,
+    weights: Information,
+    settings: RenderSettings | None = None,
+    *,
+    probes: int = 16,
+    seed: int = 0,
+    channel_weights: Sequence[float] = (1.0, 1.0, 1.0),
+    semantics: SemanticMetric | None = None,
+) -> torch.Tensor:
+    """(H, W) float32: an estimate of the sum over rows of a pixel and parameters k of phi of J_pk^2 weights_k.
+
+    With weights 1 / (H_k + lambda) this is the predictive variance of a pixel because of the deformation. It is the
+    mean of (J v)^2 over v = z sqrt(weights), z random signs: forward mode.
+
+    Args:
+        scene, camera, settings, probes, seed, channel_weights, semantics: The same as for `network`; a pixel of n rows
+            has a relative error of about sqrt(2 / (n probes)) at most sqrt(2 / probes).
+        weights: Group -> (P,) as `network` returns it, >= 0; groups that are missing weigh 0.
+    """
+    from drgs.information.network import NetworkInformation  # scenes that do not move have none
+
+    view = _view("fisher.network_variance_map", scene, camera, settings)
+    quantity = NetworkInformation("diagonal", "reverse", probes, seed, None, channel_weights, semantics)
+    return quantity.variance_map(view, weights)
 
 
 @alone
@@ -319,50 +338,21 @@ def variance_map(
             them of what was hardly seen, count as 3e32.
         sphere: The same as for `backdrop`.
     """
-    seen = gaussians_at("fisher.variance_map", gaussians, camera)
-    check_view("fisher.variance_map", seen, camera, settings)
-    must_be("fisher.variance_map", "weights", weights, Mapping, "group -> tensor, as fisher.diagonal returns")
-    settings = settings or RenderSettings.preset("exact")
-    if semantics is not None:
-        semantics.check("fisher.variance_map", seen)
-    known = {name: group for name, group in groups_of(seen).items() if name != "features" or semantics is not None}
-    shapes = {BACKDROP: (CELLS, 3)} | {name: group.shape(seen) for name, group in known.items()}
-    for name, x in weights.items():
-        if name not in shapes:
-            raise ValueError(f"fisher.variance_map: weights must be of {', '.join(shapes)}, got {name!r}")
-        must_be("fisher.variance_map", f"weights of {name}", x, torch.Tensor, "as fisher.diagonal returns")
-        if tuple(x.shape) != shapes[name]:
-            raise ValueError(
-                f"fisher.variance_map: weights of {name} must have shape {shapes[name]}, got {tuple(x.shape)}"
-            )
-    behind = weights.get(BACKDROP)
-    if behind is not None and not bool(torch.isfinite(behind).all()):
-        raise ValueError("fisher.variance_map: weights must be finite, got NaN or Inf; raise lambda above 0")
-    weights = {name: x for name, x in weights.items() if name != BACKDROP}
-    factors = three_weights("fisher.variance_map", channel_weights)
-    found = torch.zeros(camera.height, camera.width)
-    if len(seen) and weights:
-        found = Replay(seen, camera, settings, semantics=semantics).variance(weights, factors)
-    if behind is not None:
-        found = found + backdrop_variance(seen, camera, behind, settings, factors, sphere).float()
-    return found
+    where = "fisher.variance_map"
+    view = _view(where, gaussians, camera, settings)
+    must_be(where, "weights", weights, Mapping, "group -> tensor, as fisher.diagonal returns")
+    return map_of_variance(view, weights, three_weights(where, channel_weights), semantics, sphere)
 
 
 def pose_information(gaussians: Scene, camera: Camera, settings: RenderSettings | None = None) -> torch.Tensor:
-    """(6, 6) float64: what a view says about its own pose.
+    """(6, 6) float64: the information of a view about its own pose.
 
     Of the world-frame twist c2w <- exp(xi) c2w, rotation (radians) first, then translation (world units).
     """
-    seen = gaussians_at("fisher.pose_information", gaussians, camera)
-    check_view("fisher.pose_information", seen, camera, settings)
-    colors = seen.replace(features=None)  # else their columns would be computed, too, for nothing
-    flat = jacobian_columns(colors, camera, {"camera": range(6)}, settings).reshape(6, -1).double()
-    return flat @ flat.T
+    return PoseInformation().compute(_view("fisher.pose_information", gaussians, camera, settings))["pose"]
 
 
-def _cameras_of(where: str, scene: object, cameras: object, settings: RenderSettings | None) -> list[Camera]:
-    """The cameras, if these are a scene and settings, too."""
-    check_any_scene(where, scene)
-    cameras = some_cameras(where, cameras)
-    check_scene(where, gaussians_at(where, scene, cameras[0]), settings)
-    return cameras
+def _view(where: str, scene: Scene, camera: Camera, settings: RenderSettings | None) -> ViewContext:
+    """One view, if these are a scene, a camera and settings."""
+    check_view(where, gaussians_at(where, scene, camera), camera, settings)
+    return ViewContext(scene, camera, settings or RenderSettings.preset("exact"))

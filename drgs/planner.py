@@ -43,8 +43,8 @@ from drgs.gain import Information
 from drgs.guards.arguments import ArgumentError, kind_of, must_be
 from drgs.guards.inputs import camera_list
 from drgs.select import Scoring, select
-from drgs.selection.drift import DriftCache, Unanswered, named_by
-from drgs.selection.informed import ask_views
+from drgs.selection.cache import Cache, NotKept, named_by
+from drgs.selection.informed import compute_candidates
 from drgs.selection.pool import Pick, Pool, Selection
 from drgs.selection.refining import Refine
 from drgs.settings import RenderSettings
@@ -160,7 +160,7 @@ class Planner:
         self.notes: Any = None
         self._scoring = scoring or _FAST
         self._fit = OnlineFit(config or default_config())
-        self._cache = DriftCache(bound, max_bytes)
+        self._cache = Cache(max_bytes, bound=bound)
         self._known: list[Camera] = []  # at the size at which they are asked
         self._here: Camera | None = None
         self._pool: list[Camera] = []
@@ -457,7 +457,7 @@ class Planner:
     def _expect(self, cameras: Sequence[Camera]) -> None:
         """Before an answer: of other cameras nothing is kept, and nothing has been given."""
         self._cache.expect(cameras)
-        self._cache.given.clear()
+        self._cache.changes.clear()
 
     # -------------------------------------------------- answers
 
@@ -470,11 +470,11 @@ class Planner:
         until = math.inf if seconds is None else begun + seconds - self._answered_in.usual * calls
         computed = self._ask(scene, known, until)
         answering = time.monotonic()
-        self._cache.asks = False
+        self._cache.computes = False
         try:
             plan = self._answer(scene, known, k)
         finally:
-            self._cache.asks = True
+            self._cache.computes = True
         now = time.monotonic()
         self._answered_in.note((now - answering) / calls)
         return dataclasses.replace(plan, computed=computed, seconds=now - begun)
@@ -500,7 +500,7 @@ class Planner:
 
     def _ask_one(self, scene: Gaussians, camera: Camera) -> None:
         """Ask one view, beside no others, which what it tells does not depend on."""
-        ask_views(
+        compute_candidates(
             Pool(scene=scene, candidates=[camera], train=[], k=1, scoring=self._scoring, rng=_RNG, cache=self._cache)
         )
 
@@ -527,7 +527,7 @@ class Planner:
             picks.append(PlannedView(places[best], here, selection.scores[best], costs[best], values[best]))
             there = [*there, here]
             selection, places, there = self._selected(scene, [i for i in places if i != places[best]], there, 1)
-        return ViewPlan(picks, scores, max(self._cache.given.values(), default=0.0), 0, left_out, 0.0)
+        return ViewPlan(picks, scores, max(self._cache.changes.values(), default=0.0), 0, left_out, 0.0)
 
     def _selected(
         self, scene: Gaussians, places: list[int], known: list[Camera], k: int
@@ -537,9 +537,9 @@ class Planner:
             pool = [self._pool[i] for i in places]
             try:
                 found = select(scene, pool, known, min(k, len(pool)), scoring=self._scoring, cache=self._cache)
-            except Unanswered as lacking:
-                places = [i for i in places if self._cache.answered(lacking.question, self._pool[i])]
-                known = [camera for camera in known if self._cache.answered(lacking.question, camera)]
+            except NotKept as lacking:
+                places = [i for i in places if self._cache.keeps(lacking.quantity, self._pool[i])]
+                known = [camera for camera in known if self._cache.keeps(lacking.quantity, camera)]
             else:
                 return found, places, known
         return None, places, known

@@ -1,6 +1,6 @@
 """Which cameras to add: policies over information, and simple baselines.
 
-A policy is a function from a `Pool` to a `Selection`; adding one is writing it in `drgs.policies` and naming it in
+A policy is a function from a `Pool` to a `Selection`; adding one is writing it in `drgs.selection` and naming it in
 `POLICIES` (`drgs.information.choices`), or `POLICIES["mine"] = mine` in a script. How a score comes from information
 is a `Scoring`; its criteria are in information/criteria.py.
 
@@ -22,18 +22,18 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 
 from drgs.cameras import Camera
 from drgs.ellipsoids import Scene
-from drgs.guards.arguments import kind_of, must_be
+from drgs.guards.arguments import must_be
 from drgs.guards.inputs import Masks, camera_list, check_any_scene, mask_list
-from drgs.information.choices import METHODS, POLICIES, check_named
-from drgs.information.criteria import CRITERIA, criterion_named
+from drgs.information.choices import METHODS, POLICIES
+from drgs.information.criteria import CRITERIA
 from drgs.information.scoring import Scoring
 from drgs.information.sums import Information
 from drgs.selection.cache import Cache
+from drgs.selection.policies import choose, policy_named
 from drgs.selection.pool import Pick, Pool, Selection, Workers
 from drgs.selection.refining import Refine
 
@@ -50,9 +50,6 @@ __all__ = [
     "policy_named",
     "select",
 ]
-
-_INFORMED = ("fisher", "fisherrf", "coverage")
-"""Policies that score a camera by what its view tells."""
 
 # One for the process: a new one each call, or the same seed again, would draw the same places of the list every time.
 _GENERATOR = torch.Generator().manual_seed(0)
@@ -107,9 +104,9 @@ def select(
         progress: Called with (views done, views) after each view.
         information: Camera -> Information, in place of `drgs.fisher`; the policy's own kind: {"coverage": (N,)} for
             `coverage`, {"blocks": (N, 13, 13)} for criterion `block_logdet`.
-        workers: Processes that compute what single views tell, here or on other machines
+        workers: Processes that compute the information of single views, here or on other machines
             (`drgs.cluster.connect.opened`); scores and picks are made here, of the same bits.
-        refine: Move each pick to where its view tells more; of `fisher`, `fisherrf` and `coverage`, whose scores add
+        refine: Move each pick to where its view scores higher; of `fisher`, `fisherrf` and `coverage`, whose scores add
             up (no z-scores). `Pick.camera` is where to.
         **fields: Fields of `Scoring`, in place of `scoring`: `criterion`, `settings`, `method`, `prior`, `weights`,
             `groups`, `blocks`, `semantics`, `network`, `combine`, `probes`; None is the default.
@@ -119,37 +116,14 @@ def select(
     """
     started = time.perf_counter()
     check_any_scene("select", gaussians)
-    candidates = camera_list("select", "candidates", candidates)
     train = camera_list("select", "train", train)
-    if not candidates:
-        raise ValueError("select: there must be at least one candidate, got none; give poses to choose from")
-    if not (isinstance(k, int) and 1 <= k <= len(candidates)):
-        raise ValueError(f"select: k must be a whole number in 1..{len(candidates)} candidates, got {k!r}; correct it")
-    chosen = policy_named(policy)
-    if rng is not None and not isinstance(rng, torch.Generator):
-        raise ValueError(f"select: rng must be a torch.Generator that is kept between calls, got {rng!r}; make one")
-    if masks is not None and information is not None:
-        raise ValueError("select: masks must be None with information, got both; it knows by itself what views tell")
-    if workers is not None and information is not None:
-        raise ValueError("select: workers must be None with information, got both; a function is called here")
-    scored = _scoring(scoring, fields)
-    criterion_named(scored.criterion, "select")  # else the first view's information would be computed before
-    if information is not None:
-        _check_beside(policy, scored)
-    if refine is not None:
-        must_be("select", "refine", refine, Refine, "e.g. drgs.select.Refine(evaluations=40)")
-        if policy in POLICIES and policy not in _INFORMED:
-            raise ValueError(
-                f"select: refine must be None with policy {policy}, got some; use {', '.join(_INFORMED)}, which score "
-                "any camera"
-            )
     pool = Pool(
         scene=gaussians,
-        candidates=candidates,
+        candidates=camera_list("select", "candidates", candidates),
         train=train,
         k=k,
-        scoring=scored,
-        rng=rng or _GENERATOR,
+        scoring=_scoring(scoring, fields),
+        rng=_GENERATOR if rng is None else rng,
         masks=mask_list("select", masks, train),
         empty_outside=empty_outside,
         cache=cache,
@@ -159,67 +133,11 @@ def select(
         workers=workers,
         refine=refine,
     )
-    selection = _returned(policy, pool, chosen(pool))
+    if masks is not None and information is not None:
+        raise ValueError("select: masks must be None with information, got both; it knows by itself what views tell")
+    selection = choose(policy, pool)
     selection.seconds = time.perf_counter() - started
     return selection
-
-
-def _returned(policy: str, pool: Pool, found: object) -> Selection:
-    """What a policy has returned, if it is a choice from the pool."""
-    where = f"select: policy {policy}"
-    advice = "make picks with pool.pick(index, score)"
-    must_be(where, "what it returns", found, Selection, f"e.g. Selection(picks, scores); {advice}")
-    assert isinstance(found, Selection)
-    picks = found.picks
-    scores = found.scores
-    count = len(pool.candidates)
-    if not isinstance(picks, list | tuple) or any(not isinstance(pick, Pick) for pick in picks):
-        raise ValueError(f"{where}: picks must be a list of Pick, got {kind_of(picks)}; {advice}")
-    indices = [pick.index for pick in picks]
-    possible = all(isinstance(i, int) and 0 <= i < count for i in indices)
-    if not possible or len(indices) != pool.k or len(set(indices)) != pool.k:
-        raise ValueError(
-            f"{where}: picks must be k = {pool.k} different ones of {count} candidates, got indices {indices}; {advice}"
-        )
-    try:
-        plain = scores.detach().cpu() if isinstance(scores, torch.Tensor) else scores
-        numbers = np.asarray(plain, dtype=np.float64) if not np.iscomplexobj(plain) else np.empty(0)
-    except (TypeError, ValueError, NotImplementedError):  # lists of other lengths, text; a tensor on `meta`
-        numbers = np.empty(0)
-    if numbers.shape != (count,) or not np.isfinite(numbers).all():
-        raise ValueError(
-            f"{where}: scores must be a finite number for each of {count} candidates, got {kind_of(scores)}; "
-            "before the first pick, in their order"
-        )
-    found.scores = numbers.tolist()  # plain, as files hold them
-    for name, one in (("parts", found.parts), ("unseen", found.unseen)):
-        if not isinstance(one, list) or len(one) not in (0, count):
-            raise ValueError(
-                f"{where}: {name} must be a list for each of {count} candidates, or empty, got {kind_of(one)}; "
-                "leave them out"
-            )
-    return found
-
-
-def _check_beside(policy: str, scoring: Scoring) -> None:
-    """Refuse what means nothing beside information of one's own, which would be dropped in silence."""
-    if policy in POLICIES and policy not in _INFORMED:
-        raise ValueError(f"select: information must be None with policy {policy}, got some; use {', '.join(_INFORMED)}")
-    if scoring.combine is not None or scoring.network != "ratio":
-        raise ValueError(
-            "select: combine and network must be left out with information, got "
-            f"{scoring.combine or scoring.network}; its groups are scored together, by criterion"
-        )
-
-
-def policy_named(name: str) -> Callable[[Pool], Selection]:
-    """The policy of a name, or the function that `package.module:function` names.
-
-    Raises:
-        ValueError: If there is none.
-    """
-    check_named("select", POLICIES, name)
-    return POLICIES.find("--policy", name)
 
 
 def _scoring(scoring: Scoring | None, fields: dict[str, Any]) -> Scoring:

@@ -50,7 +50,6 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"features"}, "what Gaussians and pixels are called: teacher maps, decoder, labels, queries"),
     ({"information"}, "what a view says about each parameter, and how that becomes a score"),
     ({"fisher", "gain"}, "both for users"),
-    ({"information.blocks"}, "the blocks of an image, for whoever asks views"),
     ({"meshing"}, "a surface from depth, cut to what information determines"),
     ({"selection"}, "what chooses among views, by information or by poses"),
     ({"select"}, "policies, for users"),

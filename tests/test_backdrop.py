@@ -15,7 +15,8 @@ from drgs import fisher
 from drgs.cameras import Camera, intrinsics_from_fov, look_at, orbit
 from drgs.gain import Prior, information_gain, variances
 from drgs.information.backdrop import CELLS, Sphere, backdrop_cells, backdrop_sphere
-from drgs.information.diagonal import diagonal_and_opacity
+from drgs.information.diagonal import Diagonal
+from drgs.information.quantity import ViewContext
 from drgs.select import Cache, select
 from drgs.settings import RenderSettings
 
@@ -240,7 +241,10 @@ def test_opacity_of_the_diagonal(blob, ring, preset):
     normal = torch.randn(50, 12, generator=torch.Generator().manual_seed(0))
     g = drgs.Gaussians(normal[:, :3], normal[:, 3:7], normal[:, 7:10] - 2, normal[:, 10], 0.3 * torch.ones(50, 1, 3))
     for scene in (blob, g):
-        diagonal, found = diagonal_and_opacity(scene, ring[:3], settings, "exact")
+        views = [ViewContext(scene, camera, settings) for camera in ring[:3]]
+        parts = [Diagonal().compute(view) for view in views]
+        diagonal = {name: sum(part[name] for part in parts) for name in parts[0]}
+        found = [view.opacity for view in views]
         assert [x.shape for x in found] == [(18, 24)] * 3
         for opacity, camera in zip(found, ring, strict=False):
             np.testing.assert_allclose(opacity, drgs.render(scene, camera, settings).alpha, atol=6e-6)

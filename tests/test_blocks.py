@@ -15,11 +15,11 @@ from drgs.cameras import orbit
 from drgs.fitting.config import SelectionConfig
 from drgs.gain import CRITERIA, Prior, ViewCriterion, criterion_named, information_gain, scorer
 from drgs.guards import registry
-from drgs.information.blocks import BlockQuestion, ImageBlock, SceneBlocks
-from drgs.information.choices import BLOCK_NAMES, BLOCKS, CRITERION_NAMES, POLICIES, POLICY_NAMES
+from drgs.information.blocks import ImageBlock, SceneBlocks
+from drgs.information.choices import BLOCK_NAMES, BLOCKS, CRITERION_NAMES, GAUSSIAN_GROUPS, POLICIES, POLICY_NAMES
 from drgs.information.groups import GROUPS
 from drgs.information.network_groups import NETWORK_GROUPS
-from drgs.information.seen_view import SeenView
+from drgs.information.quantity import Quantity, ViewContext
 from drgs.information.sums import add, together
 from drgs.select import Cache, Scoring, select
 from drgs.settings import RenderSettings
@@ -52,10 +52,10 @@ def world():
 
 
 @dataclasses.dataclass(frozen=True)
-class Brightness(BlockQuestion):
+class Brightness(Quantity):
     """About s in exp(s) S: the derivative of the image by it is the image."""
 
-    def information(self, view):
+    def compute(self, view):
         rgb = drgs.render(view.scene, view.camera, view.settings).rgb
         return {"brightness": rgb.double().square().sum()[None]}
 
@@ -72,7 +72,7 @@ def test_names_are_those_of_the_tables():
 def test_groups_of_the_blocks():
     """Together the blocks tell about all groups of Gaussians, those of a network, and the backdrop."""
     told = {name: set(BLOCKS[name].groups) for name in BLOCK_NAMES}
-    assert told["geometry"] | told["semantic"] == {*GROUPS}
+    assert told["geometry"] | told["semantic"] == {*GROUPS} == {*GAUSSIAN_GROUPS}
     assert {*GROUPS} - told["geometry"] == {"features"}
     assert {*GROUPS} - told["semantic"] == {"sh"}
     assert told["deformation"] == {*NETWORK_GROUPS}
@@ -94,7 +94,7 @@ def test_tables_load_nothing_heavy():
 def test_a_block_is_one_row(world):
     """It is scored, beside others or alone, kept in a cache, summed over known views and mapped, by its row alone."""
     g, cams = world
-    BLOCKS["brightness"] = ImageBlock(("brightness",), lambda asked, names: Brightness())
+    BLOCKS["brightness"] = ImageBlock(("brightness",), lambda blocks, names: Brightness())
     scoring = Scoring("eig", FAST, prior=Prior(1.0), blocks=("geometry", "brightness"))
     cache = Cache()
     found = select(g, cams[2:], cams[:2], 2, scoring=scoring, cache=cache)
@@ -121,16 +121,16 @@ def test_a_block_is_one_row(world):
         select(g, cams[2:], cams[:2], 1, settings=FAST, blocks=("geometry",), groups=("means", "brightness"))
 
 
-def test_a_question_without_a_map_says_so(world):
+def test_a_quantity_without_a_map_says_so(world):
     """In one line, with what is missing."""
     g, cams = world
 
     @dataclasses.dataclass(frozen=True)
-    class Silent(BlockQuestion):
+    class Silent(Quantity):
         pass
 
     with pytest.raises(NotImplementedError, match="blocks: Silent must have a method `variance_map`, has none; add it"):
-        Silent().variance_map(SeenView(g, cams[0], FAST), {})
+        Silent().variance_map(ViewContext(g, cams[0], FAST), {})
 
 
 def test_sums_are_of_the_same_parameters():

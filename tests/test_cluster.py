@@ -229,7 +229,7 @@ def test_a_killed_worker_costs_its_views(cluster, moving, monkeypatch):
         return said
 
     monkeypatch.setattr(cluster, "result", result)
-    answers = list(cluster.each(still, [(slow, cam, None) for cam in cams]))
+    answers = list(cluster.each(still, FAST, [(slow, cam, None) for cam in cams]))
     assert [float(answer["which"]) for answer in answers] == [slow.number(cam) for cam in cams]
     (address, keys), (pid,) = *hers.items(), killed
     assert not _runs(pid)
@@ -242,7 +242,7 @@ def test_a_killed_worker_costs_its_views(cluster, moving, monkeypatch):
 
 @dataclasses.dataclass
 class _Slow:
-    """A question that takes its time."""
+    """A quantity that takes its time."""
 
     seconds: float
 
@@ -250,9 +250,9 @@ class _Slow:
     def number(cam) -> float:
         return float(np.asarray(cam.w2c).sum())
 
-    def __call__(self, scene, cam, mask):
+    def compute(self, view):
         time.sleep(self.seconds)
-        return {"which": torch.tensor(self.number(cam), dtype=torch.float64)}
+        return {"which": torch.tensor(self.number(view.camera), dtype=torch.float64)}
 
 
 def _runs(pid: int) -> bool:

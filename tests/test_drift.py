@@ -12,8 +12,8 @@ from scenes_random import gaussians
 
 from drgs.cameras import orbit
 from drgs.ellipsoids import Gaussians
-from drgs.selection.drift import DriftCache, Shapes, Unanswered
-from drgs.selection.pool import ViewQuestion
+from drgs.selection.cache import Cache, NotKept, view_key
+from drgs.selection.drift import Shapes
 
 pytestmark = pytest.mark.core
 
@@ -30,8 +30,8 @@ def change(before: Gaussians, now: Gaussians) -> torch.Tensor:
     return Shapes.of(before).change_to(Shapes.of(now))
 
 
-def key_of(camera, question="what"):
-    return ViewQuestion(None, camera, None, question).key
+def key_of(camera, quantity="what"):
+    return view_key(quantity, camera)
 
 
 def information(g: Gaussians, value=1.0):
@@ -90,33 +90,33 @@ def test_the_world_is_compared_not_the_origin():
 def test_an_answer_lasts_while_little_changes():
     """Below the bound it is given again, above it is not; where nothing more is computed it is given all the same."""
     g, (camera, *_) = scene(), cameras()
-    cache = DriftCache(bound=0.1)
+    cache = Cache(bound=0.1)
     cache.expect([camera])
     key = key_of(camera)
     assert cache.find(g, key) is None
     assert cache.change(g, camera) == math.inf
     cache.keep(g, key, information(g))
     assert cache.find(g, key)["means"] is not None
-    assert cache.given == {key[1]: 0.0}
+    assert cache.changes == {key[1]: 0.0}
     little = g.replace(log_scales=g.log_scales + 0.05)
     assert torch.equal(cache.find(little, key)["means"], information(g)["means"])
-    assert cache.given[key[1]] == pytest.approx(0.05, rel=1e-4)
+    assert cache.changes[key[1]] == pytest.approx(0.05, rel=1e-4)
     much = g.replace(log_scales=g.log_scales + 0.3)
     assert cache.change(much, camera) == pytest.approx(0.3, rel=1e-4)
     assert cache.find(much, key) is None
-    cache.asks = False
+    cache.computes = False
     assert cache.find(much, key) is not None
-    with pytest.raises(Unanswered) as lacking:
+    with pytest.raises(NotKept) as lacking:
         cache.find(much, key_of(camera, "something else"))
-    assert lacking.value.question == "something else"
-    assert cache.answered("what", camera)
-    assert not cache.answered("something else", camera)
+    assert lacking.value.quantity == "something else"
+    assert cache.keeps("what", camera)
+    assert not cache.keeps("something else", camera)
 
 
 def test_what_a_view_does_not_see_may_change():
     """The mean is over what makes up the image: here the first Gaussian alone, then the first two, unevenly."""
     g, (camera, *_) = scene(), cameras()
-    cache = DriftCache(bound=1.0)
+    cache = Cache(bound=1.0)
     cache.expect([camera])
     told = information(g, 0.0)
     told["sh"][0, 0] = 1.0
@@ -136,7 +136,7 @@ def test_new_gaussians_count_where_they_are_seen():
     g, (camera, *_) = scene(), cameras()
     front, back = (camera.center + z * camera.c2w[:3, 2] for z in (3.0, -3.0))
     for place, want in ((front, 1 / 13), (back, 0.0)):
-        cache = DriftCache(bound=1.0)
+        cache = Cache(bound=1.0)
         cache.expect([camera])
         cache.keep(g, key_of(camera), information(g))
         more = {name: torch.cat([x, x[:1]]) for name, x in g.parameters().items()}
@@ -147,7 +147,7 @@ def test_new_gaussians_count_where_they_are_seen():
         assert {name: tuple(x.shape) for name, x in found.items()} == {"means": (13, 3), "sh": (13, 4, 3)}
         assert not found["means"][12].any()
         assert torch.equal(found["means"][:12], information(g)["means"])
-    cache = DriftCache(bound=1.0)
+    cache = Cache(bound=1.0)
     cache.expect([camera])
     cache.keep(g, key_of(camera), information(g))
     sharper = g.replace(sh=torch.cat([g.sh, torch.zeros(12, 5, 3)], 1))
@@ -160,7 +160,7 @@ def test_only_what_is_expected_is_kept():
     """Answers of other cameras go; of too many bytes the one that was used least recently."""
     g, views = scene(), cameras()
     size = sum(x.nbytes for x in information(g).values())
-    cache = DriftCache(bound=0.1, max_bytes=2 * size)
+    cache = Cache(bound=0.1, max_bytes=2 * size)
     cache.expect(views[:3])
     for camera in views[:3]:
         cache.keep(g, key_of(camera), information(g))
@@ -178,7 +178,7 @@ def test_only_what_is_expected_is_kept():
 def test_a_shorter_list_is_another_scene():
     """Nothing says which Gaussians have gone: everything is forgotten, and cameras are still expected."""
     g, (camera, *_) = scene(), cameras()
-    cache = DriftCache(bound=1.0)
+    cache = Cache(bound=1.0)
     cache.expect([camera])
     cache.keep(g, key_of(camera), information(g))
     fewer = g.replace(**{name: x[:7] for name, x in g.parameters().items()})

@@ -11,11 +11,12 @@ from scenes_random import camera, gaussians
 from test_network_information import TIME, swarm
 
 from drgs import fisher
+from drgs.dynamics.jacobian import TorchJacobian, scene_jacobian
 from drgs.dynamics.lives import Lives
-from drgs.information import network, network_rows
-from drgs.information.network import _Reduced
-from drgs.information.network_rows import NetworkRows
+from drgs.information import network
+from drgs.information.network import NetworkInformation, _Reduced, _Rows
 from drgs.information.pullback import Pullback
+from drgs.information.quantity import ViewContext
 from drgs.information.semantics import SemanticMetric
 from drgs.settings import RenderSettings
 from drgs.tracing.call import Call
@@ -34,6 +35,12 @@ def made(n=40, coefficients=4, features=0, seed=0, **options):
     return swarm(g, **options), dataclasses.replace(cam, time=TIME, w2c=cam.w2c.detach())
 
 
+def rows_of(scene, cam, settings, semantics=None, mask=None):
+    """The rows of a view, each weighted by 1."""
+    rows = _Rows.of("fisher.network", ViewContext(scene, cam, settings, mask), NetworkInformation(semantics=semantics))
+    return dataclasses.replace(rows, weights=torch.ones_like(rows.weights))
+
+
 def both(scene, cam, settings, semantics=None, mask=None):
     """Squared slopes of phi along random images, by sums over hits and by a traversal for each image."""
     names = [name for name in scene.parameters() if name.startswith("phi.")]
@@ -50,9 +57,10 @@ def both(scene, cam, settings, semantics=None, mask=None):
     shown = images if mask is None else images * mask.reshape(-1, 1)
     slopes = [pull(x[:, :3], x[:, 3:] if channels > 3 else None) for x in shown]
     want = {name: sum(x[name].square() for x in slopes) for name in names}
-    rows = NetworkRows(scene, cam, settings, semantics, names, mask)
-    assert rows.are_of_geometry
-    return rows.squares(rows.along(images)), want
+    rows = rows_of(scene, cam, settings, semantics, mask)
+    jacobian = scene_jacobian(scene, TIME, names)
+    assert jacobian.fields <= {"means", "quats", "log_scales", "logit_opacities"}
+    return rows.squares_of_hits(jacobian, rows.hit_sums(jacobian, images)), want
 
 
 def close(found, want):
@@ -102,10 +110,12 @@ def test_through_the_graph_of_any_scene():
     close(*both(Plain(scene), cam, RenderSettings.preset("fast")))
     index = torch.randperm(40, generator=torch.Generator().manual_seed(0))[:25].sort().values
     names = [name for name in scene.parameters() if name.startswith("phi.")]
-    fields = network_rows._Fields.of(scene, TIME, names)
-    slopes = {name: torch.randn(5, 25, *x.shape[1:]) for name, x in fields.made.items()}
-    want = fields.squares(slopes, index)
-    found = scene.squared_slopes(TIME, index, slopes)
+    plain = TorchJacobian(scene, TIME, names)
+    assert plain.fields == scene_jacobian(scene, TIME, names).fields
+    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,)}
+    slopes = {name: torch.randn(5, 25, *shapes[name]) for name in plain.fields}
+    want = plain.squared_slopes(index, slopes)
+    found = scene_jacobian(scene, TIME, names).squared_slopes(index, slopes)
     for name in names:
         torch.testing.assert_close(found[name], want[name], rtol=1e-5, atol=1e-6 * float(want[name].max()))
 
@@ -147,8 +157,8 @@ def test_nothing_in_sight():
     away = dataclasses.replace(cam, w2c=w2c)
     names = ["phi.grid.0", "phi.mlp.means.3.weight"]
     for one in (scene, Plain(scene)):
-        rows = NetworkRows(one, away, RenderSettings.preset("exact"), None, names)
-        slopes = rows.squares(rows.along(torch.ones(2, away.width * away.height, 3)))
+        rows, jacobian = rows_of(one, away, RenderSettings.preset("exact")), scene_jacobian(one, TIME, names)
+        slopes = rows.squares_of_hits(jacobian, rows.hit_sums(jacobian, torch.ones(2, away.width * away.height, 3)))
         assert {name: x.shape for name, x in slopes.items()} == {n: scene.parameters()[n].shape for n in names}
         assert all(float(x.abs().max()) == 0 for x in slopes.values())
 
@@ -176,9 +186,11 @@ def test_parameters_that_change_colors_are_asked_by_traversals():
     scene, cam = made(seed=4)
     tinted = Tinted(scene.gaussians, torch.ones(3))
     settings = RenderSettings.preset("exact")
-    assert not NetworkRows(tinted, cam, settings, None, ["phi.mlp.tint"]).are_of_geometry
-    found = fisher.network(tinted, cam, settings, probes=2)
-    assert float(found["mlp"].min()) > 0
+    assert scene_jacobian(tinted, TIME, ["phi.mlp.tint"]).fields == {"sh"}
+    found = fisher.network(tinted, cam, settings, probes=512)["mlp"]
+    assert float(found.min()) > 0
+    by_columns = fisher.diagonal(tinted, cam, settings, "columns", groups=["phi.mlp.tint"])["phi.mlp.tint"]
+    assert found.tolist() == pytest.approx(by_columns.tolist(), rel=0.25)  # sqrt(2 / 512) is 0.06
 
 
 def test_more_images_than_are_held(monkeypatch):

@@ -8,18 +8,18 @@ import torch
 from scenes_random import assert_same_sums, camera, gaussians
 from test_network_information import swarm
 
-import drgs.information.once_per_time
+import drgs.information.quantity
 from drgs import fisher
 from drgs.ellipsoids import DeformableScene
 from drgs.fitting.config import SelectionConfig
 from drgs.gain import Prior, information_gain
-from drgs.information import diagonal
-from drgs.information.blocks import NetworkQuestion, SceneBlocks
-from drgs.information.once_per_time import once_per_time
+from drgs.information.blocks import SceneBlocks
+from drgs.information.diagonal import Diagonal
+from drgs.information.network import NetworkInformation
+from drgs.information.quantity import ViewContext, once_per_time
 from drgs.information.replay import Replay
-from drgs.information.seen_view import SeenView
 from drgs.select import POLICIES, Cache, Scoring, select
-from drgs.selection.combine import Questions, asked_of
+from drgs.selection.combine import joint_of
 from drgs.settings import RenderSettings
 
 FAST = RenderSettings.preset("fast")
@@ -121,7 +121,7 @@ def test_one_traversal_for_geometry_and_deformation(views, monkeypatch, preset, 
     replays = []
     plain = Replay.__init__
     monkeypatch.setattr(Replay, "__init__", lambda *a, **o: (replays.append(a), plain(*a, **o))[1])
-    found = Questions(settings, tuple(asked_of(blocks)[0]))(scene, cams[4], mask)
+    found = joint_of(blocks)[0].compute(ViewContext(scene, cams[4], settings, mask))
     assert len(replays) == 1
     masks = None if mask is None else [mask]
     want = fisher.network(scene, cams[4], settings, probes=K, masks=masks)
@@ -162,7 +162,7 @@ def test_what_is_computed_once_is_the_scene(views, monkeypatch):
     assert torch.equal(once.moving, scene.moving)
     assert once.at(0.5) is once.at(0.5)
     assert not any(x.requires_grad for x in once.at(0.5).parameters().values())
-    monkeypatch.setattr(drgs.information.once_per_time, "_BYTES", 0)
+    monkeypatch.setattr(drgs.information.quantity, "_BYTES", 0)
     seen = once.at(0.5)
     assert once.at(1.0) is not seen
     assert once.at(0.5) is not seen
@@ -186,28 +186,23 @@ def test_a_trace_needs_nothing_known(views, cache, network):
 
 
 @pytest.mark.parametrize("blocks", [("deformation",), ("geometry", "deformation")])
-def test_a_trace_does_not_ask_known_views(views, monkeypatch, blocks):
+def test_a_trace_is_not_computed_of_known_views(views, monkeypatch, blocks):
     """Probes of the network are pulled back at the candidates alone; other blocks ask known views as ever."""
     scene, cams = views
-    asked = {"network": [], "diagonal_and_opacity": []}
-    diagonal_of, network_of = diagonal.diagonal_and_opacity, NetworkQuestion.information
+    computed = {Diagonal: [], NetworkInformation: []}
+    for kind in computed:
 
-    def spy(scene, camera, *rest, **options):
-        asked["diagonal_and_opacity"].append(camera.name)
-        return diagonal_of(scene, camera, *rest, **options)
+        def spy(self, view, plain=kind.compute):
+            computed[type(self)].append(view.camera.name)
+            return plain(self, view)
 
-    def spy_on_network(question, view):
-        asked["network"].append(view.camera.name)
-        return network_of(question, view)
-
-    monkeypatch.setattr(diagonal, "diagonal_and_opacity", spy)
-    monkeypatch.setattr(NetworkQuestion, "information", spy_on_network)
+        monkeypatch.setattr(kind, "compute", spy)
     pick(scene, cams[2:4], cams[:2], 2, blocks=blocks, network="trace")
-    assert asked["network"] == [x.name for x in cams[2:4]]
-    assert asked["diagonal_and_opacity"] == ([x.name for x in cams[:4]] if "geometry" in blocks else [])
-    asked["network"].clear()
+    assert computed[NetworkInformation] == [x.name for x in cams[2:4]]
+    assert computed[Diagonal] == ([x.name for x in cams[:4]] if "geometry" in blocks else [])
+    computed[NetworkInformation].clear()
     pick(scene, cams[2:4], cams[:2], 2, blocks=blocks)  # a ratio needs what is known
-    assert asked["network"] == [x.name for x in cams[:4]]
+    assert computed[NetworkInformation] == [x.name for x in cams[:4]]
 
 
 @pytest.mark.parametrize("network", ["ratio", "trace"])
@@ -266,15 +261,14 @@ def test_rows_of_the_image_are_those_of_the_other_blocks():
     scene = swarm(g.replace(features=torch.randn(8, 4)))
     cams = [dataclasses.replace(cam, time=t, w2c=cam.w2c.detach()) for t in (0.0, 1.0)]
     score = lambda *blocks: Scoring(blocks=blocks, network="trace")  # noqa: E731
-    asked_by = lambda *blocks: asked_of(SceneBlocks.of(scene, score(*blocks), cams))[0]  # noqa: E731
+    parts_of = lambda *blocks: joint_of(SceneBlocks.of(scene, score(*blocks), cams))[0].parts  # noqa: E731
     told = {}
     for blocks in (("deformation",), ("geometry", "deformation"), ("semantic", "deformation")):
-        question = asked_by(*blocks)[-1].question
-        assert isinstance(question, NetworkQuestion)
-        view = SeenView(scene, cams[1], FAST)
-        told[blocks[0]] = sum(float(x) for x in question.information(view).values())
-    both = asked_by("geometry", "semantic", "deformation")
-    assert [one.block for one in both] == ["geometry", "semantic", "deformation"]
+        quantity = parts_of(*blocks)[-1][1]
+        assert isinstance(quantity, NetworkInformation)
+        told[blocks[0]] = sum(float(x) for x in quantity.compute(ViewContext(scene, cams[1], FAST)).values())
+    both = parts_of("geometry", "semantic", "deformation")
+    assert [block for block, _ in both] == ["geometry", "semantic", "deformation"]
     assert told["deformation"] == told["geometry"]
     assert told["semantic"] != told["geometry"]
 

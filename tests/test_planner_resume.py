@@ -22,7 +22,7 @@ from drgs.cameras import orbit
 from drgs.files import load_state, save_state
 from drgs.planner import Planner
 from drgs.select import Scoring
-from drgs.selection.drift import named_by
+from drgs.selection.cache import named_by
 
 HERE = Path(__file__).resolve().parent
 ROUNDS = 6

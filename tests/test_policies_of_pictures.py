@@ -10,6 +10,7 @@ import torch
 from test_semantic_information import gaussians, ring
 
 import drgs
+from drgs.information.quantity import ViewContext
 from drgs.select import select
 from drgs.selection.pictures import _Blur, _Renderers
 from drgs.settings import RenderSettings
@@ -62,11 +63,13 @@ def test_renderers_disagree(world):
 
 
 def test_workers_can_be_sent_them(world):
-    """The questions survive pickling, answer alike and keep no graph."""
+    """The quantities survive pickling, are computed alike and keep no graph."""
     g, _, candidates = world
     live = g.replace(means=g.means.clone().requires_grad_())
-    for question in (_Blur(RenderSettings.preset("fast")), _Renderers((0.0, 0.0, 0.0))):
-        (again,) = pickle.loads(pickle.dumps(question))(live, candidates[0], None).values()
-        (value,) = question(g, candidates[0], None).values()
+    settings = RenderSettings.preset("fast")
+    for quantity in (_Blur(), _Renderers()):
+        copy = pickle.loads(pickle.dumps(quantity))
+        (again,) = copy.compute(ViewContext(live, candidates[0], settings)).values()
+        (value,) = quantity.compute(ViewContext(g, candidates[0], settings)).values()
         assert torch.equal(again, value)
         assert not again.requires_grad

@@ -20,6 +20,7 @@ from drgs import fisher, reference
 from drgs.cameras import Camera, intrinsics_from_fov, look_at
 from drgs.ellipsoids import Gaussians
 from drgs.gain import CRITERIA, Prior, dense, information_gain
+from drgs.information.quantity import ViewContext
 from drgs.select import POLICIES, Cache, Scoring, select
 from drgs.selection.cache import camera_key
 from drgs.settings import RenderSettings
@@ -514,8 +515,8 @@ def test_what_means_nothing_beside_information_is_refused(options, message):
 class _Here:
     """Workers that answer in this process, as they are asked."""
 
-    def each(self, scene, views):
-        return (question(scene, camera, mask) for question, camera, mask in views)
+    def each(self, scene, settings, requests):
+        return (x.compute(ViewContext(scene, camera, settings, mask)) for x, camera, mask in requests)
 
 
 @pytest.mark.parametrize("kind", [_Fresh, _Plain, lambda g: g])

@@ -161,7 +161,7 @@ def test_a_call_within_a_call_takes_nothing_of_it(still):
     assert within == pytest.approx(expected, rel=1e-5)
     assert select(g, cameras[2:9], cameras[:2], settings=FAST, cache=cache).scores == pytest.approx(expected, rel=1e-5)
     assert len({round(score, 9) for score in expected}) == len(expected)
-    assert cache.bytes == sum(x.nbytes for answer in cache._answers.values() for x in answer.values())
+    assert cache.bytes == sum(x.nbytes for kept in cache._kept.values() for x in kept.computed.values())
 
 
 def test_a_scene_that_changes_leaves_nothing(still):

@@ -1,10 +1,10 @@
-"""Workers behind a scheduler: what they have in common with this process, what they are sent, what they answer.
+"""Workers behind a scheduler: what they have in common with this process, what they are sent, what they return.
 
-What single views tell is computed by them: the scene goes to each of them once, views come back one by one. A few views
-for each worker are on their way at any time, so that this process holds no more answers than without workers. They are
-taken in their order, rounded to float32 as they are without workers, and added up here: it does not matter who has
-computed which. A view whose worker has gone is given to another one by Dask; one that has not got the scene, because it
-has started since, says so, is sent it, and the view is asked for again.
+Quantities of single views are computed by them: the scene goes to each of them once, views come back one by one. A few
+views for each worker are on their way at any time, so that this process holds no more results than without workers.
+They are taken in their order, rounded to float32 as they are without workers, and added up here: it does not matter
+who has computed which. A view whose worker has gone is given to another one by Dask; one that has not got the scene,
+because it has started since, says so, is sent it, and the view is computed again.
 """
 
 from __future__ import annotations
@@ -33,16 +33,18 @@ from drgs.cluster.agreement import (
     worker_statement,
 )
 from drgs.cluster.payloads import Missing, Payload, keep, opened_payload
+from drgs.information.quantity import ViewContext
 
 if TYPE_CHECKING:
     from distributed import Client, Future, LocalCluster
 
-    from drgs.cameras import Camera
     from drgs.ellipsoids import Scene
+    from drgs.information.quantity import Quantity
     from drgs.information.sums import Information
-    from drgs.selection.pool import Question
+    from drgs.selection.pool import ViewRequest
+    from drgs.settings import RenderSettings
 
-__all__ = ["WORKER_SECONDS", "Cluster", "ask"]
+__all__ = ["WORKER_SECONDS", "Cluster", "compute_view"]
 
 WORKER_SECONDS = 60.0
 """Time that a cluster may be without any worker."""
@@ -62,10 +64,10 @@ class Cluster:
         ours: What every worker must have in common with this process.
         sent_bytes: Bytes that were sent to each worker so far.
         sent_seconds: Time that it took to send them to all workers.
-        views: Worker -> how many views it has answered for.
+        views: Worker -> how many views it has computed.
         view_seconds: Wall time of each of these views on its worker.
         cpu_seconds: CPU time of all of these views together.
-        received_bytes: Size of all answers.
+        received_bytes: Size of all results.
     """
 
     def __init__(self, client: Client, local: LocalCluster | None = None) -> None:
@@ -78,55 +80,53 @@ class Cluster:
         self.views: Counter[str] = Counter()
         self.view_seconds: list[float] = []
         self.cpu_seconds = 0.0
-        self._payloads: dict[str, Payload] = {}  # of the call that is being answered
+        self._payloads: dict[str, Payload] = {}  # of the current call
         self._is_there = time.monotonic()  # when a worker was seen last
 
-    def each(
-        self, scene: Scene, views: Sequence[tuple[Question, Camera, torch.Tensor | None]]
-    ) -> Iterator[Information]:
-        """What views of a scene say, in their order: question, camera and mask of each.
+    def each(self, scene: Scene, settings: RenderSettings, requests: Sequence[ViewRequest]) -> Iterator[Information]:
+        """Quantities of views of a scene, in the order of the requests.
 
         Raises:
-            ValueError: As the question does, or if something cannot be pickled, or a worker disagrees.
+            ValueError: As the quantity does, or if something cannot be pickled, or a worker disagrees.
             ConnectionError: If the scheduler, or all workers, have gone.
         """
-        if not views:
+        if not requests:
             return
-        questions: list[Question] = []
-        for question, _, _ in views:
-            if not any(question is other for other in questions):
-                questions.append(question)
-        payloads = [self.send(scene), self.send(questions)]
+        quantities: list[Quantity] = []
+        for quantity, _, _ in requests:
+            if not any(quantity is other for other in quantities):
+                quantities.append(quantity)
+        payloads = [self.send(scene), self.send((settings, quantities))]
         self.forget(payloads)
         pending: dict[int, Future] = {}
 
         def begin(i: int) -> Future:
-            question, camera, mask = views[i]
-            number = next(k for k, other in enumerate(questions) if other is question)
-            return self.submit(ask, self.ours, *payloads, number, Payload.of((camera, mask)).data)
+            quantity, camera, mask = requests[i]
+            number = next(k for k, other in enumerate(quantities) if other is quantity)
+            return self.submit(compute_view, self.ours, *payloads, number, Payload.of((camera, mask)).data)
 
         try:
             ahead = max(1, len(self.workers())) * _AHEAD
-            for i in range(len(views)):
-                for j in range(i, min(i + ahead, len(views))):
+            for i in range(len(requests)):
+                for j in range(i, min(i + ahead, len(requests))):
                     if j not in pending:
                         pending[j] = begin(j)
-                what = f"view {views[i][1].name or i}"
+                what = f"view {requests[i][1].name or i}"
                 for _ in range(_TRIES):
-                    said = self.result(pending.pop(i), what)
-                    if "missing" not in said:
+                    reply = self.result(pending.pop(i), what)
+                    if "missing" not in reply:
                         break
-                    self.send_again(payloads, [said["address"]])
+                    self.send_again(payloads, [reply["address"]])
                     pending[i] = begin(i)
                 else:
                     raise ConnectionError(
-                        f"cluster: worker {said['worker']} must keep what it is sent, does not; restart it"
+                        f"cluster: worker {reply['worker']} must keep what it is sent, does not; restart it"
                     )
-                self.views[said["worker"]] += 1
-                self.view_seconds.append(said["seconds"])
-                self.cpu_seconds += said["cpu_seconds"]
-                self.received_bytes += sum(getattr(x, "nbytes", 8) for x in said["answer"].values())
-                yield _tensors(said["answer"])
+                self.views[reply["worker"]] += 1
+                self.view_seconds.append(reply["seconds"])
+                self.cpu_seconds += reply["cpu_seconds"]
+                self.received_bytes += sum(getattr(x, "nbytes", 8) for x in reply["computed"].values())
+                yield _tensors(reply["computed"])
         finally:
             if pending:
                 self.client.cancel(list(pending.values()))
@@ -263,37 +263,37 @@ class Cluster:
                 self._local.close(timeout=5)
 
 
-def _tensors(answer: Mapping[str, np.ndarray]) -> dict[str, torch.Tensor]:
+def _tensors(arrays: Mapping[str, np.ndarray]) -> dict[str, torch.Tensor]:
     """Arrays of a message, which is read-only, as tensors of their own."""
-    return {name: torch.from_numpy(np.array(x)) for name, x in answer.items()}
+    return {name: torch.from_numpy(np.array(x)) for name, x in arrays.items()}
 
 
 # --------------------------------------------------------------------------------------------------- on the worker
 
 
-def ask(ours: Mapping[str, str], scene: str, questions: str, number: int, view: bytes) -> dict[str, Any]:
-    """Compute what one view says, on a worker.
+def compute_view(ours: Mapping[str, str], scene: str, quantities: str, number: int, view: bytes) -> dict[str, Any]:
+    """Compute a quantity of one view, on a worker.
 
     Args:
         ours: What the worker must agree with.
         scene: Digest of the payload that holds the scene.
-        questions: Digest of the payload that holds the list of questions.
-        number: Index of the view's question in that list.
+        quantities: Digest of the payload that holds the settings and the list of quantities.
+        number: Index of the view's quantity in that list.
         view: Camera and mask, pickled.
     Returns:
-        `answer`, arrays by name, `seconds` and the process's `cpu_seconds`; or what is `missing`; always `worker`, its
-        `address` and its `host`.
+        `computed`, arrays by name, `seconds` and the process's `cpu_seconds`; or what is `missing`; always `worker`,
+        its `address` and its `host`.
     """
-    said: dict[str, Any] = {**this_worker()}
-    check_agreement(said["worker"], statement(), ours)
+    reply: dict[str, Any] = {**this_worker()}
+    check_agreement(reply["worker"], statement(), ours)
     began, cpu = time.perf_counter(), time.process_time()
     try:
-        seen, asked = opened_payload(scene), opened_payload(questions)
+        shown, (settings, known) = opened_payload(scene), opened_payload(quantities)
     except Missing as missing:
-        return said | {"missing": str(missing)}
+        return reply | {"missing": str(missing)}
     camera, mask = pickle.loads(view)
-    found = asked[number](seen, camera, mask)
-    # An answer is numbers; a graph of the worker's process could not travel.
-    answer = {name: x.detach().cpu().numpy() for name, x in found.items()}
+    # Numbers; a graph of the worker's process could not travel.
+    found = known[number].compute(ViewContext(shown, camera, settings, mask))
+    computed = {name: x.detach().cpu().numpy() for name, x in found.items()}
     seconds = time.perf_counter() - began
-    return said | {"answer": answer, "seconds": seconds, "cpu_seconds": time.process_time() - cpu}
+    return reply | {"computed": computed, "seconds": seconds, "cpu_seconds": time.process_time() - cpu}

@@ -1,4 +1,4 @@
-"""Behind drgs.fisher, drgs.gain and drgs.select: rows of the Jacobian, their squares, greedy selection."""
+"""Behind drgs.fisher and drgs.gain: quantities of a view (quantity.py), their sums over views, and their scores."""
 
 from drgs.guards.imports import modules_of
 

@@ -16,41 +16,52 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch
 
 from drgs.ellipsoids import colors_only
 from drgs.information.complement import left
+from drgs.information.nuisances import Nuisances
+from drgs.information.quantity import Quantity, ViewContext
+from drgs.information.sums import Information
 from drgs.settings import RenderSettings
 from drgs.sizes import at_most
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Scene
+    from drgs.information.semantics import SemanticMetric
 
 __all__ = [
     "BACKDROP",
     "CELLS",
+    "Backdrop",
+    "ComputeViews",
     "Sphere",
+    "SurfaceDepths",
     "backdrop_cells",
     "backdrop_sphere",
     "backdrop_variance",
-    "opacity_of",
     "painted_opacity",
 ]
 
 BACKDROP = "backdrop"  # the group of its information
-_SIDE = 16  # cells along an edge of the cube
+_OPACITY, _TAKEN = "opacity", "taken"  # names of what is computed of one view
+_SIDE = 16  # cells along an edge of the cube, of 4 to 6 degrees
 CELLS = 6 * _SIDE**2
-_PIXELS = 1200  # of a view as its depth is looked at
-_VIEWS = 16  # whose depth is looked at, at most
+_PIXELS = 1200  # of a view as its depth is looked at, such as 40 x 30: a quantile needs no detail
+_VIEWS = 16  # whose depth is looked at, at most: the cost does not grow with the number of candidates
 _FAST = RenderSettings.preset("fast")  # measures depth along the ray, as `ewa` does not
-_SOLID = 0.5  # opacity from which on that is the depth of a surface
-_FARTHEST = 0.95  # of all depths
-_AROUND = 1.05  # of the distance of the outermost camera, which is inside
+_SOLID = 0.5  # opacity from which on the median depth is that of a surface
+_FARTHEST = 0.95  # quantile of all depths that is the radius: a few floaters do not decide it
+_AROUND = 1.05  # of the distance of the outermost camera, at least: cameras are inside, not on the sphere
+_NO_NUISANCES = Nuisances()
+
+ComputeViews = Callable[[Quantity, Sequence["Camera"]], Iterable[Information]]
+"""(quantity, cameras) -> what is computed of each view, as `drgs.selection.pool.Pool.compute_each`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,19 +80,19 @@ class Sphere:
 def backdrop_sphere(
     scene: Scene,
     cameras: Sequence[Camera],
-    answers: Callable[[Callable, Sequence[Camera]], Iterable[Mapping[str, torch.Tensor]]] | None = None,
+    compute: ComputeViews | None = None,
 ) -> Sphere | None:
     """Around all cameras, as far away as nearly all surfaces that they show, each at its time; None: infinitely far
-    away, where they show none. Of more than 16 cameras, 16 are asked: sorted by x, y and z of their centers, every so
+    away, where they show none. Of more than 16 cameras, 16 count: sorted by x, y and z of their centers, every so
     many.
 
     It depends on the scene and on all of these cameras, in whatever order. So it moves as candidates come and go, with
-    the bits that a single call would find; `drgs.select.Cache` keeps what views tell apart from it.
+    the bits that a single call would find; `drgs.select.Cache` keeps the opacity of views apart from it.
 
     Args:
         scene: The scene that is seen.
         cameras: The cameras that see it.
-        answers: Asks the scene's views, in place of one after another here (`Pool.answers`).
+        compute: Computes a quantity of views, in place of one after another here (`Pool.compute_each`).
     Raises:
         ValueError: If there is no camera.
     """
@@ -93,7 +104,11 @@ def backdrop_sphere(
     if len(cameras) > _VIEWS:
         in_order = sorted(cameras, key=_place)
         cameras = [in_order[i * len(cameras) // _VIEWS] for i in range(_VIEWS)]
-    found = answers(_surfaces, cameras) if answers else (_surfaces(scene, camera) for camera in cameras)
+    quantity = SurfaceDepths()
+    if compute is not None:
+        found = compute(quantity, cameras)
+    else:
+        found = (quantity.compute(ViewContext(scene, camera, _FAST)) for camera in cameras)
     solid = np.concatenate([one["depths"].numpy() for one in found])
     if not len(solid):
         return None
@@ -107,16 +122,24 @@ def _place(camera: Camera) -> tuple[list, list, float]:
     return camera.center.tolist(), camera.w2c.tolist(), -math.inf if camera.time is None else camera.time
 
 
-def _surfaces(scene: Scene, camera: Camera, mask: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
-    """(P,) depths of what is solid in a small picture of a view."""
-    from drgs.integrator import render
+@dataclasses.dataclass(frozen=True)
+class SurfaceDepths(Quantity):
+    """{"depths": (P,)}: depths of what is solid in a small picture of a view, whatever its settings are."""
 
-    with torch.no_grad():  # a distance is a number
-        plain = colors_only(scene, camera.time)
-        small = at_most(camera, _PIXELS)
-        out = render(plain, small, _FAST, outputs=("median_depth",))
-    assert out.median_depth is not None
-    return {"depths": out.median_depth[(out.alpha >= _SOLID) & (out.median_depth > 0)].cpu()}
+    def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
+        """Float32 on the CPU."""
+        from drgs.integrator import render  # loads Dr.Jit, which poses alone need not have
+
+        with torch.no_grad():  # a distance is a number
+            plain = colors_only(view.scene, view.camera.time)
+            small = at_most(view.camera, _PIXELS)
+            out = render(plain, small, _FAST, outputs=("median_depth",))
+        assert out.median_depth is not None
+        return {"depths": out.median_depth[(out.alpha >= _SOLID) & (out.median_depth > 0)].cpu()}
+
+    def key(self, camera: Camera, settings: RenderSettings) -> Hashable:
+        """Whatever the settings are."""
+        return self
 
 
 def backdrop_cells(camera: Camera, sphere: Sphere | None = None) -> torch.Tensor:
@@ -138,14 +161,6 @@ def backdrop_cells(camera: Camera, sphere: Sphere | None = None) -> torch.Tensor
         first, second = ((x / 2 * _SIDE).astype(np.int64).clip(0, _SIDE - 1) for x in even)
         found[seen] = ((2 * k + (along < 0)) * _SIDE + first) * _SIDE + second
     return torch.from_numpy(found.reshape(camera.height, camera.width))
-
-
-def opacity_of(scene: Scene, camera: Camera, settings: RenderSettings) -> torch.Tensor:
-    """(H, W) float32 opacity alpha of a view."""
-    from drgs.integrator import render
-
-    with torch.no_grad():  # information is a number
-        return render(colors_only(scene, camera.time), camera, settings, outputs=()).alpha.cpu()
 
 
 def _open(opacity: torch.Tensor) -> torch.Tensor:
@@ -177,24 +192,81 @@ def painted_opacity(
         open_ = open_ * mask.detach().double().cpu().square()
     cells = backdrop_cells(camera, sphere).flatten()
     total.index_add_(0, cells, open_.flatten())
-    told = total[:, None] * torch.tensor(channel_weights, dtype=torch.float64)
+    shown = total[:, None] * torch.tensor(channel_weights, dtype=torch.float64)
     if taken is None:
-        return told
+        return shown
     lost = torch.zeros(CELLS, *taken.shape[1:], dtype=torch.float64)
     # The same clamp as of `_open`, and 1 - alpha in float64, as there.
     rows = taken.double() * (1 - opacity.double().cpu()).clamp(min=0).reshape(-1, 1, 1)
     lost.index_add_(0, cells, rows)
-    return left(told, lost.square().sum(-1))
+    return left(shown, lost.square().sum(-1))
 
 
 def backdrop_variance(
-    scene: Scene,
-    camera: Camera,
-    weights: torch.Tensor,
-    settings: RenderSettings,
-    channel_weights: Sequence[float],
-    sphere: Sphere | None = None,
+    view: ViewContext, weights: torch.Tensor, channel_weights: Sequence[float], sphere: Sphere | None = None
 ) -> torch.Tensor:
-    """(H, W) float64 (1 - alpha)^2 times the weights (1536, 3) of the pixel's cell, summed over weighted channels."""
+    """(H, W) float32 (1 - alpha)^2 times the weights (1536, 3) of the pixel's cell, summed over weighted channels.
+
+    Raises:
+        ValueError: If a weight is not finite.
+    """
+    if not bool(torch.isfinite(weights).all()):
+        raise ValueError("fisher.variance_map: weights must be finite, got NaN or Inf; raise lambda above 0")
     each = weights.double().cpu() @ torch.tensor(channel_weights, dtype=torch.float64)
-    return _open(opacity_of(scene, camera, settings)) * each[backdrop_cells(camera, sphere)]
+    return (_open(view.opacity) * each[backdrop_cells(view.camera, sphere)]).float()
+
+
+@dataclasses.dataclass(frozen=True)
+class Backdrop(Quantity):
+    """About the color behind all Gaussians: {"backdrop": (1536, 3)}, as of `drgs.fisher.backdrop`.
+
+    What is computed of a view is its opacity, with what its unknowns take where any are eliminated: these do not depend
+    on the other views, around which the sphere is. They are painted on it when views are added up.
+
+    Attributes:
+        sphere: What the color is painted on; None: infinitely far away.
+        empty_outside: Whether it is known that nothing is outside of masks, so that the view has shown it.
+        channel_weights: Inverse noise variances of R, G and B.
+        semantics: The metric of the features, which show where the camera stands, too; None: only colors do.
+        nuisances: Unknowns of the view that are eliminated.
+    """
+
+    sphere: Sphere | None = None
+    empty_outside: bool = False
+    channel_weights: Sequence[float] = (1.0, 1.0, 1.0)
+    semantics: SemanticMetric | None = None
+    nuisances: Nuisances = _NO_NUISANCES
+    where: ClassVar[str] = "fisher.backdrop"
+
+    @property
+    def signed(self) -> tuple[str, ...]:
+        """What unknowns take are directions, of either sign."""
+        return (_TAKEN,)
+
+    def key(self, camera: Camera, settings: RenderSettings) -> Hashable:
+        """Without the sphere, and what is known outside of masks."""
+        return dataclasses.replace(self, sphere=None, empty_outside=False), settings
+
+    def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
+        """The view's opacity, (H, W), and what its unknowns take."""
+        found = {_OPACITY: view.opacity}
+        if self.nuisances.names:
+            from drgs.information.elimination import backdrop_taken  # loads Dr.Jit, which poses alone need not have
+
+            taken = backdrop_taken(view, self.channel_weights, self.semantics, self.nuisances)
+            found |= {} if taken is None else {_TAKEN: taken}
+        return found
+
+    def summand(self, computed: Information, camera: Camera, mask: torch.Tensor | None) -> dict[str, torch.Tensor]:
+        """Painted on the sphere."""
+        found = dict(computed)
+        mask = None if self.empty_outside else mask
+        opacity, taken = found.pop(_OPACITY), found.pop(_TAKEN, None)
+        found[BACKDROP] = painted_opacity(opacity, camera, self.channel_weights, mask, self.sphere, taken)
+        return found
+
+    def variance_map(self, view: ViewContext, weights: Information) -> torch.Tensor:
+        """`drgs.fisher.variance_map` of the color behind."""
+        if BACKDROP not in weights:
+            return torch.zeros(view.camera.height, view.camera.width)
+        return backdrop_variance(view, weights[BACKDROP], self.channel_weights, self.sphere)

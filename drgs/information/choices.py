@@ -1,6 +1,6 @@
 """What views can be judged and chosen by, by name; loads nothing heavy, for the options of the command line read it.
 
-What stands behind a name is imported when it is first asked for. Rows that other packages add are found by entry points
+What stands behind a name is imported when it is first looked up. Rows that other packages add are found by entry points
 (`drgs.guards.registry`), and have no part in what is the default.
 """
 
@@ -26,6 +26,7 @@ __all__ = [
     "CRITERION_NAMES",
     "Criterion",
     "Estimate",
+    "GAUSSIAN_GROUPS",
     "Method",
     "NetworkScore",
     "NetworkEstimate",
@@ -83,8 +84,8 @@ Method = Literal["exact", "columns", "probes", "fisherrf"]
 METHODS: tuple[Method, ...] = typing.get_args(Method)
 
 Block = Literal["geometry", "semantic", "deformation", "backdrop"]
-"""What is asked of a view: what its colors and its features tell about the Gaussians, what the image tells about the
-network that moves them, and about what stands behind them, where they leave a pixel open."""
+"""Parts of an image with the parameters that they inform about: colors and features about the Gaussians, the image
+about the network that moves them, and opacity about what stands behind them, where they leave a pixel open."""
 
 BLOCK_NAMES: tuple[Block, ...] = typing.get_args(Block)
 """In the order in which results name them. Where no blocks are named, these count, as far as the scene has them."""
@@ -119,6 +120,9 @@ def checked_blocks(where: str, names: Sequence[str], method: str) -> tuple[Block
         raise ValueError(f"{where}: blocks must be geometry with method fisherrf, got {other[0]}; use method exact")
     return tuple(name for name in BLOCKS if name in names)  # type: ignore[misc]  # one of another package is no `Block`
 
+
+GAUSSIAN_GROUPS = ("means", "rotations", "log_scales", "logit_opacities", "sh", "features")
+"""The names of `drgs.information.groups.GROUPS`."""
 
 Estimate = Literal["principal", "collapsed", "exact"]
 """How `drgs.fisher.SemanticMetric` sums over the channels of decoded features; the first is the default everywhere."""

@@ -1,31 +1,29 @@
-"""Columns of a view's Jacobian by forward mode, and the diagonal of J^T J from them: exact, for small scenes."""
+"""Columns of a view's Jacobian by forward mode: exact, for small scenes, and for the pose of its camera."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
 
 from drgs.guards.arguments import must_be
 from drgs.guards.inputs import check_view, gaussians_at
-from drgs.information.complement import left
-from drgs.information.elimination import ViewRows
-from drgs.information.groups import Group, Information, groups_of, scene_groups
+from drgs.information.groups import groups_of, scene_groups
+from drgs.information.quantity import Quantity
 from drgs.integrator import render_jvp
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians, Scene
-    from drgs.information.nuisances import Nuisances
-    from drgs.information.semantics import SemanticMetric
+    from drgs.information.quantity import ViewContext
     from drgs.settings import RenderSettings
 
-__all__ = ["by_columns", "jacobian_columns"]
+__all__ = ["BATCH", "PoseInformation", "jacobian_columns"]
 
-_BATCH = 16  # tangents of one traversal
+BATCH = 16  # tangents of one traversal
 
 
 def jacobian_columns(
@@ -33,7 +31,7 @@ def jacobian_columns(
     camera: Camera,
     index: Mapping[str, Any],
     settings: RenderSettings | None = None,
-    batch: int = _BATCH,
+    batch: int = BATCH,
 ) -> torch.Tensor:
     """Columns of the Jacobian by forward mode: how the image changes with single parameters.
 
@@ -77,53 +75,22 @@ def jacobian_columns(
     return torch.zeros(0, camera.height, camera.width, width)
 
 
-def by_columns(
-    gaussians: Gaussians,
-    camera: Camera,
-    settings: RenderSettings,
-    wanted: Mapping[str, Group],
-    weights: Sequence[float],
-    semantics: SemanticMetric | None,
-    scene: Scene | None = None,
-    mask: torch.Tensor | None = None,
-    nuisances: Nuisances | None = None,
-) -> Information:
-    """The diagonal of J^T J from every column of J.
+@dataclasses.dataclass(frozen=True)
+class PoseInformation(Quantity):
+    """{"pose": (6, 6)}: what a view says about the pose of its camera, as `drgs.fisher.pose_information`."""
 
-    Args:
-        gaussians: The Gaussians as the camera sees them.
-        wanted: Groups: the Gaussians', or with `scene` the scene's own.
-        weights: Inverse noise variances of R, G and B.
-        semantics: The metric of the features, if these tell about the geometry.
-        scene: The scene that the Gaussians come from.
-        mask: (H, W) what the image is multiplied by; None: 1.
-        nuisances: Unknowns of the view that are eliminated.
-    """
-    result = {}
-    every = None if semantics is None else dataclasses.replace(semantics, estimate="exact")
-    rows_of_view = ViewRows.of(gaussians, camera, settings, weights, every, mask, nuisances) if wanted else None
-    scale = torch.tensor(weights, dtype=torch.float64)
-    # A mask is a number, whatever graph it is in; sums of squares of all pixels are float64, as everywhere here.
-    factor = torch.ones(1, 1, dtype=torch.float64) if mask is None else mask.detach().double().cpu()
-    for name, group in wanted.items():
-        shape = group.tangent(gaussians)
-        squares = []
-        rows = np.argwhere(np.ones(shape))
-        for start in range(0, len(rows), _BATCH):
-            index = {name: rows[start : start + _BATCH]}
-            columns = jacobian_columns(scene or gaussians, camera, index, settings).cpu().double() * factor[..., None]
-            told = torch.zeros(len(columns), dtype=torch.float64)
-            if group.outputs == (0, 3):
-                told += (columns[..., :3].square() * scale).sum((1, 2, 3))
-            if semantics is not None:
-                told += semantics.squares(columns[..., 3:]).sum((1, 2))
-            elif group.outputs != (0, 3):
-                told += columns[..., 3:].square().sum((1, 2, 3))
-            if rows_of_view is not None and (group.outputs == (0, 3) or semantics is not None):
-                told = left(told, rows_of_view.lost_of_columns(columns, group.outputs == (0, 3)))
-            squares.append(told)
-        result[name] = group.merge(torch.cat(squares).reshape(shape))
-    return result
+    where: ClassVar[str] = "fisher.pose_information"
+
+    @property
+    def signed(self) -> tuple[str, ...]:
+        """Entries off the diagonal."""
+        return ("pose",)
+
+    def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
+        """Float64."""
+        colors = view.gaussians.replace(features=None)  # else their columns would be computed, too, for nothing
+        columns = jacobian_columns(colors, view.camera, {"camera": range(6)}, view.settings).reshape(6, -1).double()
+        return {"pose": columns @ columns.T}
 
 
 def _whole(name: str, rows: Any, shape: tuple[int, ...]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The unknowns of a view itself (nuisances), eliminated from what the view tells about the scene.
+"""The unknowns of a view itself (nuisances), eliminated from its information about the scene.
 
 A photograph has unknowns of its own besides the scene's: three log gains g (exposure and white balance), image_c' =
 exp(g_c) image_c, and the pose of its camera, a twist of six numbers. With J the Jacobian of the view's rows (channels
@@ -40,10 +40,10 @@ _ROUNDING = 4e-6
 found in two ways, apart by up to 1e-6 of the entry on scenes of 20,000 Gaussians."""
 
 
-def left(told: torch.Tensor, lost: torch.Tensor) -> torch.Tensor:
+def left(whole: torch.Tensor, lost: torch.Tensor) -> torch.Tensor:
     """What is left of entries of a diagonal; 0, not a rest of either sign, where that is all rounding."""
-    rest = told - lost
-    return torch.where(rest > _ROUNDING * told, rest, 0.0)
+    rest = whole - lost
+    return torch.where(rest > _ROUNDING * whole, rest, 0.0)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class Eliminated:
 
     Attributes:
         directions: (pixels, C, r) float64 U, orthonormal over all rows.
-        shares: (r,) float64 S, how much of a direction the view itself must tell; 1 where nothing is known before.
+        shares: (r,) float64 S, share of a direction's information that the view alone has; 1: nothing is known before.
     """
 
     directions: torch.Tensor

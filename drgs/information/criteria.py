@@ -67,7 +67,7 @@ CRITERIA: Registry[ViewCriterion] = Registry(
         "block_logdet": ViewCriterion(None, scores_fall=True, of_blocks=True),
     },
 )
-"""Name -> criterion; `drgs.select` chooses by the first unless told otherwise. A plain function is taken as the `term`
+"""Name -> criterion; `drgs.select` chooses by the first by default. A plain function is taken as the `term`
 of a criterion of which nothing else is known."""
 
 

@@ -1,140 +1,279 @@
-"""The diagonal of J^T J, summed over views, and the opacity found on the way; `drgs.fisher` is the public side."""
+"""What a view says about the parameters of its Gaussians: the diagonal of J^T J, its dense blocks, and coverage.
+
+Methods of the diagonal:
+
+    exact      squares of every derivative of each pixel and channel, hit by hit in one replay (replay.py)
+    columns    the same from forward-mode columns of J, one for every parameter
+    probes     mean of (J^T v)^2 over random images v, one reverse pass each
+    fisherrf   a replay that sums channels before it squares, as FisherRF's rasterizer does
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, ClassVar
 
+import numpy as np
 import torch
 
-from drgs.cameras import Camera
-from drgs.ellipsoids import DeformableScene, Scene
-from drgs.guards.inputs import Masks, check_any_scene, check_scene, gaussians_at, mask_list, some_cameras
-from drgs.information.choices import METHODS
-from drgs.information.columns import by_columns
+from drgs.ellipsoids import DeformableScene
+from drgs.information.choices import METHODS, Method
+from drgs.information.columns import BATCH, jacobian_columns
 from drgs.information.complement import left
-from drgs.information.elimination import ViewRows
+from drgs.information.elimination import BLOCK_INPUTS, ViewRows
+from drgs.information.gains import DENSE
 from drgs.information.groups import Group, groups_of
+from drgs.information.jacobian import GEOMETRY
+from drgs.information.jacobian import Blocks as BlockSums
+from drgs.information.maps import variance_map
 from drgs.information.nuisances import Nuisances
-from drgs.information.probes import by_probes
-from drgs.information.replay import Replay, WalkSums
+from drgs.information.pullback import Pullback
+from drgs.information.quantity import Quantity
 from drgs.information.semantics import SemanticMetric
+from drgs.information.sums import Information
 from drgs.runtime import alone
-from drgs.settings import RenderSettings
+from drgs.tracing.call import Call
+from drgs.tracing.errors import own_errors
 
-__all__ = ["check_same_parameters", "diagonal_and_opacity"]
+if TYPE_CHECKING:
+    from drgs.ellipsoids import Scene
+    from drgs.information.quantity import ViewContext
+
+__all__ = ["Coverage", "DenseBlocks", "Diagonal"]
+
+_NO_NUISANCES = Nuisances()
 
 
-@alone
-def diagonal_and_opacity(
-    gaussians: Scene | None,
-    cameras: Camera | Sequence[Camera] | None,
-    settings: RenderSettings | None,
-    method: str,
-    *,
-    groups: Sequence[str] | None = None,
-    channel_weights: Sequence[float] = (1.0, 1.0, 1.0),
-    probes: int = 16,
-    seed: int = 0,
-    semantics: SemanticMetric | None = None,
-    masks: Masks = None,
-    nuisances: Nuisances | None = None,
-    backgrounds: Sequence[tuple[float, ...]] = (),
-    beside: Sequence[WalkSums] = (),
-) -> tuple[dict[str, torch.Tensor], list[torch.Tensor]]:
-    """The diagonal of J^T J, and the opacity of the views that it is of.
+@dataclasses.dataclass(frozen=True)
+class Diagonal(Quantity):
+    """The diagonal of J^T J; `drgs.fisher.diagonal` has the equations, and more about each field.
 
-    Methods `exact` and `fisherrf` replay a traversal that composites the view, and so have its opacity for nothing: the
-    block `backdrop`, which is about (1 - opacity)^2, then need not render the view a second time.
+    Attributes:
+        method: How it is computed.
+        groups: Groups that are wanted; None: all that the Gaussians have.
+        without: Groups of the result that are left out.
+        of_gaussians: Whether groups are those of the Gaussians, also where the scene has a tensor of the same name.
+        probes, seed: Random images of method `probes`, and their seed; the number of the view is added to it.
+        channel_weights: Inverse noise variances of R, G and B; 0 where colors are no part of the image.
+        semantics: The metric of the features that are a part of the image; None: they are none.
+        nuisances: Unknowns of the view that are eliminated.
+    """
+
+    method: Method = "exact"
+    groups: Sequence[str] | None = None
+    without: tuple[str, ...] = ()
+    of_gaussians: bool = False
+    probes: int = 16
+    seed: int = 0
+    channel_weights: Sequence[float] = (1.0, 1.0, 1.0)
+    semantics: SemanticMetric | None = None
+    nuisances: Nuisances = _NO_NUISANCES
+    where: ClassVar[str] = "fisher.diagonal"
+
+    @alone
+    def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
+        """Group -> float64 tensor on the CPU; 0 of a view without Gaussians. A replay gives the view its opacity."""
+        seen = view.gaussians
+        scene = seen if self.of_gaussians else view.scene
+        wanted = self._checked_groups(groups_of(seen, self.groups, scene))
+        if self.semantics is not None:
+            self.semantics.check(self.where, seen)
+        if not len(seen):
+            found = {name: torch.zeros(group.shape(seen)) for name, group in wanted.items()}
+        elif self.method in ("columns", "probes"):
+            compute = _by_columns if self.method == "columns" else _by_probes
+            found = compute(self, view, {n: group for n, group in wanted.items() if group.owner != "scene"})
+            if own := {n: group for n, group in wanted.items() if group.owner == "scene"}:
+                assert isinstance(scene, DeformableScene)  # which alone has tensors of its own
+                found |= compute(self, view, own, scene)
+        else:
+            found = self._by_replay(view, wanted)
+        return {name: found[name].to(torch.float64) for name in wanted if name not in self.without}
+
+    def variance_map(self, view: ViewContext, weights: Information) -> torch.Tensor:
+        """`drgs.fisher.variance_map` of the same rows."""
+        return variance_map(view, weights, self.channel_weights, self.semantics)
+
+    def _by_replay(self, view: ViewContext, wanted: dict[str, Group]) -> dict[str, torch.Tensor]:
+        replay = view.replay(self.semantics)
+        along = [probes.sums for probes in view.probes.values() if probes.semantics is self.semantics]
+        found = dict(replay.diagonal(wanted, self.channel_weights, self.method == "fisherrf", along))
+        rows = ViewRows.of(view, self.channel_weights, self.semantics, self.nuisances)
+        if rows is not None:
+            found |= {name: left(found[name], lost) for name, lost in rows.lost(wanted).items()}
+        return found
+
+    def _checked_groups(self, wanted: dict[str, Group]) -> dict[str, Group]:
+        """Those of the wanted groups that a method has, which must know tensors of a scene where there are any."""
+        method, where = self.method, self.where
+        if method not in METHODS:
+            raise ValueError(f"{where}: method must be one of {', '.join(METHODS)}, got {method!r}")
+        if self.semantics is not None and method == "fisherrf":
+            raise ValueError(f"{where}: method fisherrf must have no semantics, got some; it is about colors only")
+        if self.nuisances.names and method == "fisherrf":
+            raise ValueError(f"{where}: method fisherrf must have no nuisances, got some; it knows images only")
+        for name, group in wanted.items():
+            methods = ("columns",) if group.outputs != (0, 3) else ("columns", "probes")
+            if group.owner == "scene" and method not in methods:
+                raise ValueError(
+                    f"{where}: method of group {name!r} must be {' or '.join(map(repr, methods))}, got {method!r}; "
+                    "it is a tensor of the scene: for those of its Gaussians pass scene.at(time)"
+                )
+        known = {name: group for name, group in wanted.items() if method != "fisherrf" or group.fisherrf}
+        if wanted and not known:
+            raise ValueError(
+                f"{where}: groups of method fisherrf must have more than {', '.join(wanted)}, which it does not "
+                "know; name another one, or use method exact"
+            )
+        return known
+
+
+@dataclasses.dataclass(frozen=True)
+class DenseBlocks(Quantity):
+    """One dense block of J^T J for every Gaussian: {"blocks": (N, 13, 13)}, as of `drgs.fisher.blocks`.
+
+    Attributes:
+        channel_weights, semantics, nuisances: The same as of a `Diagonal`.
+    """
+
+    channel_weights: Sequence[float] = (1.0, 1.0, 1.0)
+    semantics: SemanticMetric | None = None
+    nuisances: Nuisances = _NO_NUISANCES
+    where: ClassVar[str] = "fisher.blocks"
+
+    @property
+    def signed(self) -> tuple[str, ...]:
+        """Entries off the diagonal."""
+        return (DENSE,)
+
+    @alone
+    def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
+        """Float64 on the CPU."""
+        seen = view.gaussians
+        if self.semantics is not None:
+            self.semantics.check(self.where, seen)
+        if not len(seen):
+            return {DENSE: torch.zeros(0, BlockSums.SIZE, BlockSums.SIZE, dtype=torch.float64)}
+        found = view.replay(self.semantics).blocks(self.channel_weights)
+        rows = ViewRows.of(view, self.channel_weights, self.semantics, self.nuisances)
+        if rows is not None:
+            found = found - rows.taken_of_blocks(groups_of(seen, BLOCK_INPUTS))
+        return {DENSE: found}
+
+
+@dataclasses.dataclass(frozen=True)
+class Coverage(Quantity):
+    """{"coverage": (N,)}: sum over pixels of w^2, the information about a color without direction."""
+
+    where: ClassVar[str] = "fisher.coverage"
+
+    @alone
+    def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
+        """Float64 on the CPU."""
+        if not len(view.gaussians):
+            return {"coverage": torch.zeros(0, dtype=torch.float64)}
+        sums = view.replay(geometry=False).sums((GEOMETRY,), [1.0] * 3)
+        return {"coverage": sums[:, GEOMETRY].cpu()}
+
+
+# -------------------------------------------------- methods
+
+
+def _exact_rows(quantity: Diagonal, view: ViewContext) -> ViewRows | None:
+    """The view's rows with one for each direction that the decoder sees; None where nothing is eliminated."""
+    semantics = quantity.semantics
+    every = None if semantics is None else dataclasses.replace(semantics, estimate="exact")
+    return ViewRows.of(view, quantity.channel_weights, every, quantity.nuisances)
+
+
+def _by_columns(
+    quantity: Diagonal, view: ViewContext, wanted: Mapping[str, Group], scene: Scene | None = None
+) -> dict[str, torch.Tensor]:
+    """The diagonal of J^T J from every column of J.
 
     Args:
-        gaussians, cameras, settings, method, groups, channel_weights, probes, seed, semantics, masks, nuisances: Those
-            of `drgs.fisher.diagonal`, of which messages speak.
-        backgrounds: One for each view, in place of that of the settings; empty: none.
-        beside: Sums of the hits of the one view that there is, with this mask and these semantics. Methods `exact` and
-            `fisherrf` add to them on their way.
-    Returns:
-        Group -> float64 tensor on the CPU; and (H, W) float32 opacities on the CPU, one for each view, none of other
-        methods and of views without a Gaussian.
-    Raises:
-        ValueError: As `drgs.fisher.diagonal`.
+        quantity: The diagonal.
+        view: The view.
+        wanted: Groups: the Gaussians', or with `scene` the scene's own.
+        scene: The scene that the Gaussians come from.
     """
-    check_any_scene("fisher.diagonal", gaussians)
-    cameras = some_cameras("fisher.diagonal", cameras)
-    seen = gaussians_at("fisher.diagonal", gaussians, cameras[0])
-    check_scene("fisher.diagonal", seen, settings)
-    settings = settings or RenderSettings.preset("exact")
-    if nuisances is not None and nuisances.names and method == "fisherrf":
-        raise ValueError("fisher.diagonal: method fisherrf must have no nuisances, got some; it knows images only")
-    wanted = _checked_groups(groups_of(seen, groups, gaussians), method, semantics)
-    if semantics is not None:
-        semantics.check("fisher.diagonal", seen)
-    opacities: list[torch.Tensor] = []
-    shapes = {name: group.shape(seen) for name, group in wanted.items()}
-    total: dict[str, torch.Tensor] = {}
-    shown = mask_list("fisher.diagonal", masks, cameras)
-    for number, camera in enumerate(cameras):
-        seen = gaussians_at("fisher.diagonal", gaussians, camera)
-        for name, group in wanted.items():
-            check_same_parameters("fisher.diagonal", name, shapes[name], group.shape(seen))
-        if not len(seen):
-            continue
-        if backgrounds:  # every view has its own
-            settings = settings.replace(background=backgrounds[number])
-        own = {name: group for name, group in wanted.items() if group.owner == "scene"}
-        theirs = {name: group for name, group in wanted.items() if name not in own}
-        network = gaussians if isinstance(gaussians, DeformableScene) else None  # whose groups are `own`
-        part: dict[str, torch.Tensor] = {}
-        if method == "columns":
-            rest = (shown[number], nuisances)
-            part |= by_columns(seen, camera, settings, theirs, channel_weights, semantics, None, *rest)
-            part |= by_columns(seen, camera, settings, own, channel_weights, semantics, network, *rest)
-        elif method == "probes":
-            draw = (probes, seed + number)
-            rest = (shown[number], nuisances)
-            part |= by_probes(seen, camera, settings, theirs, channel_weights, *draw, semantics, None, *rest)
-            if own:
-                part |= by_probes(seen, camera, settings, own, channel_weights, *draw, semantics, network, *rest)
-        else:
-            replay = Replay(seen, camera, settings, semantics=semantics, mask=shown[number])
-            part |= replay.diagonal(wanted, channel_weights, method == "fisherrf", beside)
-            opacities.append(replay.opacity)
-            rows = ViewRows.of(seen, camera, settings, channel_weights, semantics, shown[number], nuisances)
-            if rows is not None:
-                part |= {name: left(part[name], lost) for name, lost in rows.lost(wanted).items()}
-        for name in wanted:
-            found = part[name].to(torch.float64)
-            total[name] = total[name].add_(found) if name in total else found
-    if not total:  # no view has Gaussians
-        total = {name: torch.zeros(shape, dtype=torch.float64) for name, shape in shapes.items()}
-    return total, opacities
-
-
-def _checked_groups(wanted: dict[str, Group], method: str, semantics: SemanticMetric | None) -> dict[str, Group]:
-    """Those of the wanted groups that a method has, which must know tensors of a scene where there are any."""
-    if method not in METHODS:
-        raise ValueError(f"fisher.diagonal: method must be one of {', '.join(METHODS)}, got {method!r}")
-    if semantics is not None and method == "fisherrf":
-        raise ValueError("fisher.diagonal: method fisherrf must have no semantics, got some; it is about colors only")
+    gaussians, semantics, mask = view.gaussians, quantity.semantics, view.mask
+    result = {}
+    rows_of_view = _exact_rows(quantity, view) if wanted else None
+    scale = torch.tensor(quantity.channel_weights, dtype=torch.float64)
+    # A mask is a number, whatever graph it is in; sums of squares of all pixels are float64, as everywhere here.
+    factor = torch.ones(1, 1, dtype=torch.float64) if mask is None else mask.detach().double().cpu()
     for name, group in wanted.items():
-        methods = ("columns",) if group.outputs != (0, 3) else ("columns", "probes")
-        if group.owner == "scene" and method not in methods:
-            raise ValueError(
-                f"fisher.diagonal: method of group {name!r} must be {' or '.join(map(repr, methods))}, got {method!r}; "
-                "it is a tensor of the scene: for those of its Gaussians pass scene.at(time)"
+        shape = group.tangent(gaussians)
+        parts = []
+        rows = np.argwhere(np.ones(shape))
+        for start in range(0, len(rows), BATCH):
+            index = {name: rows[start : start + BATCH]}
+            columns = (
+                jacobian_columns(scene or gaussians, view.camera, index, view.settings).cpu().double()
+                * factor[..., None]
             )
-    known = {name: group for name, group in wanted.items() if method != "fisherrf" or group.fisherrf}
-    if wanted and not known:
-        raise ValueError(
-            f"fisher.diagonal: groups of method fisherrf must have more than {', '.join(wanted)}, which it does not "
-            "know; name another one, or use method exact"
-        )
-    return known
+            squared = torch.zeros(len(columns), dtype=torch.float64)
+            if group.outputs == (0, 3):
+                squared += (columns[..., :3].square() * scale).sum((1, 2, 3))
+            if semantics is not None:
+                squared += semantics.squares(columns[..., 3:]).sum((1, 2))
+            elif group.outputs != (0, 3):
+                squared += columns[..., 3:].square().sum((1, 2, 3))
+            if rows_of_view is not None and (group.outputs == (0, 3) or semantics is not None):
+                squared = left(squared, rows_of_view.lost_of_columns(columns, group.outputs == (0, 3)))
+            parts.append(squared)
+        result[name] = group.merge(torch.cat(parts).reshape(shape))
+    return result
 
 
-def check_same_parameters(where: str, name: str, first: tuple[int, ...], shape: tuple[int, ...]) -> None:
-    """Refuse to add up what views say about Gaussians that are not as many in each."""
-    if first != shape:
-        raise ValueError(
-            f"{where}: a scene must have as many Gaussians and coefficients in all views, got {name} of shape "
-            f"{first} in the first and {shape} in another; take views of one time"
-        )
+@own_errors()
+def _by_probes(
+    quantity: Diagonal, view: ViewContext, groups: Mapping[str, Group], scene: DeformableScene | None = None
+) -> dict[str, torch.Tensor]:
+    """Mean of (J^T v)^2 over Rademacher images v of RGB and decoded features; what only features inform about is exact.
+
+    v has a sign for each direction that the decoder sees, and L v is what the features get of it, for E (J^T L v)^2 =
+    diag(J^T M J). Of what the view's own unknowns explain v is freed, for E (J^T W^(1/2) v)^2.
+
+    Args:
+        quantity: The diagonal.
+        view: The view.
+        groups: The Gaussians', or with `scene` the scene's own.
+        scene: The scene that the Gaussians come from.
+    """
+    gaussians, semantics, mask, probes = view.gaussians, quantity.semantics, view.mask, quantity.probes
+    weights = quantity.channel_weights
+    if not (isinstance(probes, int) and probes >= 1):
+        raise ValueError(f"fisher.diagonal: probes must be >= 1 and whole, got {probes!r}; try 16")
+    other = {name: group for name, group in groups.items() if group.outputs != (0, 3)}
+    groups = {name: group for name, group in groups.items() if name not in other}
+    total = {name: torch.zeros(group.shape(gaussians), dtype=torch.float64) for name, group in groups.items()}
+    # Detached: information is a number, and its derivatives are taken by Dr.Jit. Features that are no part of the
+    # image would be composited for nothing.
+    seen = gaussians.detach() if semantics else gaussians.detach().replace(features=None)
+    call = Call(seen, view.camera, view.settings, frozenset(), scene=scene)
+    generator = torch.Generator().manual_seed(quantity.seed + view.number)
+    pull = Pullback(call, [group.input for group in groups.values()])
+    root = torch.tensor(weights).sqrt()
+    # float32, as cotangents of images are; squares of the slopes are summed in float64.
+    factor = torch.ones(1, 1) if mask is None else mask.detach().float().cpu().reshape(-1, 1)
+    rows = _exact_rows(quantity, view)
+    for _ in range(probes if groups else 0):
+        sign = torch.randint(0, 2, (call.pixels, 3), generator=generator).float() * 2 - 1
+        signs = semantics.signs(call.pixels, generator) if semantics else None
+        if rows is not None:
+            v = rows.eliminated.root(sign.double() if signs is None else torch.cat([sign.double(), signs], 1))
+            sign, signs = v[:, :3].float(), None if signs is None else v[:, 3:]
+        features = semantics.cotangent(signs) * factor if semantics and signs is not None else None
+        slopes = pull(sign * root * factor, features)
+        for name, group in groups.items():
+            total[name] += group.pull(slopes[group.input], call.inputs[group.input].double().cpu()).square()
+    result = {name: x / probes for name, x in total.items()}
+    if other:
+        replay = view.replay(semantics, geometry=False)
+        result |= replay.diagonal(other, weights, False)
+        if rows is not None:
+            result |= {name: left(result[name], lost) for name, lost in rows.lost(other).items()}
+    return result

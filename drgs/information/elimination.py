@@ -23,12 +23,11 @@ from drgs.tracing.tangents import push_forward
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
-    from drgs.ellipsoids import Gaussians, Scene
     from drgs.information.groups import Group
     from drgs.information.nuisances import Nuisances
+    from drgs.information.quantity import ViewContext
     from drgs.information.semantics import SemanticMetric
     from drgs.information.sums import Information
-    from drgs.settings import RenderSettings
 
 __all__ = ["BLOCK_INPUTS", "ViewRows", "backdrop_taken", "eliminated_of"]
 
@@ -105,29 +104,21 @@ class ViewRows:
 
     @classmethod
     def of(
-        cls,
-        gaussians: Gaussians,
-        camera: Camera,
-        settings: RenderSettings,
-        weights: Sequence[float],
-        semantics: SemanticMetric | None,
-        mask: torch.Tensor | None,
-        nuisances: Nuisances | None,
+        cls, view: ViewContext, weights: Sequence[float], semantics: SemanticMetric | None, nuisances: Nuisances
     ) -> ViewRows | None:
         """None where nothing is to be eliminated, or seen.
 
         Args:
-            gaussians: The Gaussians as the camera sees them.
-            camera, settings: The view.
+            view: The view.
             weights: Inverse noise variances of R, G and B.
             semantics: The metric of the features, if these are rows, too.
-            mask: (H, W) what the image is multiplied by; None: 1.
-            nuisances: The unknowns; None: there are none.
+            nuisances: The unknowns.
         """
-        if nuisances is None or not nuisances.names or not len(gaussians) or not camera.width * camera.height:
+        camera, mask = view.camera, view.mask
+        if not nuisances.names or not len(view.gaussians) or not camera.width * camera.height:
             return None
         roots = torch.tensor(list(weights), dtype=torch.float64).sqrt()
-        seen = gaussians.detach()  # as everywhere here: a number
+        seen = view.gaussians.detach()  # as everywhere here: a number
         reduction = None
         if semantics is None:
             seen = seen.replace(features=None)
@@ -138,7 +129,7 @@ class ViewRows:
             roots = torch.cat([roots, roots.new_full((reduction.shape[1],), semantics.weight**0.5)])
         # A mask is a number, whatever graph it is in.
         scales = roots if mask is None else mask.detach().double().cpu().reshape(-1, 1) * roots
-        call = Call(seen, camera, settings, frozenset())
+        call = Call(seen, camera, view.settings, frozenset())
         return cls(call, roots, scales, eliminated_of(call, scales, nuisances), semantics, reduction)
 
     def slopes(self, groups: Mapping[str, Group]) -> Iterator[tuple[float, dict[str, torch.Tensor]]]:
@@ -162,9 +153,9 @@ class ViewRows:
 
         Features that are no rows are known by themselves only, and nothing is taken of them.
         """
-        told = {name: group for name, group in groups.items() if name != "features" or self.semantics is not None}
+        informed = {name: group for name, group in groups.items() if name != "features" or self.semantics is not None}
         total: dict[str, torch.Tensor] = {}
-        for share, found in self.slopes(told):
+        for share, found in self.slopes(informed):
             for name, x in found.items():
                 part = share * (self._squares(x) if name == "features" else x.square())
                 total[name] = total[name] + part if name in total else part
@@ -189,10 +180,10 @@ class ViewRows:
             columns: (K, H, W, 3 + D) float64 columns of J, times the mask.
             colors: Whether their colors count.
         """
-        told = columns.flatten(1, 2)
-        rows = told[..., :3] * self.weights[:3] * float(colors)
+        flat = columns.flatten(1, 2)
+        rows = flat[..., :3] * self.weights[:3] * float(colors)
         if self.reduction is not None:
-            rows = torch.cat([rows, told[..., 3:] @ self.reduction * self.weights[3:]], -1)
+            rows = torch.cat([rows, flat[..., 3:] @ self.reduction * self.weights[3:]], -1)
         return self.eliminated.lost(rows)
 
     def taken_of_blocks(self, groups: Mapping[str, Group]) -> torch.Tensor:
@@ -211,26 +202,16 @@ class ViewRows:
 
 
 def backdrop_taken(
-    scene: Scene,
-    camera: Camera,
-    settings: RenderSettings,
-    weights: Sequence[float],
-    semantics: SemanticMetric | None,
-    mask: torch.Tensor | None,
-    nuisances: Nuisances | None,
+    view: ViewContext, weights: Sequence[float], semantics: SemanticMetric | None, nuisances: Nuisances
 ) -> torch.Tensor | None:
     """(pixels, 3, r) float64 of a view: S_j^(1/2) U_j of the colors times what these are multiplied by; None where
     nothing is eliminated.
 
     Times 1 - alpha, which is the derivative by the color behind everything, and summed up over a cell, these are roots
-    of what the unknowns take of H_c. What is known to be empty outside of a mask tells nothing about them, and they
-    nothing about it: there U is 0.
+    of what the unknowns take of H_c. Outside of a mask rows are 0, and so is U: pixels that are known to be empty there
+    have no information about the unknowns.
     """
-    if nuisances is None or not nuisances.names:
-        return None
-    with torch.no_grad():  # information is a number
-        seen = scene.at(camera.time)
-    rows = ViewRows.of(seen, camera, settings, weights, semantics, mask, nuisances)
+    rows = ViewRows.of(view, weights, semantics, nuisances)
     if rows is None:
         return None
     return rows.eliminated.directions[:, :3] * rows.scales[..., :3, None] * rows.eliminated.shares.sqrt()

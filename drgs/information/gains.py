@@ -1,9 +1,9 @@
 """What a view would add to what is known: information gain from Fisher information.
 
 Symbols: H Fisher information of the training views, Hc of a candidate (sums of squared derivatives of the image, unit
-noise on every channel), l the prior's precision lambda, in the inverse squared unit of its parameter. An Information is
-a dict group -> tensor with one entry a parameter, as `drgs.fisher.diagonal` returns it; `drgs.gain` is the public side. docs/information.md says what
-the criteria mean, and where others publish something else under the same names.
+noise on every channel), l the prior's precision lambda, in the inverse squared unit of its parameter. `drgs.gain` is
+the public side; docs/information.md says what the criteria mean, and where others publish something else under the same
+names.
 
 Reference:
     [1] Next Best View Selections for Semantic and Dynamic 3D Gaussian Splatting, arXiv 2512.22771: `eig`, section 3.3.

@@ -1,4 +1,4 @@
-"""Parameter groups of Fisher information. A group is one entry of `GROUPS`; nothing else asks for its name.
+"""Parameter groups of Fisher information. A group is one entry of `GROUPS`; nothing else knows its name.
 
 A group belongs to the Gaussians, as a view sees them, or to the scene that they come from: each float tensor of a
 `DeformableScene`, such as a weight of a network, is a group of that name (`scene_groups`). Where both have the name,
@@ -36,7 +36,7 @@ class Group:
         pull: (derivative by `input`, `input`) -> derivative by the group.
         fisherrf: Inputs by name -> what FisherRF divides the squares by; None where it leaves the group out.
         columns: Gaussians -> shape of a tangent, where it is not `shape`.
-        outputs: First and last (exclusive) channel of a column that tells about it: RGB, then features.
+        outputs: First and last (exclusive) channel of a column that informs about it: RGB, then features.
         merge: Squares of all columns, shaped `columns` -> information.
         there: Gaussians -> whether they have it.
     """
@@ -127,7 +127,7 @@ def scene_groups(scene: Scene | None) -> dict[str, Group]:
 
 
 def _own(name: str, shape: tuple[int, ...]) -> Group:
-    """A scene's tensor; images of features tell about features only, RGB about all others."""
+    """A scene's tensor; images of features inform about features only, RGB about all others."""
     outputs = GROUPS["features"].outputs if name == "features" else (0, 3)
     return Group(shape=lambda _: shape, input=name, owner="scene", fisherrf=None, outputs=outputs)
 

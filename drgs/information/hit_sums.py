@@ -6,7 +6,7 @@ mean, by w_p dc_nc / dmu_j (jacobian.py). Along an image u this adds to the slop
     s_pj sum_c g_pc u_pc + sum_c w_p dc_nc / dmu_j u_pc
 
 for which the rows of the hit are made once, whatever the number of images. The traversal may be one that is walked for
-something else, such as the diagonal: what it does besides is little where few of the Gaussians are asked.
+something else, such as the diagonal: what it does besides is little where few of the Gaussians are wanted.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["HitSums"]
 
 _WIDTH = packed_size(GEOMETRY)  # floats of an image and a Gaussian
-_NOBODY = 0xFFFFFFFF  # place of a Gaussian that is not asked
+_NOWHERE = 0xFFFFFFFF  # place of a Gaussian that is not wanted
 
 
 class HitSums:
@@ -36,7 +36,7 @@ class HitSums:
 
     Attributes:
         images: (K, pixels, C) float32 cotangents of the rows of a replay: three colors, then semantic channels.
-        asked: (M,) int64, ascending: the Gaussians.
+        wanted: (M,) int64, ascending: the Gaussians.
         is_full: The hits of the view have been added.
     """
 
@@ -44,13 +44,13 @@ class HitSums:
         """
         Args:
             images: The same as the attribute.
-            which: (N,) bool, which Gaussians are asked.
+            which: (N,) bool, which Gaussians are wanted.
         """
         self.images = images
-        self.asked = which.nonzero()[:, 0]
+        self.wanted = which.nonzero()[:, 0]
         self.is_full = False
-        places = torch.full(which.shape, -1, dtype=torch.int32, device=which.device)  # the bits of _NOBODY
-        places[self.asked] = torch.arange(len(self.asked), dtype=torch.int32, device=which.device)
+        places = torch.full(which.shape, -1, dtype=torch.int32, device=which.device)  # the bits of _NOWHERE
+        places[self.wanted] = torch.arange(len(self.wanted), dtype=torch.int32, device=which.device)
         self._places = places
         self._buffer: Float | None = None
 
@@ -58,7 +58,7 @@ class HitSums:
         """What takes the rows of one walk of a view; its `buffer` is to be evaluated afterwards."""
         lib, home = replay.lib, replay.call.home
         if self._buffer is None:
-            self._buffer = dr.zeros(lib.Float, max(1, len(self.images) * len(self.asked) * _WIDTH))
+            self._buffer = dr.zeros(lib.Float, max(1, len(self.images) * len(self.wanted) * _WIDTH))
         first = 0 if walk.first else walk.start
         channels = slice(first, first + (walk.channels.outputs if walk.first else walk.channels.channels))
         images = self.images[..., channels].to(home)
@@ -67,8 +67,8 @@ class HitSums:
         return _Along(lib, walk, images, places, self._buffer)
 
     def geometry(self) -> torch.Tensor:
-        """(K, M, 10) slopes by the geometry of the Gaussians that are asked; rotations in place of quats."""
-        K, M = len(self.images), len(self.asked)
+        """(K, M, 10) slopes by the geometry of the Gaussians that are wanted; rotations in place of quats."""
+        K, M = len(self.images), len(self.wanted)
         if self._buffer is None:
             return torch.zeros(K, M, GEOMETRY)
         rows = self._buffer.torch()[: K * M * _WIDTH].reshape(M, K, _WIDTH)
@@ -81,7 +81,7 @@ class _Along:
     Args:
         walk: The walk.
         images: (K, pixels, C) of the channels that it composites and that weigh.
-        places: (N,) of each Gaussian in the buffer, `_NOBODY` where it is not asked.
+        places: (N,) of each Gaussian in the buffer, `_NOWHERE` where it is not wanted.
         buffer: (M K _WIDTH) added to.
     """
 
@@ -104,10 +104,10 @@ class _Along:
         return {}
 
     def take(self, lib: Lib, index: UInt32, hits: Mask, rows: list[Row], states: list[dict]) -> list[dict]:
-        """Add the rows of a hit, if its Gaussian is asked, along every image."""
+        """Add the rows of a hit, if its Gaussian is wanted, along every image."""
         place = dr.gather(lib.UInt32, self.places, index, hits)
         own = [[row.slopes, row.g[len(row.g) - self.width :], row.turned or []] for row in rows]
-        dr.if_stmt((place, own), hits & (place != _NOBODY), self._add, lambda place, own: place)
+        dr.if_stmt((place, own), hits & (place != _NOWHERE), self._add, lambda place, own: place)
         return states
 
     def _add(self, place: UInt32, own: list[list]) -> UInt32:

@@ -49,7 +49,7 @@ def extras(
     Args:
         logit: (N,) raw opacities.
         projected: `Projected` of the view.
-        moved: Tangents of the record, where the response asks for them: one per geometric parameter but the opacity.
+        moved: Tangents of the record, where the response needs them: one per geometric parameter but the opacity.
         color: (channel, axis) nested lists of dc/dmu, or None where the color does not depend on the mean.
     """
     F = lib.Float

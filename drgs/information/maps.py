@@ -1,4 +1,4 @@
-"""Maps of what other rules look at, in the pixels of a view: beside those of `drgs.fisher.variance_map`.
+"""Maps in the pixels of a view: the predictive variance, and what other rules look at.
 
 Moments of the features along rays say how far what a pixel is made of differs from what the pixel shows:
 Var_c = sum_i w_i f_ic^2 - (sum_i w_i f_ic)^2 in a pixel, w_i the weights of compositing. As sum w <= 1 it is >= 0, and
@@ -13,11 +13,14 @@ Reference:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
 
 from drgs.ellipsoids import Y_00
+from drgs.guards.arguments import must_be
+from drgs.information.backdrop import BACKDROP, CELLS, backdrop_variance
 from drgs.information.gains import variances
 from drgs.information.groups import groups_of
 from drgs.information.prior import Prior
@@ -29,9 +32,45 @@ from drgs.oracle import sh_colors
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
+    from drgs.information.backdrop import Sphere
+    from drgs.information.quantity import ViewContext
+    from drgs.information.semantics import SemanticMetric
     from drgs.settings import RenderSettings
 
-__all__ = ["fisherrf_map", "moments_map"]
+__all__ = ["fisherrf_map", "moments_map", "variance_map"]
+
+
+def variance_map(
+    view: ViewContext,
+    weights: Information,
+    channel_weights: Sequence[float] = (1.0, 1.0, 1.0),
+    semantics: SemanticMetric | None = None,
+    sphere: Sphere | None = None,
+) -> torch.Tensor:
+    """(H, W) float32: sum over channels and parameters k of J_pk^2 weights_k; see `drgs.fisher.variance_map`.
+
+    Args:
+        view: The view; a map has no mask.
+        weights, channel_weights, semantics, sphere: The same as for `drgs.fisher.variance_map`.
+    """
+    where, seen = "fisher.variance_map", view.gaussians
+    if semantics is not None:
+        semantics.check(where, seen)
+    known = {name: group for name, group in groups_of(seen).items() if name != "features" or semantics is not None}
+    shapes = {BACKDROP: (CELLS, 3)} | {name: group.shape(seen) for name, group in known.items()}
+    for name, x in weights.items():
+        if name not in shapes:
+            raise ValueError(f"{where}: weights must be of {', '.join(shapes)}, got {name!r}")
+        must_be(where, f"weights of {name}", x, torch.Tensor, "as fisher.diagonal returns")
+        if tuple(x.shape) != shapes[name]:
+            raise ValueError(f"{where}: weights of {name} must have shape {shapes[name]}, got {tuple(x.shape)}")
+    of_gaussians = {name: x for name, x in weights.items() if name != BACKDROP}
+    found = torch.zeros(view.camera.height, view.camera.width)
+    if len(seen) and of_gaussians:
+        found = Replay(seen, view.camera, view.settings, semantics=semantics).variance(of_gaussians, channel_weights)
+    if BACKDROP in weights:
+        found = found + backdrop_variance(view, weights[BACKDROP], channel_weights, sphere)
+    return found
 
 
 def fisherrf_map(

@@ -24,7 +24,7 @@ _STD = (1e-9, 1e9)  # whose squares and their inverses are numbers by far
 class Nuisances(Record):
     """Unknowns of a view that are eliminated from its information, and how well they are known before it is seen.
 
-    A view that tells only its own exposure tells nothing about the scene. `drgs.information.elimination` has the
+    A view that shows only its own exposure has no information about the scene. `drgs.information.elimination` has the
     equations.
 
     Attributes:

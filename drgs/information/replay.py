@@ -1,4 +1,4 @@
-"""A view rendered once, to be replayed for what every hit says about its Gaussian (fisher.py is the public side)."""
+"""A view rendered once, to be replayed for the rows of every hit; `ViewContext.replay` is how quantities get it."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ class Replay:
         return lit, basis_width, moved
 
     def _moved_records(self) -> list[list[Float]] | None:
-        """Tangents of the records along means, rotations and log-scales, for a response that asks for them."""
+        """Tangents of the records along means, rotations and log-scales, for a response that needs them."""
         if not self.compositor.model.response.by_tangents:
             return None
         lib = self.lib

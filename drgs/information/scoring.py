@@ -45,10 +45,10 @@ class Scoring(Record):
     `prior`: None is 1e-2 of criterion `v_opt`, for colors that are known to 0.3 beforehand and photographs to 0.03;
     else 1e-6, as in FisherRF. Policy `coverage` takes its `value`, not its `groups`.
 
-    `blocks`: `geometry` is what the colors of an image tell about all but the features; `semantic`, what its decoded
-    features tell about the features and, coupled, about the geometry; `deformation`, what both tell, as far as the
+    `blocks`: `geometry` is what the colors of an image say about all but the features; `semantic`, what its decoded
+    features say about the features and, coupled, about the geometry; `deformation`, what both say, as far as the
     other two blocks are named, else the colors, about the network that moves the Gaussians, groups `grid` and `mlp`;
-    `backdrop`, what its opacity tells about what is behind all Gaussians. None is all that the scene has (method
+    `backdrop`, what its opacity says about what is behind all Gaussians. None is all that the scene has (method
     `fisherrf` knows colors of Gaussians only, `block_logdet` these and features).
 
     `network`: `ratio` scores the diagonal of the block `deformation` by `criterion` against that of the known views,

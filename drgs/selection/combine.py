@@ -1,7 +1,7 @@
-"""How scores of several blocks become one, and all that a view is asked for them.
+"""How scores of several blocks become one.
 
-Diagonals of blocks (`drgs.information.blocks`) are ratios in a score, without a unit, and add up: what colors and
-features say about the same parameters even before it is divided by what is known. A trace has a unit, and no divisor:
+Diagonals of blocks (`drgs.information.blocks`) are ratios in a score, without a unit, and add up; those of colors and
+features about the same parameters even before they are divided by what is known. A trace has a unit, and no divisor:
 beside it every block is scored alone, by information of its own, whose groups are named `block.group` then, and its
 scores are compared with those of the other candidates before they are added up (z-scores).
 """
@@ -16,83 +16,23 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from drgs.information.blocks import BlockQuestion, SceneBlocks
+from drgs.information.blocks import SceneBlocks
 from drgs.information.criteria import criterion_named
 from drgs.information.gains import Gain, scorer
-from drgs.information.once_per_time import once_per_time
-from drgs.information.seen_view import SeenView
+from drgs.information.quantity import Joint
 from drgs.information.sums import Information
 
 if TYPE_CHECKING:
-    from drgs.cameras import Camera
-    from drgs.ellipsoids import Scene
     from drgs.information.scoring import Scoring
-    from drgs.settings import RenderSettings
 
-__all__ = ["Asked", "Combination", "Questions", "asked_of"]
+__all__ = ["Combination", "joint_of"]
 
 _SAME = 1e-6  # relative standard deviation below which a block's scores are the same but for float32 images
 
 
 @dataclasses.dataclass(frozen=True)
-class Asked:
-    """One question to a view, and how its answer is named.
-
-    Attributes:
-        question: What is asked.
-        block: The block that names of groups begin with; "" where all blocks are scored together.
-    """
-
-    question: BlockQuestion
-    block: str = ""
-
-    def named(self, information: Information) -> dict[str, torch.Tensor]:
-        """Information by the names that scores know it by."""
-        return {f"{self.block}.{name}" if self.block else name: x for name, x in information.items()}
-
-
-@dataclasses.dataclass(frozen=True)
-class Questions:
-    """All that a view is asked, as data, which other processes can be sent.
-
-    Attributes:
-        settings: Settings of the renderer.
-        asked: The questions in the order of asking: what one finds out on its way, those after it make use of.
-    """
-
-    settings: RenderSettings
-    asked: tuple[Asked, ...]
-
-    def __call__(self, scene: Scene, camera: Camera, mask: torch.Tensor | None) -> Information:
-        """What one view says, in float32, as it is kept: half the memory, of sums that are of float32 images."""
-        found: dict[str, torch.Tensor] = {}
-        view = SeenView(once_per_time(scene), camera, self.settings, mask)
-        with torch.no_grad():  # information is a number
-            if len(self.asked) > 1:  # else nobody walks along the view for another one
-                beside = {one.question: one.question.beside(view) for one in self.asked}
-                view.beside = {question: sums for question, sums in beside.items() if sums}
-            for one in self.asked:
-                found |= one.named(one.question.information(view))
-        return {name: x.to(torch.float32) for name, x in found.items()}
-
-    def lasting(self) -> Questions:
-        """Questions whose answers depend on a view alone, not on the others of its pool."""
-        return Questions(self.settings, tuple(Asked(one.question.lasting(), one.block) for one in self.asked))
-
-    def finished(self, answer: Information, camera: Camera, mask: torch.Tensor | None) -> Information:
-        """What a view says to these questions, of its answer to the `lasting` ones: the same bits."""
-        found = dict(answer)
-        for one in self.asked:
-            # Where all blocks are scored together, a question gets the whole answer, and returns it.
-            own = _own(found, one.block) if one.block else found
-            rest = {name: x for name, x in found.items() if name not in one.named(own)}
-            found = rest | one.named(one.question.finished(own, camera, mask))
-        return {name: x.to(torch.float32) for name, x in found.items()}
-
-
-@dataclasses.dataclass(frozen=True)
 class Combination:
-    """How one score is made of what a view says.
+    """How the information of a view becomes one score.
 
     Attributes:
         scoring: The scoring that has criterion, lambda and weights.
@@ -106,7 +46,7 @@ class Combination:
 
     @property
     def pooled(self) -> bool:
-        """Whether scores ask for the information of all views together, known ones and candidates."""
+        """Whether scores need the information of all views together, known ones and candidates."""
         needed = criterion_named(self.scoring.criterion, "select").needs_pool
         return needed and (bool(self.apart) or not self.traced)
 
@@ -164,7 +104,7 @@ class Combination:
             names = [name for name in gains[0].parts if name.startswith(f"{block}.")]
             scores = [math.fsum(gain.parts[name] for name in names) for gain in gains]
             mean, spread = statistics.fmean(scores), statistics.pstdev(scores)
-            # A block that is the same for all tells none from another.
+            # A block that is the same for all ranks none above another.
             factor = 1 / spread if spread > _SAME * abs(mean) else 0.0
             for name in names:
                 middle = statistics.fmean(gain.parts[name] for gain in gains)
@@ -206,24 +146,24 @@ def _own(information: Information, block: str) -> dict[str, torch.Tensor]:
     return {name.removeprefix(prefix): x for name, x in information.items() if name.startswith(prefix)}
 
 
-def asked_of(of: SceneBlocks) -> tuple[list[Asked], Combination]:
-    """What views are asked, and how they are scored by it.
+def joint_of(blocks: SceneBlocks) -> tuple[Joint, Combination]:
+    """The quantity of a view that blocks are together, and how views are scored by it.
 
     Args:
-        of: The blocks of the scene that count, at least one.
+        blocks: The blocks of the scene that count, at least one.
     Raises:
-        ValueError: If the scoring names groups that no block tells about, or blocks that cannot be combined.
+        ValueError: If the scoring names groups that are of no block, or blocks that cannot be combined.
     """
-    scoring = of.scoring
-    of.check_groups()
-    apart = of.names if scoring.combined_of(of.names) == "zscore" else ()
-    parts: list[Sequence[str]] = [[block] for block in apart] or [of.names]
-    asked = [Asked(question, name if apart else "") for part in parts for name, question in of.questions(part)]
-    if not asked:
+    scoring = blocks.scoring
+    blocks.check_groups()
+    apart = blocks.names if scoring.combined_of(blocks.names) == "zscore" else ()
+    together: list[Sequence[str]] = [[block] for block in apart] or [blocks.names]
+    parts = [(name if apart else "", quantity) for some in together for name, quantity in blocks.quantities(some)]
+    if not parts:
         raise ValueError(
-            f"select: groups must have one that blocks {', '.join(of.names)} tell about, got "
+            f"select: groups must have one that blocks {', '.join(blocks.names)} tell about, got "
             f"{', '.join(scoring.groups or ()) or 'none'}; add the other block, or another group"
         )
-    traced = [name for name, question in of.questions(of.names) if not question.asks_known]
-    told = tuple(block for block in apart if any(one.block == block for one in asked))
-    return asked, Combination(scoring, told, *traced[:1])
+    traced = [name for name, quantity in blocks.quantities(blocks.names) if not quantity.needs_known_views]
+    scored = tuple(block for block in apart if any(name == block for name, _ in parts))
+    return Joint(tuple(parts)), Combination(scoring, scored, *traced[:1])

@@ -1,4 +1,4 @@
-"""Greedy choice of views by their information: one at a time, each against what the picks before it have told.
+"""Greedy choice of views by their information: one at a time, each against what is known once those before it are.
 
 Plain greedy picks the candidate with the best score, adds its information to H, that of the known views, and scores
 all others again. But scores never rise as H grows: what is known already cannot be learned twice (diminishing
@@ -15,127 +15,99 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import torch
 
 from drgs.cameras import Camera
 from drgs.guards.memory import available
-from drgs.information.blocks import TAKEN
-from drgs.information.criteria import criterion_named
 from drgs.information.gains import Gain, check
 from drgs.information.network_groups import NETWORK_GROUPS
 from drgs.information.prior import Prior
+from drgs.information.quantity import Quantity
 from drgs.information.sums import Information, add
 from drgs.selection.cache import Cache, size_of
 from drgs.selection.combine import Combination
-from drgs.selection.pool import Pool, Question, Selection, ViewQuestion
+from drgs.selection.pool import Pool, Selection
 from drgs.selection.refining import refined
 
-__all__ = ["AskedView", "InformationSource", "ViewInformation", "greedy"]
+__all__ = ["PoolView", "ViewInformation", "greedy"]
 
 _SHARE = 0.25  # of the memory there is, for information that could be computed again
 _ROUNDING = 1e-12  # relative: how far a sum of float64 gains may rise again by rounding, and a bound be missed by
 
 
-@dataclasses.dataclass(frozen=True)
-class InformationSource:
-    """What views are asked, and what becomes of the answers.
+class PoolView(NamedTuple):
+    """A view of a pool.
 
     Attributes:
-        question: Its answers are what a cache keeps.
-        kept_by: What these depend on besides scene, camera and mask; None: on the question.
-        by_name: Whether they may also depend on what a camera is called.
-        finish: (answer, camera, mask) -> the view's information; None: it is the answer.
-    """
-
-    question: Question
-    kept_by: Hashable = None
-    by_name: bool = False
-    finish: Callable[[Information, Camera, torch.Tensor | None], Information] | None = None
-
-    def to(self, view: AskedView) -> ViewQuestion:
-        """The question to one view."""
-        kept_by = (self.kept_by, view.camera.name) if self.by_name else self.kept_by
-        return ViewQuestion(self.question, view.camera, view.mask, kept_by)
-
-
-@dataclasses.dataclass(frozen=True)
-class AskedView:
-    """A view whose information is wanted.
-
-    Attributes:
-        what: What it is called in messages.
+        title: What it is called in messages.
         camera, mask: The camera and the mask of the view.
         is_known: Whether it is one of the known ones.
     """
 
-    what: str
+    title: str
     camera: Camera
     is_known: bool = False
     mask: torch.Tensor | None = None
 
 
 class ViewInformation:
-    """Information of single views as greedy needs it: out of the pool's cache if it is there, checked, in float32.
+    """Information of a pool's views by one quantity, checked and counted.
 
     Attributes:
         computed: Number of views that were not in the cache.
         bytes: Bytes that a cache needs to keep all views so far.
-        told: Group of a network -> whether any view so far says something about it.
+        has_any: Group of a network -> whether any view so far has information about it.
     """
 
-    def __init__(self, pool: Pool, source: InformationSource, known: InformationSource | None = None):
+    def __init__(self, pool: Pool, quantity: Quantity, of_known: Quantity | None = None) -> None:
         """
         Args:
-            pool: The pool whose cache is asked, and whose `progress` is called after each view.
-            source: What information is computed by.
-            known: What information of known views is computed by, where less is needed of them.
+            pool: The pool whose cache and workers are used, and whose `progress` is called after each view.
+            quantity: What is computed of a view.
+            of_known: What is computed of known views, where less is needed of them.
         """
         self.pool = pool
-        self.source = source
-        self.known = known or source
+        self.quantity = quantity
+        self.of_known = of_known or quantity
         self.computed = self.done = self.bytes = 0
         self._expected = len(pool.train) + len(pool.candidates)
-        self.told: dict[str, bool] = {}
+        self.has_any: dict[str, bool] = {}
 
-    def each(self, views: Sequence[AskedView]) -> Iterator[Information]:
+    def each(self, views: Sequence[PoolView]) -> Iterator[Information]:
         """The information of these views, one after another: nothing of one is held while the next one is computed."""
-        signed = criterion_named(self.pool.scoring.criterion, "select").of_blocks
+        quantities = [self.of_known if view.is_known else self.quantity for view in views]
 
-        def accept(i: int, answer: Information) -> Information:
-            # Rounded once, here, whoever computed it: a cache and workers give the same bits as neither.
-            found = {name: x.to(torch.float32) for name, x in answer.items()}
+        def accept(i: int, computed: Information) -> None:
             self.computed += 1
-            directions = {name: x for name, x in found.items() if name.rpartition(".")[2] == TAKEN}
-            check(f"select: {views[i].what}", directions, signed=True)
-            check(f"select: {views[i].what}", {n: x for n, x in found.items() if n not in directions}, signed)
-            return found
+            signed = {*quantities[i].signed}
+            where = f"select: {views[i].title}"
+            check(where, {name: x for name, x in computed.items() if name in signed}, signed=True)
+            check(where, {name: x for name, x in computed.items() if name not in signed})
 
-        answers = self.pool.told([self._source(view).to(view) for view in views], accept)
-        for view in views:
-            yield self._finished(view, next(answers))
+        requests = [(quantity, view.camera, view.mask) for quantity, view in zip(quantities, views, strict=True)]
+        results = self.pool.compute(requests, accept)
+        for quantity, view in zip(quantities, views, strict=True):
+            yield self._counted(quantity, view, next(results))
 
     def again(self, most: int) -> Callable[[Camera], Information]:
-        """What asks further cameras, so many at most, one at a time."""
+        """What computes the information of further cameras, so many at most, one at a time."""
         self.expect(most)
-        return lambda camera: next(self.each([AskedView(f"{camera.name}, moved", camera)]))
+        return lambda camera: next(self.each([PoolView(f"{camera.name}, moved", camera)]))
 
     def expect(self, more: int) -> None:
-        """So many more views will be asked for, for `progress`."""
+        """So many more views will be computed, for `progress`."""
         self._expected += more
 
-    def _source(self, view: AskedView) -> InformationSource:
-        return self.known if view.is_known else self.source
-
-    def _finished(self, view: AskedView, answer: Information) -> Information:
-        """The information that an answer is, or that is made of it; counted."""
-        self.bytes += size_of(answer)
-        finish = self._source(view).finish
-        found = finish(answer, view.camera, view.mask) if finish else answer
+    def _counted(self, quantity: Quantity, view: PoolView, computed: Information) -> Information:
+        """The information that adds up over views, of what was computed of one."""
+        self.bytes += size_of(computed)
+        found = quantity.summand(computed, view.camera, view.mask)
         for name, x in found.items():
             if name.rpartition(".")[2] in NETWORK_GROUPS:
-                self.told[name] = self.told.get(name, False) or bool(x.any())
+                self.has_any[name] = self.has_any.get(name, False) or bool(x.any())
         self.done += 1
         if self.pool.progress:
             self.pool.progress(self.done, self._expected)
@@ -166,7 +138,7 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         left_out=gains[0].left_out,
         evaluations=len(gains),
         computed=information.computed,
-        notes=[*_notes(gains, combination.apart), *_silent(information.told), *_crowded(pool.cache, information)],
+        notes=[*_notes(gains, combination.apart), *_silent(information.has_any), *_crowded(pool.cache, information)],
     )
     # Scores never rise as H grows, unless lambda or the set of counted parameters changes with it.
     falling = pool.lazy and not prior.relative and min((prior.value, *prior.groups.values())) > 0 and combination.falls
@@ -175,24 +147,24 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         order = sorted((i for i in left if i in fresh), key=lambda i: -gains[i].total)  # stable: ties by index
         best = order[0]
         margin = gains[best].total - gains[order[1]].total if len(order) > 1 else None
-        pick, told = pool.pick(best, gains[best].total, gains[best].parts, margin), kept.get(best)
+        pick, picked = pool.pick(best, gains[best].total, gains[best].parts, margin), kept.get(best)
         if pool.refine is not None:
             score = combination.scorer(H, everything)
-            asked = information.again(pool.refine.evaluations)
+            compute = information.again(pool.refine.evaluations)
             start = pool.candidates[best]
             camera, gain, moved, count = refined(
-                pool.scene, pool.candidates, pool.train, start, gains[best], score, asked, pool.refine
+                pool.scene, pool.candidates, pool.train, start, gains[best], score, compute, pool.refine
             )
             selection.evaluations += count
             pick = dataclasses.replace(pick, score=gain.total, parts=gain.parts, camera=camera, start=pick.score)
-            told = told if moved is None else moved
+            picked = picked if moved is None else moved
         selection.picks.append(pick)
         if len(selection.picks) == pool.k:
             return selection
         left.remove(best)
         kept.pop(best)
-        assert told is not None  # kept, as more than one is picked
-        _add(H, told)
+        assert picked is not None  # kept, as more than one is picked
+        _add(H, picked)
         fresh = set()  # the other scores are bounds now
         selection.evaluations += _refresh(gains, left, fresh, falling, combination.scorer(H, everything), kept)
         for i, gain in zip(left, combination.compared([gains[i] for i in left]), strict=True):
@@ -209,22 +181,22 @@ def _first_round(
     gains: list[Gain] = []
     kept: dict[int, Information] = {}
     known = [
-        AskedView(f"training view {i} ({camera.name})", camera, True, mask)
+        PoolView(f"training view {i} ({camera.name})", camera, True, mask)
         for i, (camera, mask) in enumerate(zip(pool.train, pool.masks or [None] * len(pool.train), strict=True))
     ]
-    candidates = [AskedView(f"candidate {i} ({camera.name})", camera) for i, camera in enumerate(pool.candidates)]
-    told = information.each([*known, *candidates])
+    candidates = [PoolView(f"candidate {i} ({camera.name})", camera) for i, camera in enumerate(pool.candidates)]
+    each = information.each([*known, *candidates])
     for _ in known:
-        part = next(told)
+        part = next(each)
         H = H or _nothing(part)
         _add(H, part)
     score = None
     everything = None
     keeps = pool.k > 1
     for i in range(len(candidates)):
-        part = next(told)
+        part = next(each)
         if i == 0:
-            H = _nothing(part) | H  # also of what known views were not asked
+            H = _nothing(part) | H  # also of groups that are not computed of known views
             if combination.pooled:
                 everything = {name: x.clone() for name, x in H.items()}
                 keeps = keeps or _fits(part, len(candidates))
@@ -241,8 +213,8 @@ def _first_round(
         score = combination.scorer(H, everything)
         if not keeps:
             information.expect(len(candidates))
-            told = information.each(candidates)
-        gains = [score(kept[i] if keeps else next(told)) for i in range(len(candidates))]
+            each = information.each(candidates)
+        gains = [score(kept[i] if keeps else next(each)) for i in range(len(candidates))]
     return H, everything, gains, kept
 
 
@@ -275,12 +247,12 @@ def _notes(gains: list[Gain], apart: tuple[str, ...]) -> list[str]:
     return notes
 
 
-def _silent(told: dict[str, bool]) -> list[str]:
-    """What is worth saying about a network that views tell nothing about."""
+def _silent(has_any: dict[str, bool]) -> list[str]:
+    """What is worth saying about a network that no view has information about."""
     return [
         f"deformation: no view has information about {name}, which decides nothing (heads of the network that are 0, "
         "as at its start, or no Gaussian in sight moves)"
-        for name, any_view in told.items()
+        for name, any_view in has_any.items()
         if not any_view
     ]
 

@@ -1,21 +1,33 @@
 """Policies by the information of views.
 
 Those whose scores depend on what has been picked are greedy: take the best, add its information to H, score again
-(`drgs.selection.greedy`). How a score comes from information is a `Scoring`; its criteria are in gain.py.
+(`drgs.selection.greedy`). How a score comes from information is a `Scoring`; its criteria are in
+`drgs.information.criteria`.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Hashable, Mapping
+from typing import TYPE_CHECKING, Any
 
-from drgs.information.blocks import CoverageQuestion, DiagonalQuestion, SceneBlocks
-from drgs.selection.combine import Asked, Combination, Questions, asked_of
-from drgs.selection.greedy import AskedView, InformationSource, ViewInformation, greedy
+import torch
+
+from drgs.information.blocks import SceneBlocks
+from drgs.information.criteria import criterion_named
+from drgs.information.gains import DENSE
+from drgs.information.quantity import Joint, Quantity
+from drgs.selection.combine import Combination, joint_of
+from drgs.selection.greedy import PoolView, ViewInformation, greedy
 from drgs.selection.pool import Pool, Selection
 
-__all__ = ["ask_views", "coverage", "fisher", "fisherrf"]
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.information.quantity import ViewContext
+    from drgs.information.sums import Information
+    from drgs.settings import RenderSettings
+
+__all__ = ["compute_candidates", "coverage", "fisher", "fisherrf"]
 
 _FEW_PROBES = 8  # of a network's information, below which 1 / H is far too large on average
 
@@ -23,11 +35,11 @@ _FEW_PROBES = 8  # of a network's information, below which 1 / H is far too larg
 def fisher(pool: Pool) -> Selection:
     """Largest gain of Fisher information, of the blocks of the image that the scoring names."""
     scoring = pool.scoring
-    if pool.information is not None:  # it knows by itself what it is about
-        return _greedy(pool, ())
+    if pool.information is not None:  # its groups are its own
+        return _greedy(pool)
     blocks = _blocks(pool)
-    asked, combination = asked_of(blocks)
-    selection = _greedy(pool, asked, combination)
+    joint, combination = joint_of(blocks)
+    selection = _greedy(pool, joint, combination)
     selection.blocks = list(blocks.names)
     selection.semantics = blocks.metric.to_json() if blocks.metric else None
     if "deformation" in blocks.names:
@@ -45,59 +57,78 @@ def fisher(pool: Pool) -> Selection:
 
 def fisherrf(pool: Pool) -> Selection:
     """Largest sum Hc / (H + lambda) of FisherRF's H, which has no rotations and no features."""
+    from drgs.information.diagonal import Diagonal  # loads Dr.Jit, which poses alone need not have
+
     prior = pool.scoring.prior_of("fisherrf")
     weights = _without_rotations(pool.scoring.weights)
     prior = dataclasses.replace(prior, groups=_without_rotations(prior.groups))
-    asked = Asked(DiagonalQuestion("fisherrf", without=("features",)))
-    plain = dataclasses.replace(pool, masks=None)  # of which FisherRF knows nothing
-    return _greedy(_scored(plain, criterion="eig", prior=prior, weights=weights), [asked])
+    joint = Joint((("", Diagonal("fisherrf", without=("features",))),))
+    plain = dataclasses.replace(pool, masks=None)  # which FisherRF does not have
+    return _greedy(_scored(plain, criterion="eig", prior=prior, weights=weights), joint)
 
 
 def coverage(pool: Pool) -> Selection:
     """Largest sum Wc / (W + lambda), W = sum over pixels of w^2."""
+    from drgs.information.diagonal import Coverage  # loads Dr.Jit, which poses alone need not have
+
     prior = dataclasses.replace(pool.scoring.prior_of("coverage"), groups={})
-    return _greedy(_scored(pool, criterion="eig", prior=prior, weights={}), [Asked(CoverageQuestion())])
+    return _greedy(_scored(pool, criterion="eig", prior=prior, weights={}), Joint((("", Coverage()),)))
 
 
-def _greedy(pool: Pool, asked: Sequence[Asked], combination: Combination | None = None) -> Selection:
-    """`greedy` by what `drgs.fisher` says of each view, or by the pool's own information.
+@dataclasses.dataclass(frozen=True)
+class _OwnInformation(Quantity):
+    """Information by a function of the pool's, in float32 as that of `Joint`.
+
+    Attributes:
+        function: Camera -> Information.
+        of_blocks: Whether entries may be negative, as those off the diagonal of blocks.
+    """
+
+    function: Callable[[Camera], Information]
+    of_blocks: bool
+
+    def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
+        """What the function returns."""
+        return {name: x.to(torch.float32) for name, x in self.function(view.camera).items()}
+
+    def key(self, camera: Camera, settings: RenderSettings) -> Hashable:
+        """The function may go by what a camera is called."""
+        return self.function, camera.name, settings
+
+    @property
+    def signed(self) -> tuple[str, ...]:
+        """Those of dense blocks."""
+        return (DENSE,) if self.of_blocks else ()
+
+
+def _greedy(pool: Pool, joint: Joint | None = None, combination: Combination | None = None) -> Selection:
+    """`greedy` by a quantity of the views.
 
     Args:
         pool: The pool whose scoring says how much it counts.
-        asked: What is asked of a view.
+        joint: The quantity; None: the pool's own information, whatever is given, is what counts.
         combination: How that becomes a score; default by the pool's scoring, all groups together.
     """
-    combination = combination or Combination(pool.scoring)
-    if own := pool.information:
-        kept_by = own, pool.scoring.settings
-        source = InformationSource(lambda scene, camera, mask: own(camera), kept_by, by_name=True)
-        return greedy(pool, ViewInformation(pool, source), combination)
-    told = [one for one in asked if one.question.asks_known]
-    known = None if len(told) == len(asked) else _source(pool, told)
-    return greedy(pool, ViewInformation(pool, _source(pool, asked), known), combination)
+    if pool.information is not None:
+        own = _OwnInformation(pool.information, criterion_named(pool.scoring.criterion, "select").of_blocks)
+        return greedy(pool, ViewInformation(pool, own), combination)
+    assert joint is not None  # as of every policy here
+    of_known = Joint(tuple(part for part in joint.parts if part[1].needs_known_views))
+    return greedy(pool, ViewInformation(pool, joint, of_known), combination)
 
 
-def _source(pool: Pool, asked: Sequence[Asked]) -> InformationSource:
-    """What views are asked: with a cache, first what depends on a view alone."""
-    questions = Questions(pool.scoring.settings, tuple(asked))
-    if pool.cache is None:
-        return InformationSource(questions)
-    return InformationSource(questions.lasting(), finish=questions.finished)
-
-
-def ask_views(pool: Pool) -> None:
-    """Ask the candidates what `fisher` goes by, for the pool's cache; nothing is scored."""
-    asked, _ = asked_of(_blocks(pool))
-    for _ in ViewInformation(pool, _source(pool, asked)).each(
-        [AskedView(f"candidate {i}", camera) for i, camera in enumerate(pool.candidates)]
-    ):
+def compute_candidates(pool: Pool) -> None:
+    """Compute the information of the candidates that `fisher` scores by, for the pool's cache; nothing is scored."""
+    joint, _ = joint_of(_blocks(pool))
+    views = [PoolView(f"candidate {i}", camera) for i, camera in enumerate(pool.candidates)]
+    for _ in ViewInformation(pool, joint).each(views):
         pass
 
 
 def _blocks(pool: Pool) -> SceneBlocks:
-    """The blocks of the image that the pool's views are asked about."""
+    """The blocks of the image that count."""
     views = [*pool.train, *pool.candidates]
-    return SceneBlocks.of(pool.scene, pool.scoring, views, answers=pool.answers, empty_outside=pool.empty_outside)
+    return SceneBlocks.of(pool.scene, pool.scoring, views, compute=pool.compute_each, empty_outside=pool.empty_outside)
 
 
 def _scored(pool: Pool, **fields: Any) -> Pool:
@@ -106,5 +137,5 @@ def _scored(pool: Pool, **fields: Any) -> Pool:
 
 
 def _without_rotations(groups: Mapping[str, float]) -> dict[str, float]:
-    """What is said of groups that FisherRF's rasterizer knows."""
+    """Values of the groups that FisherRF's rasterizer has."""
     return {name: x for name, x in groups.items() if name != "rotations"}

@@ -1,4 +1,4 @@
-"""Policies that look at what candidates show, each by itself: no training view is needed, nothing is differentiated.
+"""Policies by renderings of candidates, each by itself: no training view is needed, nothing is differentiated.
 
 Picks do not change the scores: k picks are the k best, whatever they share.
 
@@ -13,19 +13,18 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from drgs.selection.pool import Pool, Question, Selection
+from drgs.information.quantity import Quantity
+from drgs.selection.pool import Pool, Selection
 from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
-    from drgs.cameras import Camera
-    from drgs.ellipsoids import Scene
-    from drgs.information.sums import Information
+    from drgs.information.quantity import ViewContext
 
 __all__ = ["blur", "moments", "renderers"]
 
 _COMPARED = ("exact", "fast", "gsplat", "3dgut")
 _LUMA = (0.299, 0.587, 0.114)  # of R, G and B, ITU-R BT.601
-_BLACK = 1e-12  # added to a sharpness, which is 0 of a picture of one color
+_BLACK = 1e-12  # squared luma in [0, 1]; added to a sharpness, whose logarithm is infinite of one color
 
 
 def moments(pool: Pool) -> Selection:
@@ -33,16 +32,16 @@ def moments(pool: Pool) -> Selection:
 
     "Magic Moments"; see `drgs.information.maps`.
     """
-    return _ranked(pool, "moments", _Moments(pool.scoring.settings))
+    return _ranked(pool, "moments", _Moments())
 
 
 def blur(pool: Pool) -> Selection:
     """Least sharp rendering: smallest variance of the Laplacian of the luma over the image [1].
 
     The score is minus the logarithm of that variance. A view that is rendered without detail is taken to be a bad one;
-    whether detail is missing or was never there, this does not tell.
+    whether detail is missing or was never there is unknown.
     """
-    return _ranked(pool, "blur", _Blur(pool.scoring.settings))
+    return _ranked(pool, "blur", _Blur())
 
 
 def renderers(pool: Pool) -> Selection:
@@ -51,13 +50,13 @@ def renderers(pool: Pool) -> Selection:
     The presets `exact`, `fast`, `gsplat` and `3dgut`: they differ where Gaussians overlap, are large or near the
     camera, which is where few photographs have said what they are.
     """
-    return _ranked(pool, "renderers", _Renderers(pool.scoring.settings.background))
+    return _ranked(pool, "renderers", _Renderers())
 
 
-def _ranked(pool: Pool, name: str, question: Question) -> Selection:
+def _ranked(pool: Pool, name: str, quantity: Quantity) -> Selection:
     """The candidates that score highest, one by one."""
     scores = []
-    for number, found in enumerate(pool.answers(question, pool.candidates), 1):
+    for number, found in enumerate(pool.compute_each(quantity, pool.candidates), 1):
         scores.append(float(found[name]))
         if pool.progress:
             pool.progress(number, len(pool.candidates))
@@ -70,52 +69,50 @@ def _ranked(pool: Pool, name: str, question: Question) -> Selection:
     return Selection(picks, scores, evaluations=len(scores), notes=notes)
 
 
-# Functions that other processes can be sent; what loads Dr.Jit is imported when they are asked.
+# What loads Dr.Jit is imported when it is first computed.
 
 
 @dataclasses.dataclass(frozen=True)
-class _Moments:
+class _Moments(Quantity):
     """The mean over a view's pixels of the variance along their rays."""
 
-    settings: RenderSettings
-
-    def __call__(self, scene: Scene, camera: Camera, mask: torch.Tensor | None) -> Information:
+    def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
+        """A float64 number."""
         from drgs.information.maps import moments_map
 
-        return {"moments": moments_map(scene.at(camera.time), camera, self.settings).double().mean()}
+        return {"moments": moments_map(view.gaussians, view.camera, view.settings).double().mean()}
 
 
 @dataclasses.dataclass(frozen=True)
-class _Blur:
+class _Blur(Quantity):
     """How far a view is from sharp."""
 
-    settings: RenderSettings
-
-    def __call__(self, scene: Scene, camera: Camera, mask: torch.Tensor | None) -> Information:
-        shown = _shown(scene, camera, self.settings) @ torch.tensor(_LUMA, dtype=torch.float64)
-        inner = shown[1:-1, 1:-1]
-        laplacian = shown[:-2, 1:-1] + shown[2:, 1:-1] + shown[1:-1, :-2] + shown[1:-1, 2:] - 4 * inner
+    def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
+        """A float64 number."""
+        luma = _rendered(view, view.settings) @ torch.tensor(_LUMA, dtype=torch.float64)
+        inner = luma[1:-1, 1:-1]
+        laplacian = luma[:-2, 1:-1] + luma[2:, 1:-1] + luma[1:-1, :-2] + luma[1:-1, 2:] - 4 * inner
         sharp = laplacian.var(correction=0) if laplacian.numel() else torch.zeros((), dtype=torch.float64)
         return {"blur": -(sharp + _BLACK).log()}
 
 
 @dataclasses.dataclass(frozen=True)
-class _Renderers:
+class _Renderers(Quantity):
     """The mean over a view's pixels and channels of the variance between renderers."""
 
-    background: tuple[float, float, float]
-
-    def __call__(self, scene: Scene, camera: Camera, mask: torch.Tensor | None) -> Information:
-        shown = torch.stack(
-            [_shown(scene, camera, RenderSettings.preset(name, background=self.background)) for name in _COMPARED]
+    def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
+        """A float64 number."""
+        background = view.settings.background
+        rendered = torch.stack(
+            [_rendered(view, RenderSettings.preset(name, background=background)) for name in _COMPARED]
         )
-        return {"renderers": shown.var(0, correction=0).mean()}
+        return {"renderers": rendered.var(0, correction=0).mean()}
 
 
-def _shown(scene: Scene, camera: Camera, settings: RenderSettings) -> torch.Tensor:
+def _rendered(view: ViewContext, settings: RenderSettings) -> torch.Tensor:
     """(H, W, 3) float64 colors of a view."""
     from drgs.integrator import render
 
     with torch.no_grad():
-        gaussians = scene.at(camera.time).detach().replace(features=None)
-        return render(gaussians, camera, settings, outputs=()).rgb.double().cpu()
+        gaussians = view.gaussians.detach().replace(features=None)
+        return render(gaussians, view.camera, settings, outputs=()).rgb.double().cpu()

@@ -6,21 +6,24 @@ import dataclasses
 import functools
 import math
 import operator
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 import torch
 
 from drgs.cameras import Camera
 from drgs.ellipsoids import Scene
+from drgs.guards.arguments import must_be
 from drgs.information.choices import Combine
-from drgs.information.once_per_time import once_per_time
+from drgs.information.criteria import criterion_named
+from drgs.information.quantity import Quantity, ViewContext, once_per_time
 from drgs.information.scoring import Scoring
 from drgs.information.sums import Information
-from drgs.selection.cache import Cache, camera_key, value_key
+from drgs.selection.cache import Cache, view_key
 from drgs.selection.refining import Refine
+from drgs.settings import RenderSettings
 
-__all__ = ["Pick", "Pool", "Question", "Selection", "ViewQuestion", "Workers"]
+__all__ = ["Pick", "Pool", "Selection", "ViewRequest", "Workers"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,39 +125,16 @@ class Selection:
         return [{**view, "score": score, "parts": own, "unseen": x, **rest} for view, score, own, x, rest in rows]
 
 
-Question = Callable[[Scene, Camera, torch.Tensor | None], Information]
-"""What is asked of a view: scene, camera and mask -> tensors by name. Other processes can be sent it."""
-
-
-@dataclasses.dataclass(frozen=True)
-class ViewQuestion:
-    """A question to one view.
-
-    Attributes:
-        question: What is asked.
-        camera, mask: The camera and the mask of the view.
-        kept_by: What the answer depends on besides scene, camera and mask; None: on the question.
-    """
-
-    question: Question
-    camera: Camera
-    mask: torch.Tensor | None = None
-    kept_by: Hashable = None
-
-    @property
-    def key(self) -> Hashable:
-        """By which a cache keeps the answer."""
-        by = self.question if self.kept_by is None else self.kept_by
-        return by, camera_key(self.camera), None if self.mask is None else value_key(self.mask)
+ViewRequest = tuple[Quantity, Camera, torch.Tensor | None]
+"""A quantity, and the camera and mask of the view that it is computed of; plain data, sent to other processes."""
 
 
 class Workers(Protocol):
-    """Other processes that views are asked about in; `drgs.cluster.workers.Cluster` is some."""
+    """Other processes that compute quantities of views; `drgs.cluster.workers.Cluster` is some."""
 
-    def each(
-        self, scene: Scene, views: Sequence[tuple[Question, Camera, torch.Tensor | None]]
-    ) -> Iterator[Information]:
-        """The answers, in the order of the views, with the bits that this process would find with one thread."""
+    def each(self, scene: Scene, settings: RenderSettings, requests: Sequence[ViewRequest]) -> Iterator[Information]:
+        """What `Quantity.compute` returns, in the order of the requests, with the bits that this process would compute
+        with one thread."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -175,7 +155,9 @@ class Pool:
         progress: Called with (views done, views) after each view whose information is known.
         information: Camera -> Information, in place of what `drgs.fisher` computes.
         workers: Processes that compute information; None: this one.
-        refine: How far picks are moved to where they tell more; None: not at all.
+        refine: How far picks are moved to where they score higher; None: not at all.
+    Raises:
+        ValueError: If there are no candidates or fewer than k, or an argument is wrong or means nothing beside others.
     """
 
     scene: Scene
@@ -193,55 +175,85 @@ class Pool:
     workers: Workers | None = None
     refine: Refine | None = None
 
-    def answers(self, question: Question, cameras: Iterable[Camera]) -> Iterator[Information]:
-        """What views say to one question, one after another; see `told`."""
-        return self.told([ViewQuestion(question, camera) for camera in cameras])
+    def __post_init__(self) -> None:
+        count = len(self.candidates)
+        if not count:
+            raise ValueError("select: there must be at least one candidate, got none; give poses to choose from")
+        if not (isinstance(self.k, int) and 1 <= self.k <= count):
+            raise ValueError(f"select: k must be a whole number in 1..{count} candidates, got {self.k!r}; correct it")
+        if not isinstance(self.rng, torch.Generator):
+            raise ValueError(
+                f"select: rng must be a torch.Generator that is kept between calls, got {self.rng!r}; make one"
+            )
+        criterion_named(self.scoring.criterion, "select")  # else the first view's information would be computed before
+        if self.refine is not None:
+            must_be("select", "refine", self.refine, Refine, "e.g. drgs.select.Refine(evaluations=40)")
+        if self.information is None:
+            return
+        if self.workers is not None:
+            raise ValueError("select: workers must be None with information, got both; a function is called here")
+        scoring = self.scoring  # of the rest, what means nothing beside information would be dropped in silence
+        if scoring.combine is not None or scoring.network != "ratio":
+            raise ValueError(
+                "select: combine and network must be left out with information, got "
+                f"{scoring.combine or scoring.network}; its groups are scored together, by criterion"
+            )
 
-    def told(
-        self,
-        views: Sequence[ViewQuestion],
-        accept: Callable[[int, Information], Information] = lambda i, answer: answer,
+    def compute_each(self, quantity: Quantity, cameras: Iterable[Camera]) -> Iterator[Information]:
+        """One quantity of several views without masks; see `compute`."""
+        return self.compute([(quantity, camera, None) for camera in cameras])
+
+    def compute(
+        self, requests: Sequence[ViewRequest], accept: Callable[[int, Information], object] = lambda i, computed: None
     ) -> Iterator[Information]:
-        """What views say, one after another: out of the cache, else computed by the workers, if any, else here.
+        """Quantities of views, one after another: out of the cache, else computed by the workers, if any, else here.
 
         Args:
-            views: Questions to the views, in their order.
-            accept: Called with the place of a view and what was computed of it; returns what is made of that, and kept.
+            requests: The views, in their order.
+            accept: Called with the place of a view and what was computed of it, before the cache keeps that; it raises
+                if that is wrong.
         """
         cache = self.cache
         if cache is None:
-            coming = self._computed(views)
-            for i in range(len(views)):
-                yield accept(i, next(coming))
+            coming = self._computed(requests)
+            for i in range(len(requests)):
+                computed = next(coming)
+                accept(i, computed)
+                yield computed
+                del computed  # not alive while the next one is computed
             return
-        keys = [view.key for view in views]
-        # What is found is held until its turn: what is computed before that may push it out of the cache.
+        settings = self.scoring.settings
+        keys = [view_key(quantity.key(camera, settings), camera, mask) for quantity, camera, mask in requests]
+        # What the cache has is held until its turn: what is computed before that may push it out of the cache.
         held = {key: cache.find(self.scene, key) for key in dict.fromkeys(keys)}
         first = {key: i for i, key in reversed([*enumerate(keys)])}
         last = {key: i for i, key in enumerate(keys)}
-        coming = self._computed([views[first[key]] for key, found in held.items() if found is None])
+        coming = self._computed([requests[first[key]] for key, kept in held.items() if kept is None])
 
         for i, key in enumerate(keys):
-            found = held.pop(key)
-            if found is None:
-                # Never looked up again: another call may have stored it meanwhile, and the next answer is this one's.
-                found = accept(i, next(coming))
-                cache.keep(self.scene, key, found)
+            kept = held.pop(key)
+            if kept is None:
+                # Never looked up again: another call may have stored it meanwhile, and the next result is this one's.
+                kept = next(coming)
+                accept(i, kept)
+                cache.keep(self.scene, key, kept)
             elif i > first[key]:
                 cache.hits += 1  # the same view once more
             if i < last[key]:
-                held[key] = found
-            yield found
-            del found  # not alive while the next one is computed
+                held[key] = kept
+            yield kept
+            del kept  # not alive while the next one is computed
 
-    def _computed(self, views: Sequence[ViewQuestion]) -> Iterator[Information]:
+    def _computed(self, requests: Sequence[ViewRequest]) -> Iterator[Information]:
+        settings = self.scoring.settings
         if self.workers is not None:
-            return self.workers.each(self.scene, [(view.question, view.camera, view.mask) for view in views])
-        return (view.question(self._once_per_time, view.camera, view.mask) for view in views)
+            return self.workers.each(self.scene, settings, requests)
+        scene = self._once_per_time
+        return (quantity.compute(ViewContext(scene, camera, settings, mask)) for quantity, camera, mask in requests)
 
     @functools.cached_property
     def _once_per_time(self) -> Scene:
-        """The scene, for questions that are asked here: a pool lives no longer than the choice from it."""
+        """The scene, for views that are computed here: a pool lives no longer than the choice from it."""
         return once_per_time(self.scene)
 
     def pick(self, index: int, score: float, parts: Mapping | None = None, margin: float | None = None) -> Pick:

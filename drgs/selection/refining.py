@@ -1,4 +1,4 @@
-"""A candidate moved to where its view tells more, within bounds.
+"""A candidate moved to where its view scores higher, within bounds.
 
 A list of candidates is a sample of the places where a camera can be; the best of them is near a better one. From there
 the camera goes along its own axes and turns about two of them, one motion at a time, each kept where the score is
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 __all__ = ["Refine", "refined"]
 
 _AXES = ("right", "down", "forward")
-_HALVED = 4  # times, after which the steps are a 16th of the first
-_HIGHER = 1e-6  # relative: what rounding may change of a score
+_HALVED = 4  # times that steps are halved, to a 16th of the first: finer ones change a score by little
+_HIGHER = 1e-6  # share of a score that rounding may change
 _SOLID = 0.5  # opacity from which on a Gaussian is in the way
-_NEAREST = 10  # of them that stand nearest; fewer may be floaters
+_NEAREST = 10  # the distance to Gaussians is that to the tenth: fewer may be floaters
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -121,25 +121,25 @@ def refined(
     start: Camera,
     gain: Gain,
     score: Callable[[Information], Gain],
-    ask: Callable[[Camera], Information],
+    compute: Callable[[Camera], Information],
     refine: Refine,
 ) -> tuple[Camera, Gain, Information | None, int]:
-    """A candidate moved to where it tells more.
+    """A candidate moved to where it scores higher.
 
     Args:
         scene: The scene.
         candidates, known: The cameras that it was chosen among, and those of known views.
-        start, gain: The candidate, and what it tells.
+        start, gain: The candidate, and its gain.
         score: Gain of a view's information against that of the known views.
-        ask: Information of a view.
+        compute: Information of a view.
         refine: How far and how long.
     Returns:
         The camera, its gain and its information (None where it has not moved), and how many views were scored.
     """
     bounds = _Bounds.of(scene, [*candidates, *known], start, refine)
     shift = _shift(candidates)
-    best, most, told = start, gain, None
-    asked = 0
+    best, highest, moved = start, gain, None
+    count = 0
     motions = [(kind, axis, sign) for kind in ("go", "turn") for axis in _AXES for sign in (1, -1)]
     motions = [x for x in motions if x[:2] != ("turn", "forward")]  # a roll shows the same place
     for halved in range(_HALVED + 1):
@@ -149,17 +149,17 @@ def refined(
             for kind, axis, sign in motions:
                 size = sign * (shift if kind == "go" else math.radians(refine.turn) / 2) / 2**halved
                 camera = _moved(best, kind, _AXES.index(axis), size)
-                while size and asked < refine.evaluations and bounds.hold(camera, start):
-                    information = ask(camera)
+                while size and count < refine.evaluations and bounds.hold(camera, start):
+                    information = compute(camera)
                     own = score(information)
-                    asked += 1
-                    if own.total <= most.total + _HIGHER * abs(most.total):
+                    count += 1
+                    if own.total <= highest.total + _HIGHER * abs(highest.total):
                         break
-                    best, most, told, rose = camera, own, information, True
+                    best, highest, moved, rose = camera, own, information, True
                     camera = _moved(best, kind, _AXES.index(axis), size)
-            if asked >= refine.evaluations:
-                return best, most, told, asked
-    return best, most, told, asked
+            if count >= refine.evaluations:
+                return best, highest, moved, count
+    return best, highest, moved, count
 
 
 def _shift(cameras: Sequence[Camera]) -> float:
