@@ -38,7 +38,7 @@ from drgs.information.gains import DENSE, information_gain
 from drgs.information.groups import GROUPS
 from drgs.information.jacobian import Blocks
 from drgs.information.maps import variance_map as map_of_variance
-from drgs.information.nuisances import Nuisances
+from drgs.information.nuisances import NO_NUISANCES, Nuisances
 from drgs.information.prior import Prior
 from drgs.information.quantity import ViewContext, checked_views, sum_over_views
 from drgs.information.semantics import SemanticMetric
@@ -148,7 +148,7 @@ def diagonal(
         seed=seed,
         channel_weights=weights,
         semantics=semantics,
-        nuisances=nuisances or Nuisances(),
+        nuisances=nuisances or NO_NUISANCES,
     )
     total = sum_over_views(quantity, gaussians, views, each, shown)
     if "sh" in total:
@@ -189,7 +189,7 @@ def blocks(
     """
     views = checked_views("fisher.blocks", gaussians, cameras, settings, masks)
     weights = three_weights("fisher.blocks", channel_weights)
-    return sum_over_views(DenseBlocks(weights, semantics, nuisances or Nuisances()), gaussians, *views)[DENSE]
+    return sum_over_views(DenseBlocks(weights, semantics, nuisances or NO_NUISANCES), gaussians, *views)[DENSE]
 
 
 @alone
@@ -238,7 +238,7 @@ def backdrop(
             f"{[tuple(x.shape) for x in seen_opacity]}; pass the alpha that drgs.render gives of the same views"
         )
     weights = three_weights("fisher.backdrop", channel_weights)
-    quantity = Backdrop(sphere, False, weights, semantics, nuisances or Nuisances())
+    quantity = Backdrop(sphere, False, weights, semantics, nuisances or NO_NUISANCES)
     return sum_over_views(quantity, gaussians, cameras, each, shown, seen_opacity)[BACKDROP]
 
 
@@ -282,7 +282,7 @@ def network(
 
     views = checked_views("fisher.network", scene, cameras, settings, masks)
     quantity = NetworkInformation(
-        estimate, mode, probes, seed, None, channel_weights, semantics, nuisances or Nuisances()
+        estimate, mode, probes, seed, None, channel_weights, semantics, nuisances or NO_NUISANCES
     )
     return sum_over_views(quantity, scene, *views)
 

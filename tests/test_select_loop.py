@@ -109,7 +109,7 @@ def test_a_cache_is_bounded_in_bytes(still):
     g, cameras = still
     whole = Cache()
     picks = loop(g, cameras, np.random.default_rng(0), whole)[0]
-    assert whole.bytes == sum(x.nbytes for answer in whole._answers.values() for x in answer.values()) > 0
+    assert whole.bytes == sum(x.nbytes for kept in whole._kept.values() for x in kept.computed.values()) > 0
     for share in (0.5, 0.05):
         cache = Cache(max_bytes=int(share * whole.bytes))
         assert loop(g, cameras, np.random.default_rng(0), cache)[0] == picks

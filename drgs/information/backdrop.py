@@ -24,7 +24,7 @@ import torch
 
 from drgs.ellipsoids import colors_only
 from drgs.information.complement import left
-from drgs.information.nuisances import Nuisances
+from drgs.information.nuisances import NO_NUISANCES, Nuisances
 from drgs.information.quantity import Quantity, ViewContext
 from drgs.information.sums import Information
 from drgs.settings import RenderSettings
@@ -58,7 +58,7 @@ _FAST = RenderSettings.preset("fast")  # measures depth along the ray, as `ewa` 
 _SOLID = 0.5  # opacity from which on the median depth is that of a surface
 _FARTHEST = 0.95  # quantile of all depths that is the radius: a few floaters do not decide it
 _AROUND = 1.05  # of the distance of the outermost camera, at least: cameras are inside, not on the sphere
-_NO_NUISANCES = Nuisances()
+
 
 ComputeViews = Callable[[Quantity, Sequence["Camera"]], Iterable[Information]]
 """(quantity, cameras) -> what is computed of each view, as `drgs.selection.pool.Pool.compute_each`."""
@@ -106,10 +106,10 @@ def backdrop_sphere(
         cameras = [in_order[i * len(cameras) // _VIEWS] for i in range(_VIEWS)]
     quantity = SurfaceDepths()
     if compute is not None:
-        found = compute(quantity, cameras)
+        computed = compute(quantity, cameras)
     else:
-        found = (quantity.compute(ViewContext(scene, camera, _FAST)) for camera in cameras)
-    solid = np.concatenate([one["depths"].numpy() for one in found])
+        computed = (quantity.compute(ViewContext(scene, camera, _FAST)) for camera in cameras)
+    solid = np.concatenate([one["depths"].numpy() for one in computed])
     if not len(solid):
         return None
     outermost = float(np.linalg.norm(centers - center, axis=1).max())
@@ -152,15 +152,15 @@ def backdrop_cells(camera: Camera, sphere: Sphere | None = None) -> torch.Tensor
         rays *= np.sqrt(np.maximum(along**2 + 1 - start @ start, 0.0)) - along
         rays += start[:, None]
     axis = np.abs(rays).argmax(0)
-    found = np.empty(len(axis), np.int64)
+    cells = np.empty(len(axis), np.int64)
     for k in range(3):  # the faces across each axis
         (seen,) = (axis == k).nonzero()
         along, *others = (rays[(k + step) % 3][seen] for step in range(3))
         # Evenly in angle, in [0, 2]; the edge of a face, 2, would be cell 16.
         even = (np.arctan(x / np.abs(along)) * 4 / np.pi + 1 for x in others)
         first, second = ((x / 2 * _SIDE).astype(np.int64).clip(0, _SIDE - 1) for x in even)
-        found[seen] = ((2 * k + (along < 0)) * _SIDE + first) * _SIDE + second
-    return torch.from_numpy(found.reshape(camera.height, camera.width))
+        cells[seen] = ((2 * k + (along < 0)) * _SIDE + first) * _SIDE + second
+    return torch.from_numpy(cells.reshape(camera.height, camera.width))
 
 
 def _open(opacity: torch.Tensor) -> torch.Tensor:
@@ -235,7 +235,7 @@ class Backdrop(Quantity):
     empty_outside: bool = False
     channel_weights: Sequence[float] = (1.0, 1.0, 1.0)
     semantics: SemanticMetric | None = None
-    nuisances: Nuisances = _NO_NUISANCES
+    nuisances: Nuisances = NO_NUISANCES
     where: ClassVar[str] = "fisher.backdrop"
 
     @property
@@ -249,21 +249,21 @@ class Backdrop(Quantity):
 
     def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
         """The view's opacity, (H, W), and what its unknowns take."""
-        found = {_OPACITY: view.opacity}
+        computed = {_OPACITY: view.opacity}
         if self.nuisances.names:
             from drgs.information.elimination import backdrop_taken  # loads Dr.Jit, which poses alone need not have
 
             taken = backdrop_taken(view, self.channel_weights, self.semantics, self.nuisances)
-            found |= {} if taken is None else {_TAKEN: taken}
-        return found
+            computed |= {} if taken is None else {_TAKEN: taken}
+        return computed
 
     def summand(self, computed: Information, camera: Camera, mask: torch.Tensor | None) -> dict[str, torch.Tensor]:
         """Painted on the sphere."""
-        found = dict(computed)
+        painted = dict(computed)
         mask = None if self.empty_outside else mask
-        opacity, taken = found.pop(_OPACITY), found.pop(_TAKEN, None)
-        found[BACKDROP] = painted_opacity(opacity, camera, self.channel_weights, mask, self.sphere, taken)
-        return found
+        opacity, taken = painted.pop(_OPACITY), painted.pop(_TAKEN, None)
+        painted[BACKDROP] = painted_opacity(opacity, camera, self.channel_weights, mask, self.sphere, taken)
+        return painted
 
     def variance_map(self, view: ViewContext, weights: Information) -> torch.Tensor:
         """`drgs.fisher.variance_map` of the color behind."""

@@ -119,11 +119,11 @@ class SceneBlocks:
             seen = scene.at(cameras[0].time)
         names = scoring.blocks_of(seen, where, scene)
         prepared: dict[str, Any] = {}
-        found = cls(scene, scoring, names, prepared, empty_outside)
+        blocks = cls(scene, scoring, names, prepared, empty_outside)
         for name in names:
             if prepare := BLOCKS[name].prepare:
-                prepared[name] = prepare(found, seen, cameras, compute)
-        return found
+                prepared[name] = prepare(blocks, seen, cameras, compute)
+        return blocks
 
     @property
     def metric(self) -> SemanticMetric | None:
@@ -150,8 +150,8 @@ class SceneBlocks:
         together: dict[Callable, list[str]] = {}
         for name in names:
             together.setdefault(BLOCKS[name].quantity, []).append(name)
-        found = [(own[0], quantity(self, tuple(own))) for quantity, own in together.items()]
-        return [(name, quantity) for name, quantity in found if quantity is not None]
+        quantities = [(own[0], quantity(self, tuple(own))) for quantity, own in together.items()]
+        return [(name, quantity) for name, quantity in quantities if quantity is not None]
 
     def information(self, camera: Camera) -> dict[str, Information]:
         """Block -> the information of a view by it alone.
@@ -192,7 +192,7 @@ class SceneBlocks:
 
     def _apart(self) -> list[tuple[str, Quantity]]:
         """The quantity of each block alone."""
-        return [found for name in self.names for found in self.quantities([name])]
+        return [pair for name in self.names for pair in self.quantities([name])]
 
     def _view(self, camera: Camera) -> ViewContext:
         return ViewContext(self.scene, camera, self.scoring.settings)

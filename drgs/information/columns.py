@@ -96,16 +96,16 @@ class PoseInformation(Quantity):
 def _whole(name: str, rows: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Rows of integers as an array; a single axis are rows of one."""
     try:
-        found = np.asarray(rows)
+        array = np.asarray(rows)
     except ValueError:  # rows of several lengths
-        found = np.empty(0, object)
-    if found.dtype.kind not in "iu" and (found.size or found.dtype == object):
+        array = np.empty(0, object)
+    if array.dtype.kind not in "iu" and (array.size or array.dtype == object):
         raise ValueError(
             f"fisher.jacobian_columns: index of {name} must be rows of {len(shape)} integers below {shape}, got "
             f"{rows!r:.60}; use whole numbers, as many in each row"
         )
-    found = found.astype(np.int64)
-    return found[:, None] if found.ndim == 1 else found
+    array = array.astype(np.int64)
+    return array[:, None] if array.ndim == 1 else array
 
 
 def _tangent_shape(gaussians: Gaussians, name: str, scene: Scene) -> tuple[int, ...]:

@@ -81,5 +81,5 @@ def criterion_named(name: str, where: str = "criterion") -> ViewCriterion:
     Raises:
         ValueError: If there is none.
     """
-    found = CRITERIA.find(where, name)
-    return found if isinstance(found, ViewCriterion) else ViewCriterion(found)
+    criterion = CRITERIA.find(where, name)
+    return criterion if isinstance(criterion, ViewCriterion) else ViewCriterion(criterion)

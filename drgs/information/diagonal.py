@@ -27,7 +27,7 @@ from drgs.information.groups import Group, groups_of
 from drgs.information.jacobian import GEOMETRY
 from drgs.information.jacobian import Blocks as BlockSums
 from drgs.information.maps import variance_map
-from drgs.information.nuisances import Nuisances
+from drgs.information.nuisances import NO_NUISANCES, Nuisances
 from drgs.information.pullback import Pullback
 from drgs.information.quantity import Quantity
 from drgs.information.semantics import SemanticMetric
@@ -41,8 +41,6 @@ if TYPE_CHECKING:
     from drgs.information.quantity import ViewContext
 
 __all__ = ["Coverage", "DenseBlocks", "Diagonal"]
-
-_NO_NUISANCES = Nuisances()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +66,7 @@ class Diagonal(Quantity):
     seed: int = 0
     channel_weights: Sequence[float] = (1.0, 1.0, 1.0)
     semantics: SemanticMetric | None = None
-    nuisances: Nuisances = _NO_NUISANCES
+    nuisances: Nuisances = NO_NUISANCES
     where: ClassVar[str] = "fisher.diagonal"
 
     @alone
@@ -80,16 +78,16 @@ class Diagonal(Quantity):
         if self.semantics is not None:
             self.semantics.check(self.where, seen)
         if not len(seen):
-            found = {name: torch.zeros(group.shape(seen)) for name, group in wanted.items()}
+            result = {name: torch.zeros(group.shape(seen)) for name, group in wanted.items()}
         elif self.method in ("columns", "probes"):
             compute = _by_columns if self.method == "columns" else _by_probes
-            found = compute(self, view, {n: group for n, group in wanted.items() if group.owner != "scene"})
+            result = compute(self, view, {n: group for n, group in wanted.items() if group.owner != "scene"})
             if own := {n: group for n, group in wanted.items() if group.owner == "scene"}:
                 assert isinstance(scene, DeformableScene)  # which alone has tensors of its own
-                found |= compute(self, view, own, scene)
+                result |= compute(self, view, own, scene)
         else:
-            found = self._by_replay(view, wanted)
-        return {name: found[name].to(torch.float64) for name in wanted if name not in self.without}
+            result = self._by_replay(view, wanted)
+        return {name: result[name].to(torch.float64) for name in wanted if name not in self.without}
 
     def variance_map(self, view: ViewContext, weights: Information) -> torch.Tensor:
         """`drgs.fisher.variance_map` of the same rows."""
@@ -98,11 +96,11 @@ class Diagonal(Quantity):
     def _by_replay(self, view: ViewContext, wanted: dict[str, Group]) -> dict[str, torch.Tensor]:
         replay = view.replay(self.semantics)
         along = [probes.sums for probes in view.probes.values() if probes.semantics is self.semantics]
-        found = dict(replay.diagonal(wanted, self.channel_weights, self.method == "fisherrf", along))
+        result = dict(replay.diagonal(wanted, self.channel_weights, self.method == "fisherrf", along))
         rows = ViewRows.of(view, self.channel_weights, self.semantics, self.nuisances)
         if rows is not None:
-            found |= {name: left(found[name], lost) for name, lost in rows.lost(wanted).items()}
-        return found
+            result |= {name: left(result[name], lost) for name, lost in rows.lost(wanted).items()}
+        return result
 
     def _checked_groups(self, wanted: dict[str, Group]) -> dict[str, Group]:
         """Those of the wanted groups that a method has, which must know tensors of a scene where there are any."""
@@ -139,7 +137,7 @@ class DenseBlocks(Quantity):
 
     channel_weights: Sequence[float] = (1.0, 1.0, 1.0)
     semantics: SemanticMetric | None = None
-    nuisances: Nuisances = _NO_NUISANCES
+    nuisances: Nuisances = NO_NUISANCES
     where: ClassVar[str] = "fisher.blocks"
 
     @property
@@ -155,11 +153,11 @@ class DenseBlocks(Quantity):
             self.semantics.check(self.where, seen)
         if not len(seen):
             return {DENSE: torch.zeros(0, BlockSums.SIZE, BlockSums.SIZE, dtype=torch.float64)}
-        found = view.replay(self.semantics).blocks(self.channel_weights)
+        blocks = view.replay(self.semantics).blocks(self.channel_weights)
         rows = ViewRows.of(view, self.channel_weights, self.semantics, self.nuisances)
         if rows is not None:
-            found = found - rows.taken_of_blocks(groups_of(seen, BLOCK_INPUTS))
-        return {DENSE: found}
+            blocks = blocks - rows.taken_of_blocks(groups_of(seen, BLOCK_INPUTS))
+        return {DENSE: blocks}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -139,11 +139,11 @@ class ViewRows:
         pull = Pullback(self.call, [group.input for group in groups.values()])
         for share, direction in zip(self.eliminated.shares, self.eliminated.directions.unbind(-1), strict=True):
             rows = (direction * self.scales).float()  # as cotangents of images are
-            found = pull(rows[:, :3], rows[:, 3:] if rows.shape[1] > 3 else None)
+            slopes = pull(rows[:, :3], rows[:, 3:] if rows.shape[1] > 3 else None)
             yield (
                 float(share),
                 {
-                    name: group.pull(found[group.input], self.call.inputs[group.input].double().cpu())
+                    name: group.pull(slopes[group.input], self.call.inputs[group.input].double().cpu())
                     for name, group in groups.items()
                 },
             )
@@ -155,8 +155,8 @@ class ViewRows:
         """
         informed = {name: group for name, group in groups.items() if name != "features" or self.semantics is not None}
         total: dict[str, torch.Tensor] = {}
-        for share, found in self.slopes(informed):
-            for name, x in found.items():
+        for share, slopes in self.slopes(informed):
+            for name, x in slopes.items():
                 part = share * (self._squares(x) if name == "features" else x.square())
                 total[name] = total[name] + part if name in total else part
         return total
@@ -193,9 +193,9 @@ class ViewRows:
             groups: Those of `BLOCK_INPUTS`.
         """
         total = torch.zeros(self.call.count, 13, 13, dtype=torch.float64)
-        for share, found in self.slopes(groups):
-            parts = [found[name] for name in BLOCK_INPUTS[:3]]
-            parts += [found["logit_opacities"][:, None], found["sh"][:, 0]]
+        for share, slopes in self.slopes(groups):
+            parts = [slopes[name] for name in BLOCK_INPUTS[:3]]
+            parts += [slopes["logit_opacities"][:, None], slopes["sh"][:, 0]]
             row = torch.cat(parts, 1)
             total += share * row[:, :, None] * row[:, None, :]
         return total

@@ -65,12 +65,12 @@ def variance_map(
         if tuple(x.shape) != shapes[name]:
             raise ValueError(f"{where}: weights of {name} must have shape {shapes[name]}, got {tuple(x.shape)}")
     of_gaussians = {name: x for name, x in weights.items() if name != BACKDROP}
-    found = torch.zeros(view.camera.height, view.camera.width)
+    variance = torch.zeros(view.camera.height, view.camera.width)
     if len(seen) and of_gaussians:
-        found = Replay(seen, view.camera, view.settings, semantics=semantics).variance(of_gaussians, channel_weights)
+        variance = Replay(seen, view.camera, view.settings, semantics=semantics).variance(of_gaussians, channel_weights)
     if BACKDROP in weights:
-        found = found + backdrop_variance(view, weights[BACKDROP], channel_weights, sphere)
-    return found
+        variance = variance + backdrop_variance(view, weights[BACKDROP], channel_weights, sphere)
+    return variance
 
 
 def fisherrf_map(
@@ -128,8 +128,8 @@ def moments_map(gaussians: Gaussians, camera: Camera, settings: RenderSettings) 
     values = values.double()  # squares are rounded once, to the float32 that is rendered
     # sum_c w f_c^2 = w |f|^2 is one more channel.
     moments = torch.cat([values, values.square().sum(1, keepdim=True)], 1).float()
-    found = render(g.replace(sh=g.sh[:, :1], features=moments), camera, settings, outputs=()).features
-    assert found is not None  # there is at least one channel
-    found = found.double().cpu()
+    features = render(g.replace(sh=g.sh[:, :1], features=moments), camera, settings, outputs=()).features
+    assert features is not None  # there is at least one channel
+    features = features.double().cpu()
     # A difference of equal numbers where a pixel shows one thing: rounding makes some of them negative.
-    return (found[..., -1] - found[..., :-1].square().sum(-1)).clamp_min(0).float()
+    return (features[..., -1] - features[..., :-1].square().sum(-1)).clamp_min(0).float()

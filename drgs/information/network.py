@@ -46,7 +46,7 @@ from drgs.information.elimination import eliminated_of
 from drgs.information.hit_sums import HitSums
 from drgs.information.jacobian import GEOMETRY
 from drgs.information.network_groups import NETWORK_GROUPS, network_groups
-from drgs.information.nuisances import Nuisances
+from drgs.information.nuisances import NO_NUISANCES, Nuisances
 from drgs.information.pullback import Pullback
 from drgs.information.quantity import Quantity, original
 from drgs.information.replay import Replay
@@ -69,7 +69,7 @@ __all__ = ["NetworkInformation", "NetworkProbes"]
 
 _FLOATS = 1 << 23  # of the tangents that one traversal carries, or of images and what is summed up along them: 32 MiB
 _BATCH = 16  # tangents of one traversal
-_NO_NUISANCES = Nuisances()
+
 _GEOMETRY_FIELDS = {"means": 0, "quats": 3, "log_scales": 6, "logit_opacities": 9}
 """Raw fields of Gaussians -> first place of theirs in the geometry of a row, where rotations stand for quats."""
 
@@ -97,7 +97,7 @@ class NetworkInformation(Quantity):
     groups: tuple[str, ...] | None = None
     channel_weights: Sequence[float] = (1.0, 1.0, 1.0)
     semantics: SemanticMetric | None = None
-    nuisances: Nuisances = _NO_NUISANCES
+    nuisances: Nuisances = NO_NUISANCES
     where: ClassVar[str] = "fisher.network"
 
     @property
@@ -109,10 +109,10 @@ class NetworkInformation(Quantity):
     def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
         """Group -> float64 on the CPU: (P,) of its parameters, of `trace` and `paper` a number ()."""
         if probes := view.probes.get(self):
-            found = probes.information()
+            result = probes.information()
         else:
-            found = self._estimated(view)
-        return {name: x for name, x in found.items() if self.groups is None or name in self.groups}
+            result = self._estimated(view)
+        return {name: x for name, x in result.items() if self.groups is None or name in self.groups}
 
     def _estimated(self, view: ViewContext) -> dict[str, torch.Tensor]:
         groups = self._checked(view.scene)
@@ -157,7 +157,7 @@ class NetworkInformation(Quantity):
                 raise ValueError(
                     f"{where}: weights of {name} must be finite and >= 0, got others; raise lambda above 0"
                 )
-        rows = _Rows.of(where, view, dataclasses.replace(self, nuisances=_NO_NUISANCES))
+        rows = _Rows.of(where, view, dataclasses.replace(self, nuisances=NO_NUISANCES))
         camera = view.camera
         total = torch.zeros(camera.height * camera.width, dtype=torch.float64)
         if rows is None or not weights:
@@ -214,8 +214,8 @@ class NetworkProbes:
     def information(self) -> dict[str, torch.Tensor]:
         """Group -> (P,) float64 on the CPU."""
         with own_errors():
-            found = _by_group(self._groups, self._rows.squares_of_hits(self._jacobian, self.sums))
-        return {name: x.double().div_(len(self.sums.images)).cpu() for name, x in found.items()}
+            squares = _by_group(self._groups, self._rows.squares_of_hits(self._jacobian, self.sums))
+        return {name: x.double().div_(len(self.sums.images)).cpu() for name, x in squares.items()}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -475,9 +475,9 @@ def _first_signs(*shape: int) -> torch.Tensor:
     return _signs(torch.Generator().manual_seed(0), *shape, dtype=torch.float32)
 
 
-def _by_group(groups: Groups, found: Mapping[str, torch.Tensor]) -> Information:
+def _by_group(groups: Groups, tensors: Mapping[str, torch.Tensor]) -> Information:
     """Group -> (P,) of what is known by parameter."""
-    return {group: torch.cat([found[name].flatten() for name in own]) for group, own in groups.items()}
+    return {group: torch.cat([tensors[name].flatten() for name in own]) for group, own in groups.items()}
 
 
 def _size(own: Mapping[str, torch.Tensor]) -> int:

@@ -27,8 +27,8 @@ def network_groups(scene: Scene) -> dict[str, dict[str, torch.Tensor]]:
     if not isinstance(scene, DeformableScene):
         return {}
     floats = {name: x for name, x in scene.parameters().items() if x.is_floating_point()}
-    found = {
+    groups = {
         group: {name: x for name, x in floats.items() if name.startswith(prefix)}
         for group, prefix in NETWORK_GROUPS.items()
     }
-    return {group: own for group, own in found.items() if own}
+    return {group: own for group, own in groups.items() if own}

@@ -10,7 +10,7 @@ from typing import ClassVar, Literal
 
 from drgs.guards.records import Record
 
-__all__ = ["NUISANCES", "Nuisance", "Nuisances"]
+__all__ = ["NO_NUISANCES", "NUISANCES", "Nuisance", "Nuisances"]
 
 Nuisance = Literal["exposure", "pose"]
 """Unknowns of a photograph: three log gains of its channels, and the six numbers of its camera's pose."""
@@ -84,3 +84,6 @@ class Nuisances(Record):
     def over(self, fitted: Sequence[Nuisance]) -> Nuisances:
         """With those that a fit has estimated, unless these say themselves which."""
         return self if self.eliminate is not None else self.replace(eliminate=tuple(fitted))
+
+
+NO_NUISANCES = Nuisances(eliminate=())

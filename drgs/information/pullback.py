@@ -49,10 +49,10 @@ class Pullback:
         elif call.width:
             cotangent["features"] = torch.zeros(call.pixels * call.width)
         grads = self.compositor.adjoint({n: to_drjit(call.lib, x.to(call.home)).array for n, x in cotangent.items()})
-        found = [(x, grads[name]) for name, x in self.attached.items() if x is not None]
-        for x, slope in found:
+        reached = [(x, grads[name]) for name, x in self.attached.items() if x is not None]
+        for x, slope in reached:
             dr.set_grad(x, slope)
-        dr.enqueue(dr.ADMode.Backward, [x for x, _ in found])
+        dr.enqueue(dr.ADMode.Backward, [x for x, _ in reached])
         # The graph is used again by the next cotangent.
         dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
         # Copies: what Dr.Jit and torch share is reset for the next cotangent.

@@ -114,10 +114,10 @@ class ViewContext:
         """The view's Gaussians, rendered once to be replayed for each hit; the opacity is known then."""
         from drgs.information.replay import Replay  # loads Dr.Jit, which poses alone need not have
 
-        found = Replay(self.gaussians, self.camera, self.settings, geometry, semantics, self.mask)
+        replay = Replay(self.gaussians, self.camera, self.settings, geometry, semantics, self.mask)
         if self._opacity is None:
-            self._opacity = found.opacity
-        return found
+            self._opacity = replay.opacity
+        return replay
 
 
 class Quantity:
@@ -170,24 +170,24 @@ class Joint(Quantity):
 
     def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
         """In float32, as it is kept: half the memory, of sums that are of float32 images."""
-        found: dict[str, torch.Tensor] = {}
+        result: dict[str, torch.Tensor] = {}
         with torch.no_grad():  # information is a number
             if len(self.parts) > 1:  # else no other quantity walks along the view
                 probes = {quantity: quantity.hit_probes(view) for _, quantity in self.parts}
                 view.probes = {quantity: sums for quantity, sums in probes.items() if sums is not None}
             for block, quantity in self.parts:
-                found |= _named(block, quantity.compute(view))
-        return {name: x.to(torch.float32) for name, x in found.items()}
+                result |= _named(block, quantity.compute(view))
+        return {name: x.to(torch.float32) for name, x in result.items()}
 
     def summand(self, computed: Information, camera: Camera, mask: torch.Tensor | None) -> dict[str, torch.Tensor]:
         """That of each part, in float32."""
-        found = dict(computed)
+        rest = dict(computed)
         for block, quantity in self.parts:
             # Where all blocks are scored together, a part gets all that was computed, and returns the rest as it is.
-            own = {name: found.pop(name) for name in [*found] if not block or name.startswith(f"{block}.")}
+            own = {name: rest.pop(name) for name in [*rest] if not block or name.startswith(f"{block}.")}
             plain = {name.removeprefix(f"{block}."): x for name, x in own.items()} if block else own
-            found |= _named(block, quantity.summand(plain, camera, mask))
-        return {name: x.to(torch.float32) for name, x in found.items()}
+            rest |= _named(block, quantity.summand(plain, camera, mask))
+        return {name: x.to(torch.float32) for name, x in rest.items()}
 
     def key(self, camera: Camera, settings: RenderSettings) -> Hashable:
         """That of each part."""

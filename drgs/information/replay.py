@@ -244,8 +244,8 @@ class Replay:
             others = [sums.sink(self, walk) for sums in beside]
             # A buffer is float32, which one traversal fills; what several add up to is float64.
             dr.eval(self.run(walk, Together([sink, *others])), sink.buffer, [other.buffer for other in others])
-            found = sink.buffer.torch().double().reshape(self.count, -1)[:, :width]
-            total[:, : found.shape[1]] += found
+            sums = sink.buffer.torch().double().reshape(self.count, -1)[:, :width]
+            total[:, : sums.shape[1]] += sums
         return total
 
     def sums(
@@ -328,10 +328,10 @@ class Replay:
         if 2 * len(seen) > self.count:  # to copy them to where they belong takes longer than zeros of the others
             seen = torch.arange(self.count, device=squares.device)
         basis, lit = self._squared_basis(seen)
-        found = basis[:, :, None] * (squares[seen] * lit * weights)[:, None, :]
+        information = basis[:, :, None] * (squares[seen] * lit * weights)[:, None, :]
         if len(seen) == self.count:
-            return found
-        return found.new_zeros(self.count, *found.shape[1:]).index_copy_(0, seen, found)
+            return information
+        return information.new_zeros(self.count, *information.shape[1:]).index_copy_(0, seen, information)
 
     @property
     def feature_scale(self) -> float:

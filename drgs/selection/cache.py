@@ -495,12 +495,12 @@ def named_by(x: Any) -> str | None:
 def _shapes_of(tensors: Mapping[str, torch.Tensor], number: int, sh: int, where: str) -> Shapes:
     """The shapes of that number in a file."""
     kinds = {"means": 3, "log_scales": 3, "quats": 4, "opacities": 0, "colors": 3}
-    found = {name: tensors.get(f"shapes.{number}.{name}") for name in kinds}
-    means = found["means"]
+    given = {name: tensors.get(f"shapes.{number}.{name}") for name in kinds}
+    means = given["means"]
     count = 0 if means is None or not means.ndim else len(means)
     parts: dict[str, torch.Tensor] = {}
     for name, width in kinds.items():
-        x, dtype = found[name], torch.float64 if name == "means" else torch.float32
+        x, dtype = given[name], torch.float64 if name == "means" else torch.float32
         shape = (count, width) if width else (count,)
         if x is None or x.dtype != dtype or tuple(x.shape) != shape:
             raise ValueError(f"{where}: {name} of shapes {number} must be {dtype} of shape {shape}, is not; {_ADVICE}")

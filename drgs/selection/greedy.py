@@ -104,14 +104,14 @@ class ViewInformation:
     def _counted(self, quantity: Quantity, view: PoolView, computed: Information) -> Information:
         """The information that adds up over views, of what was computed of one."""
         self.bytes += size_of(computed)
-        found = quantity.summand(computed, view.camera, view.mask)
-        for name, x in found.items():
+        information = quantity.summand(computed, view.camera, view.mask)
+        for name, x in information.items():
             if name.rpartition(".")[2] in NETWORK_GROUPS:
                 self.has_any[name] = self.has_any.get(name, False) or bool(x.any())
         self.done += 1
         if self.pool.progress:
             self.pool.progress(self.done, self._expected)
-        return found
+        return information
 
 
 def greedy(pool: Pool, information: ViewInformation, combination: Combination | None = None) -> Selection:

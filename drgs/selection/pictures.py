@@ -56,8 +56,8 @@ def renderers(pool: Pool) -> Selection:
 def _ranked(pool: Pool, name: str, quantity: Quantity) -> Selection:
     """The candidates that score highest, one by one."""
     scores = []
-    for number, found in enumerate(pool.compute_each(quantity, pool.candidates), 1):
-        scores.append(float(found[name]))
+    for number, computed in enumerate(pool.compute_each(quantity, pool.candidates), 1):
+        scores.append(float(computed[name]))
         if pool.progress:
             pool.progress(number, len(pool.candidates))
     order = sorted(range(len(scores)), key=lambda i: -scores[i])  # stable: ties by index

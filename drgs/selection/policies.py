@@ -1,4 +1,4 @@
-"""How a policy is found by its name, called, and what it returns checked."""
+"""How a policy is looked up by its name, called, and what it returns checked."""
 
 from __future__ import annotations
 
@@ -48,12 +48,12 @@ def policy_named(name: str) -> Callable[[Pool], Selection]:
     return POLICIES.find("--policy", name)
 
 
-def _check_selection(where: str, pool: Pool, found: Any) -> None:
+def _check_selection(where: str, pool: Pool, selection: Any) -> None:
     """Refuse what is no choice from the pool; its scores become plain numbers."""
     advice = "make picks with pool.pick(index, score)"
-    must_be(where, "what it returns", found, Selection, f"e.g. Selection(picks, scores); {advice}")
-    picks = found.picks
-    scores = found.scores
+    must_be(where, "what it returns", selection, Selection, f"e.g. Selection(picks, scores); {advice}")
+    picks = selection.picks
+    scores = selection.scores
     count = len(pool.candidates)
     if not isinstance(picks, list | tuple) or any(not isinstance(pick, Pick) for pick in picks):
         raise ValueError(f"{where}: picks must be a list of Pick, got {kind_of(picks)}; {advice}")
@@ -73,8 +73,8 @@ def _check_selection(where: str, pool: Pool, found: Any) -> None:
             f"{where}: scores must be a finite number for each of {count} candidates, got {kind_of(scores)}; "
             "before the first pick, in their order"
         )
-    found.scores = numbers.tolist()  # plain, as files hold them
-    for name, one in (("parts", found.parts), ("unseen", found.unseen)):
+    selection.scores = numbers.tolist()  # plain, as files hold them
+    for name, one in (("parts", selection.parts), ("unseen", selection.unseen)):
         if not isinstance(one, list) or len(one) not in (0, count):
             raise ValueError(
                 f"{where}: {name} must be a list for each of {count} candidates, or empty, got {kind_of(one)}; "
