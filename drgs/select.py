@@ -4,7 +4,7 @@ A policy is a function from a `Pool` to a `Selection`; adding one is writing it 
 `POLICIES` (`drgs.information.choices`), or `POLICIES["mine"] = mine` in a script. How a score comes from information
 is a `Scoring`; its criteria are in information/criteria.py.
 
-    fisher      `criterion` of the Fisher information (gain.py)
+    fisher      `criterion` of the Fisher information (information/gains.py)
     fisherrf    `eig` of what FisherRF's rasterizer computes, no rotations
     moments     variance of the features along the rays (Magic Moments), averaged over pixels
     blur        least sharp rendering
