@@ -40,7 +40,7 @@ from drgs.information.jacobian import Blocks
 from drgs.information.maps import variance_map as map_of_variance
 from drgs.information.nuisances import NO_NUISANCES, Nuisances
 from drgs.information.prior import Prior
-from drgs.information.quantity import ViewContext, checked_views, sum_over_views
+from drgs.information.quantity import ViewContext, checked_views, once_per_time, sum_over_views
 from drgs.information.semantics import SemanticMetric
 from drgs.information.sums import Information
 from drgs.runtime import alone
@@ -137,6 +137,7 @@ def diagonal(
         backgrounds = given.backgrounds
         channels = given.channels
         weights = [weight if k < channels else 0.0 for k, weight in enumerate(weights)]
+    gaussians = once_per_time(gaussians)
     views, each, shown = checked_views("fisher.diagonal", gaussians, cameras, settings, masks)
     assert gaussians is not None  # which has been refused
     if backgrounds:  # every view has its own
@@ -187,6 +188,7 @@ def blocks(
     Returns:
         (N, 13, 13) float64: means 3, rotations 3, log-scales 3, logit-opacity 1, base color sh[0] 3.
     """
+    gaussians = once_per_time(gaussians)
     views = checked_views("fisher.blocks", gaussians, cameras, settings, masks)
     weights = three_weights("fisher.blocks", channel_weights)
     return sum_over_views(DenseBlocks(weights, semantics, nuisances or NO_NUISANCES), gaussians, *views)[DENSE]
@@ -204,6 +206,7 @@ def coverage(
     Args:
         gaussians, cameras, settings, masks: The same as for `diagonal`.
     """
+    gaussians = once_per_time(gaussians)
     views = checked_views("fisher.coverage", gaussians, cameras, settings, masks)
     return sum_over_views(Coverage(), gaussians, *views)["coverage"]
 
@@ -231,6 +234,7 @@ def backdrop(
         nuisances: The same as for `diagonal`.
         semantics: The metric of the features, which show where the camera stands, too; None: only colors do.
     """
+    gaussians = once_per_time(gaussians)
     cameras, each, shown = checked_views("fisher.backdrop", gaussians, cameras, settings, masks)
     if seen_opacity is not None and [x.shape for x in seen_opacity] != [(c.height, c.width) for c in cameras]:
         raise ValueError(
@@ -280,6 +284,7 @@ def network(
     """
     from drgs.information.network import NetworkInformation  # scenes that do not move have none
 
+    scene = once_per_time(scene)
     views = checked_views("fisher.network", scene, cameras, settings, masks)
     quantity = NetworkInformation(
         estimate, mode, probes, seed, None, channel_weights, semantics, nuisances or NO_NUISANCES
@@ -354,5 +359,6 @@ def pose_information(gaussians: Scene, camera: Camera, settings: RenderSettings 
 
 def _view(where: str, scene: Scene, camera: Camera, settings: RenderSettings | None) -> ViewContext:
     """One view, if these are a scene, a camera and settings."""
+    scene = once_per_time(scene)
     check_view(where, gaussians_at(where, scene, camera), camera, settings)
     return ViewContext(scene, camera, settings or RenderSettings.preset("exact"))

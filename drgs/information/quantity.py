@@ -21,7 +21,7 @@ from __future__ import annotations
 import dataclasses
 from collections import OrderedDict
 from collections.abc import Hashable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar, cast
 
 import torch
 
@@ -216,12 +216,12 @@ def sum_over_views(
 
     Args:
         quantity: What is computed of each view.
-        scene, cameras, settings, masks: The views, see `checked_views`.
+        scene: The scene, by `once_per_time`.
+        cameras, settings, masks: The views, see `checked_views`.
         opacities: (H, W) of each view, where they are known; None: they are not.
     Raises:
         ValueError: If the scene's Gaussians are not as many in all views.
     """
-    scene = once_per_time(scene)
     total: dict[str, torch.Tensor] = {}
     for number, (camera, own, mask) in enumerate(zip(cameras, settings, masks, strict=True)):
         gaussians_at(quantity.where, scene, camera)  # refuses what has no Gaussians then
@@ -248,8 +248,7 @@ def checked_views(
     """
     check_any_scene(where, scene)
     cameras = some_cameras(where, cameras)
-    with torch.no_grad():
-        check_scene(where, gaussians_at(where, scene, cameras[0]), settings)
+    check_scene(where, gaussians_at(where, scene, cameras[0]), settings)
     settings = settings or RenderSettings.preset("exact")
     return cameras, [settings] * len(cameras), mask_list(where, masks, cameras)
 
@@ -264,12 +263,13 @@ def opacity_of(scene: Scene, camera: Camera, settings: RenderSettings) -> torch.
 
 # -------------------------------------------------- Gaussians of a time, computed once
 
+_Any = TypeVar("_Any")
 _Scene = TypeVar("_Scene", bound=Scene)
 
 _BYTES = 64 << 20  # that Gaussians of several times may take, 64 MiB, or those of one time
 
 
-def once_per_time(scene: Scene) -> Scene:
+def once_per_time(scene: _Any) -> _Any:
     """The scene as it is now, its Gaussians as numbers, without a graph, each time's computed once.
 
     Parameters may not change while it is in use, so that it lives no longer than one call. What else the scene has is
@@ -277,12 +277,13 @@ def once_per_time(scene: Scene) -> Scene:
     """
     if isinstance(scene, Gaussians | _OncePerTime) or not isinstance(scene, Scene):
         return scene
-    return (_DeformableOncePerTime if isinstance(scene, DeformableScene) else _OncePerTime)(scene)
+    wrapper = _DeformableOncePerTime if isinstance(scene, DeformableScene) else _OncePerTime
+    return cast("_Any", wrapper(scene))  # has what the scene has
 
 
 def original(scene: _Scene) -> _Scene:
     """What `once_per_time` was made of."""
-    return scene._scene if isinstance(scene, _OncePerTime) else scene
+    return cast("_Scene", scene._scene) if isinstance(scene, _OncePerTime) else scene
 
 
 class _OncePerTime:
