@@ -36,7 +36,7 @@ from drgs.information.columns import PoseInformation, jacobian_columns
 from drgs.information.diagonal import Coverage, DenseBlocks, Diagonal
 from drgs.information.gains import DENSE, information_gain
 from drgs.information.groups import GROUPS
-from drgs.information.jacobian import Blocks
+from drgs.information.jacobian import BlockSums
 from drgs.information.maps import variance_map as map_of_variance
 from drgs.information.nuisances import NO_NUISANCES, Nuisances
 from drgs.information.prior import Prior
@@ -68,7 +68,7 @@ __all__ = [
     "variance_map",
 ]
 
-BLOCK = Blocks.SIZE  # 13: means 3, rotations 3, log-scales 3, logit-opacity 1, base color 3
+BLOCK = BlockSums.SIZE  # 13: means 3, rotations 3, log-scales 3, logit-opacity 1, base color 3
 
 
 @alone

@@ -24,8 +24,7 @@ from drgs.information.complement import left
 from drgs.information.elimination import BLOCK_INPUTS, ViewRows
 from drgs.information.gains import DENSE
 from drgs.information.groups import Group, groups_of
-from drgs.information.jacobian import GEOMETRY
-from drgs.information.jacobian import Blocks as BlockSums
+from drgs.information.jacobian import GEOMETRY, BlockSums
 from drgs.information.maps import variance_map
 from drgs.information.nuisances import NO_NUISANCES, Nuisances
 from drgs.information.pullback import Pullback

@@ -28,10 +28,10 @@ class Group:
     Attributes:
         owner: `gaussians` or `scene`: of which of them `input` and the tangents are.
         shape: Gaussians -> shape of its information.
-        entries: What it is made from, of the sums of a replay (`jacobian.Diagonal`); empty where that knows nothing.
+        entries: What it is made from, of the sums of a replay (`jacobian.SquareSums`); empty where that knows nothing.
         collect: (N, entries) sums, `Replay`, channel weights -> its information; None likewise.
         spread: Weights shaped like its information, `Replay` -> (N, entries or 3) weights of squares in a pixel
-            (`jacobian.Variance`); None where a pixel's RGB do not depend on it.
+            (`jacobian.VarianceSums`); None where a pixel's RGB do not depend on it.
         input: The tensor that reverse mode differentiates by.
         pull: (derivative by `input`, `input`) -> derivative by the group.
         fisherrf: Inputs by name -> what FisherRF divides the squares by; None where it leaves the group out.

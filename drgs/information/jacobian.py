@@ -26,7 +26,7 @@ from drgs.tracing.records import load_packed, pack, packed_size
 from drgs.tracing.responses import Response
 from drgs.tracing.sums import add_row
 
-__all__ = ["GEOMETRY", "Blocks", "Diagonal", "Rows", "Together", "Variance", "extras"]
+__all__ = ["GEOMETRY", "BlockSums", "SquareSums", "Rows", "SeveralSums", "VarianceSums", "extras"]
 
 GEOMETRY = 10  # means 3, rotations 3, log-scales 3, logit-opacity 1: the order of every row
 # entries of `extras`: d log strength / dlogit, dc/dmu (9), then the response's
@@ -86,7 +86,7 @@ class Rows:
 
     Args:
         buffer: The buffer of `extras`; None leaves the geometry out, only w is known then.
-        sink: What becomes of them: `Diagonal`, `Blocks` or `Variance`.
+        sink: What becomes of them: `SquareSums`, `BlockSums` or `VarianceSums`.
         finals: The final state of the Primal pass, one per shared ray.
         color: The color depends on the mean, through the direction.
         masks: What the rows of each shared ray are multiplied by; None: nothing.
@@ -208,7 +208,7 @@ def _entry(slopes: list[Float], g: list[Float], turned: list[list[Float]] | None
     return value + turned[c][j] if turned and j < 3 and c < len(turned) else value
 
 
-class Diagonal:
+class SquareSums:
     """Sums of squares into a buffer of `width` floats a Gaussian: geometry, sum w^2, by band and channel, then padding.
 
     Args:
@@ -279,7 +279,7 @@ def _uncolored(row: Row, weights: Sequence[float]) -> Float:
     return sum(x * x * weight for x, weight in zip(row.g[3:], weights[3:], strict=True))
 
 
-class Blocks:
+class BlockSums:
     """Sums of outer products: the lower triangles of (13, 13), row by row, then padding; base colors follow the
     geometry.
     """
@@ -322,7 +322,7 @@ class Blocks:
         return states
 
 
-class Together:
+class SeveralSums:
     """Several sinks, each of which takes every row.
 
     Args:
@@ -344,7 +344,7 @@ class Together:
         return states
 
 
-class Variance:
+class VarianceSums:
     """Per pixel, the sum over parameters of squared derivatives times a weight of each.
 
     Args:

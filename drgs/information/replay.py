@@ -11,7 +11,7 @@ import torch
 
 from drgs import runtime
 from drgs.information.groups import GROUPS, Information
-from drgs.information.jacobian import GEOMETRY, Blocks, Diagonal, Rows, Together, Variance, extras
+from drgs.information.jacobian import GEOMETRY, BlockSums, Rows, SeveralSums, SquareSums, VarianceSums, extras
 from drgs.tracing.arrays import Float
 from drgs.tracing.bridge import to_drjit
 from drgs.tracing.call import Call
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 __all__ = ["Replay", "WalkSums"]
 
 _TABLED = 4  # channels whose tables are worth their memory
-_BESIDE = 16  # semantic channels of one traversal, beside the colors
+_SEMANTIC = 16  # semantic channels of one traversal, besides the colors
 _FLOAT_MAX = torch.finfo(torch.float32).max
 _MOST = 1e-6 * _FLOAT_MAX  # of a weight, so that what few of them add up to is no inf, which times 0 were NaN
 
@@ -96,7 +96,7 @@ class Replay:
         if semantics is not None and geometry:
             assert gaussians.features is not None  # `SemanticMetric.check` has refused it
             channels = semantics.channels(gaussians.features)
-            slices = list(channels.split(_BESIDE, 1)) if channels.shape[1] else slices
+            slices = list(channels.split(_SEMANTIC, 1)) if channels.shape[1] else slices
         self.semantics = semantics
         self.slices = slices
         seen = gaussians.detach().replace(features=slices[0])
@@ -207,7 +207,7 @@ class Replay:
             own = [*(weights if number == 0 else [0.0] * 3), *[gamma] * count]
             for at in done:
                 known = along_lists(self.lib, *at, tabled, kernel)
-                yield Walk(number == 0, 3 + number * _BESIDE, own, channels, *known)
+                yield Walk(number == 0, 3 + number * _SEMANTIC, own, channels, *known)
 
     def _rows(
         self, channels: Channels, part: Part, finals: list[dict], sink: Sink | Any = None, table: Table | None = None
@@ -230,46 +230,46 @@ class Replay:
 
     def _summed(
         self,
-        sink_of: Callable[[Walk, dr.ReduceMode], Diagonal | Blocks],
+        sink_of: Callable[[Walk, dr.ReduceMode], SquareSums | BlockSums],
         width: int,
         weights: Sequence[float],
-        beside: Sequence[WalkSums] = (),
+        more_sums: Sequence[WalkSums] = (),
     ) -> torch.Tensor:
         """(N, width) float64, where kernels run: what `sink_of(walk, reduce mode)` sums up in its `buffer`, over all
-        walks; their hits are added to the sums `beside`, too.
+        walks; their hits are added to `more_sums`, too.
         """
         total = torch.zeros(self.count, width, dtype=torch.float64, device=self.call.home)
         for walk in self.walks(weights):
             sink = sink_of(walk, walk.part.reduction)
-            others = [sums.sink(self, walk) for sums in beside]
+            others = [sums.sink(self, walk) for sums in more_sums]
             # A buffer is float32, which one traversal fills; what several add up to is float64.
-            dr.eval(self.run(walk, Together([sink, *others])), sink.buffer, [other.buffer for other in others])
+            dr.eval(self.run(walk, SeveralSums([sink, *others])), sink.buffer, [other.buffer for other in others])
             sums = sink.buffer.torch().double().reshape(self.count, -1)[:, :width]
             total[:, : sums.shape[1]] += sums
         return total
 
     def sums(
-        self, entries: Sequence[int], weights: Sequence[float], summed: bool = False, beside: Sequence[WalkSums] = ()
+        self, entries: Sequence[int], weights: Sequence[float], summed: bool = False, more_sums: Sequence[WalkSums] = ()
     ) -> torch.Tensor:
         """(N, 11) float64, where kernels run: squares of the geometry, and sum w^2; those of SH along each ray are kept
         in `light`.
         """
         bands = self.call.coefficients if self.along_ray and self.extras is not None and GEOMETRY in entries else 0
 
-        def made(walk: Walk, mode: dr.ReduceMode) -> Diagonal:
+        def sink_of(walk: Walk, mode: dr.ReduceMode) -> SquareSums:
             own = entries if walk.first else [k for k in entries if k < GEOMETRY]
-            return Diagonal(self.lib, self.count, walk.weights, own, mode, bands if walk.first else 0, summed)
+            return SquareSums(self.lib, self.count, walk.weights, own, mode, bands if walk.first else 0, summed)
 
-        total = self._summed(made, GEOMETRY + 1 + 3 * bands, weights, beside)
+        total = self._summed(sink_of, GEOMETRY + 1 + 3 * bands, weights, more_sums)
         self.light = total[:, GEOMETRY + 1 :].reshape(self.count, bands, 3)
         return total[:, : GEOMETRY + 1]
 
     def diagonal(
-        self, groups: dict, weights: Sequence[float], fisherrf: bool, beside: Sequence[WalkSums] = ()
+        self, groups: dict, weights: Sequence[float], fisherrf: bool, more_sums: Sequence[WalkSums] = ()
     ) -> Information:
-        """`fisher.diagonal` of one view, on the CPU; its hits are added to the sums `beside`, too."""
+        """`fisher.diagonal` of one view, on the CPU; its hits are added to `more_sums`, too."""
         entries = sorted({k for group in groups.values() for k in group.entries})
-        sums = self.sums(entries, weights, fisherrf, beside)
+        sums = self.sums(entries, weights, fisherrf, more_sums)
         result = {}
         scale = torch.tensor([1.0] * 3 if fisherrf else weights, dtype=torch.float64, device=self.call.home)
         for name, group in groups.items():
@@ -281,10 +281,10 @@ class Replay:
 
     def blocks(self, weights: Sequence[float]) -> torch.Tensor:
         """`fisher.blocks` of one view, on the CPU."""
-        lib, size = self.lib, Blocks.SIZE
-        made = lambda walk, mode: Blocks(lib, self.count, walk.weights, mode)  # noqa: E731
+        lib, size = self.lib, BlockSums.SIZE
+        sink_of = lambda walk, mode: BlockSums(lib, self.count, walk.weights, mode)  # noqa: E731
         row, column = torch.tril_indices(size, size, device=self.call.home)
-        total = self._summed(made, len(row), weights)
+        total = self._summed(sink_of, len(row), weights)
         full = torch.zeros(self.count, size, size, dtype=torch.float64, device=self.call.home)
         full[:, row, column] = total
         full[:, column, row] = total
@@ -305,7 +305,7 @@ class Replay:
         image = dr.zeros(lib.Float, self.call.pixels)
         light = None if self.light is None else self._weights(self.light)
         for walk in self.walks(weights):
-            sink = Variance(
+            sink = VarianceSums(
                 buffer, walk.weights, light if walk.first else None, walk.first and "features" in information
             )
             for state, at, inside in zip(self.run(walk, sink), walk.part.flat, walk.part.inside, strict=True):
