@@ -24,13 +24,13 @@ from __future__ import annotations
 import dataclasses
 import numbers
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from drgs.guards.arguments import must_be
+from drgs.guards.arguments import ArgumentError, kind_of, must_be
 from drgs.guards.camera_checks import (
     IMAGE_MAX,
     as_numpy,
@@ -54,12 +54,16 @@ __all__ = [
     "c2w_from_opengl",
     "c2w_to_mitsuba",
     "c2w_to_opengl",
+    "camera_list",
+    "cameras_of_one_size",
+    "check_camera",
     "intrinsics",
     "intrinsics_from_fov",
     "look_at",
     "orbit",
     "places_in_time",
     "rigid",
+    "some_cameras",
 ]
 
 _ROUNDING = 1e-14  # of a float64 rotation; what is less orthonormal was rounded in a file or an optimizer
@@ -499,3 +503,50 @@ def places_in_time(cameras: Sequence[Camera]) -> np.ndarray:
     times = np.array([[camera.time or 0.0] for camera in cameras])
     size = max(float(np.linalg.norm(centers - center, axis=1).max()) for center in centers)
     return np.c_[centers / (size or 1.0), times / (float(np.ptp(times)) or 1.0)]
+
+
+# -------------------------------------------------- checks of arguments
+
+_MAKE = "drgs.Camera(K=K, w2c=w2c, width=width, height=height) makes one"
+
+
+def check_camera(where: str, camera: Any) -> None:
+    """Raise `ArgumentError` unless this is one Camera; a list of them gets the advice to loop over it."""
+    several = isinstance(camera, list | tuple) and all(isinstance(x, Camera) for x in camera)
+    hint = f"it takes one view at a time: [drgs.{where}(..., camera, ...) for camera in cameras]"
+    must_be(where, "camera", camera, Camera, hint if several else _MAKE)
+
+
+def camera_list(where: str, name: str, cameras: Any) -> list[Camera]:
+    """One Camera or several as a list; `ArgumentError` for anything else."""
+    if isinstance(cameras, Camera):
+        return [cameras]
+    if isinstance(cameras, str | bytes | dict) or not isinstance(cameras, Iterable):
+        raise ArgumentError(f"{where}: {name} must be a Camera or a list of them, got {kind_of(cameras)}; {_MAKE}")
+    cameras = list(cameras)
+    for index, camera in enumerate(cameras):
+        must_be(where, f"{name}[{index}]", camera, Camera, _MAKE)
+    return cameras
+
+
+def some_cameras(where: str, cameras: Any) -> list[Camera]:
+    """The same, at least one; ValueError for none."""
+    cameras = camera_list(where, "cameras", cameras)
+    if not cameras:
+        raise ValueError(f"{where}: there must be at least one camera, got none; pass one or more")
+    return cameras
+
+
+def cameras_of_one_size(where: str, cameras: Any) -> list[Camera]:
+    """A list of at least one Camera, all of one image size; the first one that differs is named."""
+    cameras = camera_list(where, "camera", cameras)
+    if not cameras:
+        raise ArgumentError(f"{where}: a list of cameras must have at least one, got none; pass one or more")
+    sizes = [(camera.width, camera.height) for camera in cameras]
+    for index, (width, height) in enumerate(sizes):
+        if (width, height) != sizes[0]:
+            raise ArgumentError(
+                f"{where}: cameras of a list must have one image size, got {sizes[0][0]}x{sizes[0][1]} and "
+                f"camera[{index}] with {width}x{height}; render each size by itself"
+            )
+    return cameras

@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -29,6 +29,8 @@ __all__ = [
     "DeformableScene",
     "Gaussians",
     "Scene",
+    "check_any_scene",
+    "check_gaussians",
     "colors_only",
     "ellipsoids_shape",
     "semi_axes",
@@ -40,6 +42,7 @@ LOGIT_ENDS = (-151 * math.log(2), math.log(2**26 - 1))
 """Logits, -104.7 and 18.0, that an opacity of 0 and of 1 become where a file holds these: of 2^-151 and 1 - 2^-26, the
 middle of what rounds to them in float32, so that `Gaussians.opacities` are 0 and 1."""
 _FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh", "features")
+_MAKE = "drgs.load_ply(path) or drgs.Gaussians.from_arrays(means, quats, scales, opacities, sh) makes one"
 # float32 keeps 2^-24 of a coordinate: past this ratio of |mean| to scale the detail of a Gaussian is lost.
 _FAR_RATIO = 1e5
 
@@ -266,6 +269,19 @@ class Gaussians:
                 raise ValueError(
                     f"{where}: quats must not be 0, got {self.quats[i].tolist()} at index {i}; use (1, 0, 0, 0)"
                 )
+
+
+def check_gaussians(where: str, gaussians: Any) -> None:
+    """Raise `ArgumentError` unless these are Gaussians."""
+    must_be(where, "gaussians", gaussians, Gaussians, _MAKE)
+
+
+def check_any_scene(where: str, scene: Any) -> None:
+    """Raise `ArgumentError` unless this is a `Scene`, which names its parameters (a torch Module does not)."""
+    if not isinstance(scene, Scene):
+        check_gaussians(where, scene)
+    hint = "tensors by name, of a torch.nn.Module dict(self.named_parameters())"
+    must_be(where, "scene.parameters()", scene.parameters(), Mapping, hint)
 
 
 def colors_only(scene: Scene, time: float | None) -> Scene:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from drgs.guards import outputs
-from drgs.guards.arguments import ArgumentError
+from drgs.guards.arguments import ArgumentError, check_path
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.json_files import parse_json, read_json
 from drgs.guards.ply_headers import EXTRA, extra_kind, is_antialiased, ply_source, read_ply_header
@@ -80,7 +80,6 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
     import torch
 
     from drgs.ellipsoids import Gaussians
-    from drgs.guards.inputs import check_path
 
     path = check_path("load_ply", path)
     names = _check_ply(path)
@@ -190,11 +189,11 @@ def save_ply(
     """
     import plyfile
 
-    from drgs.guards.inputs import check_path, check_scene
+    from drgs.ellipsoids import check_gaussians
 
     if isinstance(g, str | os.PathLike):
         raise ArgumentError("save_ply: gaussians must come first and the path second, got a path first; swap them")
-    check_scene("save_ply", g, None)
+    check_gaussians("save_ply", g)
     path = check_path("save_ply", path)
     g.validate("save_ply")
     # A file holds values.

@@ -29,13 +29,13 @@ import torch
 from drgs.cameras import Camera
 from drgs.ellipsoids import Scene
 from drgs.guards.arguments import ArgumentError, must_be
-from drgs.guards.inputs import Masks, check_view, gaussians_at, three_weights
 from drgs.information.backdrop import BACKDROP, Backdrop, Sphere, backdrop_sphere
 from drgs.information.choices import METHODS, Method, NetworkEstimate
 from drgs.information.columns import PoseInformation, jacobian_columns
 from drgs.information.diagonal import Coverage, DenseBlocks, Diagonal
 from drgs.information.gains import DENSE, information_gain
 from drgs.information.groups import GROUPS
+from drgs.information.inputs import Masks, three_weights
 from drgs.information.jacobian import BlockSums
 from drgs.information.maps import variance_map as map_of_variance
 from drgs.information.nuisances import NO_NUISANCES, Nuisances
@@ -46,6 +46,7 @@ from drgs.information.sums import Information
 from drgs.runtime import alone
 from drgs.settings import RenderSettings
 from drgs.splats import SplatScene, SplatTensors, scene_of
+from drgs.tracing.inputs import check_view, gaussians_at
 
 __all__ = [
     "BLOCK",

@@ -17,14 +17,14 @@ import numpy as np
 import torch
 
 from drgs import runtime
-from drgs.cameras import Camera
+from drgs.cameras import Camera, cameras_of_one_size
 from drgs.ellipsoids import DeformableScene, Gaussians, Scene
 from drgs.guards.arguments import ArgumentError, kind_of, must_be
-from drgs.guards.inputs import cameras_of_one_size, check_scene, check_view, gaussians_at
 from drgs.settings import RenderSettings
 from drgs.tracing.bridge import differentiable
 from drgs.tracing.call import Call, Output
 from drgs.tracing.errors import own_errors
+from drgs.tracing.inputs import check_scene, check_view, gaussians_at
 from drgs.tracing.tangents import push_forward
 
 __all__ = ["OUTPUTS", "Output", "render", "render_jvp", "render_normals", "render_rays", "render_with_offsets"]

@@ -8,14 +8,15 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
-from drgs.cameras import rigid
-
-if TYPE_CHECKING:
-    from drgs.settings import RenderSettings
+from drgs.cameras import check_camera, rigid
+from drgs.ellipsoids import check_gaussians
+from drgs.guards.arguments import ArgumentError
+from drgs.guards.derivatives import refuse_meta
+from drgs.settings import RenderSettings, check_settings
 
 __all__ = [
     "Footprints",
@@ -23,6 +24,7 @@ __all__ = [
     "OracleScene",
     "Tiles",
     "activate",
+    "check_oracle",
     "cull_near",
     "float64",
     "scale_and_shift",
@@ -404,3 +406,17 @@ def within(scene: OracleScene, reach: torch.Tensor, origins: torch.Tensor, direc
     radius = reach * scene.axes.detach().norm(dim=1).amax(1)
     spread = torch.asin((radius / away.norm(dim=1).clamp(min=1e-300)).clamp(max=1))
     return (angle - spread <= half + 1e-9) | (half > 1.5)
+
+
+def check_oracle(where: str, gaussians: Any, camera: Any, settings: Any) -> None:
+    """What the oracles need, which take anything that has the fields of Gaussians and of a Camera."""
+    if hasattr(camera, "log_scales"):
+        raise ArgumentError(f"{where}: gaussians must come first and the camera second, got them swapped; swap them")
+    if not hasattr(gaussians, "log_scales"):
+        check_gaussians(where, gaussians)
+    if camera is not None and not hasattr(camera, "w2c"):
+        check_camera(where, camera)
+    check_settings(where, settings)
+    for name in ("means", "quats", "log_scales", "logit_opacities", "sh", "features"):
+        if isinstance(x := getattr(gaussians, name, None), torch.Tensor):
+            refuse_meta(where, name, x)

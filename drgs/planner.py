@@ -35,13 +35,12 @@ import numpy as np
 import torch
 
 from drgs import planner_files, runtime
-from drgs.cameras import Camera
+from drgs.cameras import Camera, camera_list
 from drgs.ellipsoids import Gaussians
 from drgs.fitting.config import FitConfig
 from drgs.fitting.online import OnlineFit
 from drgs.gain import Information
 from drgs.guards.arguments import ArgumentError, kind_of, must_be
-from drgs.guards.inputs import camera_list
 from drgs.select import Scoring, select
 from drgs.selection.cache import Cache, NotKept, named_by
 from drgs.selection.informed import compute_candidates

@@ -22,8 +22,8 @@ from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
 from drgs.files import load_state, save_state, state_header
 from drgs.guards import unfinished
+from drgs.guards.arguments import check_path
 from drgs.guards.camera_checks import as_numpy
-from drgs.guards.inputs import check_path
 from drgs.guards.json_files import check_json, parse_json
 
 __all__ = [

@@ -18,7 +18,6 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from drgs.cameras import rigid
-from drgs.guards.inputs import check_oracle
 from drgs.oracle import (
     Footprints,
     OracleRays,
@@ -26,6 +25,7 @@ from drgs.oracle import (
     Tiles,
     activate,
     camera_rays,
+    check_oracle,
     cull_near,
     float64,
     scale_and_shift,

@@ -24,12 +24,12 @@ from typing import Any
 
 import torch
 
-from drgs.cameras import Camera
-from drgs.ellipsoids import Scene
+from drgs.cameras import Camera, camera_list
+from drgs.ellipsoids import Scene, check_any_scene
 from drgs.guards.arguments import must_be
-from drgs.guards.inputs import Masks, camera_list, check_any_scene, mask_list
 from drgs.information.choices import METHODS, POLICIES
 from drgs.information.criteria import CRITERIA
+from drgs.information.inputs import Masks, mask_list
 from drgs.information.scoring import Scoring
 from drgs.information.sums import Information
 from drgs.selection.cache import Cache

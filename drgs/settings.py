@@ -15,7 +15,7 @@ from typing import Any, Literal
 from drgs.guards.arguments import check_fields, must_be
 from drgs.guards.registry import Registry
 
-__all__ = ["EPS_ALPHA", "PRESETS", "RESPONSES", "Preset", "RenderSettings", "legal"]
+__all__ = ["EPS_ALPHA", "PRESETS", "RESPONSES", "Preset", "RenderSettings", "check_settings", "legal"]
 
 Preset = Literal["exact", "fast", "inria", "gsplat", "3dgut", "mitsuba"]
 PRESETS: tuple[Preset, ...] = typing.get_args(Preset)
@@ -239,3 +239,9 @@ def legal(s: RenderSettings) -> str | None:
     if s.dilation > 0 and not s.planar:
         return f"dilation belongs to response='ewa', use dilation=0 (got {s.response!r})"
     return None
+
+
+def check_settings(where: str, settings: Any) -> None:
+    """Raise `ArgumentError` unless these are RenderSettings, or None."""
+    if settings is not None:
+        must_be(where, "settings", settings, RenderSettings, 'drgs.RenderSettings.preset("exact") makes them')

@@ -19,8 +19,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from drgs.guards.inputs import check_oracle
-from drgs.oracle import OracleScene, activate, cull_near, float64, sh_colors, view_rays, within
+from drgs.oracle import OracleScene, activate, check_oracle, cull_near, float64, sh_colors, view_rays, within
 from drgs.settings import EPS_ALPHA, RenderSettings
 
 __all__ = ["Volume", "render_volume"]

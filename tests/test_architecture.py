@@ -34,7 +34,7 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"settings", "runtime"}, "what a render can be asked for, and the machine it runs on"),
     ({"guards.memory", "guards.camera_checks"}, "guards that know the machine or the settings"),
     ({"cameras", "ellipsoids", "sizes"}, "the two things that a view is made of, and how large it is looked at"),
-    ({"guards.inputs", "splats"}, "what public functions take: cameras and Gaussians, or the tensors that make them"),
+    ({"splats"}, "cameras and Gaussians as tensors that make them"),
     ({"oracle", "volume", "reference"}, "the truth: below the engine, so that it cannot borrow from what it checks"),
     ({"files", "display"}, "what is written, for machines and people"),
     ({"scenes"}, "made data sets, path traced by Mitsuba: they know nothing of Gaussians"),

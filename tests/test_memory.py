@@ -105,7 +105,7 @@ def test_frames_take_what_is_said(gaussians):
         pytest.skip("no /proc to read the peak from")
     environ = {**os.environ, "DRGS_THREADS": "1"}  # each thread has buffers of its own
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environ)
-    estimate = memory.frame_bytes(1448**2, TILES)
+    estimate = memory.frame_bytes(1448**2, TILES.traversal)
     assert 0.9 < int(done.stdout) / estimate < 1.6
 
 
@@ -125,8 +125,8 @@ def test_render_refuses_what_does_not_fit(gaussians, one_gigabyte):
         drgs.render(gaussians, camera(4096), TILES)
     assert "\n" not in str(error.value)
     bvh = dataclasses.replace(TILES, traversal="bvh", order="center")
-    assert memory.frame_bytes(100, bvh) > memory.frame_bytes(100, TILES)
-    assert memory.frame_bytes(100, TILES, gradients=True) > memory.frame_bytes(100, TILES)
+    assert memory.frame_bytes(100, bvh.traversal) > memory.frame_bytes(100, TILES.traversal)
+    assert memory.frame_bytes(100, TILES.traversal, gradients=True) > memory.frame_bytes(100, TILES.traversal)
     with pytest.raises(ValueError, match=f"render_jvp: {TOLD}take fewer at a time"):
         drgs.render_jvp(gaussians, camera(512), {"camera": np.zeros((64, 6))}, TILES)
     wide = gaussians.replace(features=torch.zeros(len(gaussians), 512))
@@ -141,11 +141,11 @@ def test_tile_lists_that_do_not_fit(gaussians, monkeypatch):
     monkeypatch.setattr(memory, "_SMALL", 0)
     monkeypatch.setattr(memory, "_OTHER", 0)
     where = "_device" if runtime.backend().name == "cuda" else "available"
-    monkeypatch.setattr(memory, where, lambda: memory.frame_bytes(64 * 64, TILES) + 1)
+    monkeypatch.setattr(memory, where, lambda: memory.frame_bytes(64 * 64, TILES.traversal) + 1)
     wide = gaussians.replace(log_scales=gaussians.log_scales + 4).take(torch.arange(400) % 20)
     with pytest.raises(ValueError, match=r"entries of tile lists \(400 Gaussians, 64x64 pixels\).*; lower extent"):
         drgs.render(wide, camera(64), TILES)
-    monkeypatch.setattr(memory, where, lambda: memory.frame_bytes(64 * 64, TILES, gradients=True) + 1)
+    monkeypatch.setattr(memory, where, lambda: memory.frame_bytes(64 * 64, TILES.traversal, gradients=True) + 1)
     with pytest.raises(ValueError, match="entries of tile lists"):
         drgs.render(wide.replace(means=wide.means.clone().requires_grad_()), camera(64), TILES)
 

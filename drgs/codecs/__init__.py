@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 from drgs.codecs.codec import Codec
 from drgs.codecs.folders import file_of_folder, is_checkpoint, refuse_checkpoint
 from drgs.files import atomic_write, load_ply, save_ply
-from drgs.guards.arguments import ArgumentError
+from drgs.guards.arguments import ArgumentError, check_path
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.registry import Registry
 
@@ -80,7 +80,6 @@ def load_gaussians(path: str | os.PathLike, *, as_stored: bool = False) -> Gauss
         ValueError: If it is damaged, of another kind (which is named, with the way round), or holds values that are
             not finite (the first index is named).
     """
-    from drgs.guards.inputs import check_path
 
     path = check_path("load_gaussians", path)
     if path.is_dir():
@@ -132,13 +131,13 @@ def save_gaussians(
         ValueError: If the suffix is another one, a parameter is not finite (the first index is named), or the format
             cannot hold it.
     """
-    from drgs.guards.inputs import check_path, check_scene
+    from drgs.ellipsoids import check_gaussians
 
     if isinstance(g, str | os.PathLike):
         raise ArgumentError(
             "save_gaussians: gaussians must come first and the path second, got a path first; swap them"
         )
-    check_scene("save_gaussians", g, None)
+    check_gaussians("save_gaussians", g)
     path = check_path("save_gaussians", path)
     suffix = check_suffix("save_gaussians", path)
     if suffix == ".ply":

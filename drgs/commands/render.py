@@ -344,7 +344,7 @@ def _check_memory(cameras: list[Camera], settings: RenderSettings, formats: tupl
     pictures_need = max(memory.PICTURES.get(name, 0) for name in formats)
     where = f"view {largest.name!r}"
     what = f"its {largest.width}x{largest.height} pixels"
-    needed = memory.frame_bytes(pixels, settings, features)
+    needed = memory.frame_bytes(pixels, settings.traversal, features)
     if runtime.backend().name == "cuda":
         memory.require(where, needed, what, "lower --width or --height", cuda=True)
         needed = 0

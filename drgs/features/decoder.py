@@ -17,8 +17,8 @@ import torch
 
 from drgs.files import atomic_write
 from drgs.guards.archives import check_archive
+from drgs.guards.arguments import check_path
 from drgs.guards.foreign import refuse_foreign
-from drgs.guards.inputs import check_path
 
 __all__ = ["Decoder", "load_decoder", "save_decoder"]
 

@@ -6,11 +6,13 @@ import dataclasses
 import functools
 import math
 import numbers
+import os
 import typing
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
-__all__ = ["ArgumentError", "check_fields", "kind_of", "must_be"]
+__all__ = ["ArgumentError", "check_fields", "check_path", "kind_of", "must_be"]
 
 
 class ArgumentError(TypeError, ValueError):
@@ -47,6 +49,12 @@ def kind_of(value: Any) -> str:
     if isinstance(value, list | tuple) and value:
         return f"a {type(value).__name__} of {len(value)} ({', '.join(sorted({type(x).__name__ for x in value}))})"
     return f"a value of type {type(value).__name__}"
+
+
+def check_path(where: str, path: Any) -> Path:
+    """A file name as a Path."""
+    must_be(where, "path", path, (str, os.PathLike), 'a file name, e.g. "point_cloud.ply"')
+    return Path(path)
 
 
 def check_fields(

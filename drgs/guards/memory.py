@@ -5,10 +5,6 @@ from __future__ import annotations
 import os
 import resource
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from drgs.settings import RenderSettings
 
 __all__ = ["PAIR", "PICTURES", "TANGENT", "available", "frame_bytes", "is_out_of_memory", "of_card", "require"]
 
@@ -33,16 +29,16 @@ _OTHER = 256 << 20  # kernels, tensors of the Gaussians and whatever else a comm
 _SMALL = 256 << 20  # of what needs less, nobody asks: looking costs more than it is worth
 
 
-def frame_bytes(pixels: int, settings: RenderSettings, features: int = 0, gradients: bool = False) -> int:
+def frame_bytes(pixels: int, traversal: str, features: int = 0, gradients: bool = False) -> int:
     """Bytes that rendering an image takes at least, whatever it shows.
 
     Args:
         pixels: Number of pixels of the image.
-        settings: How it is rendered.
+        traversal: `RenderSettings.traversal`.
         features: Channels besides the colors.
         gradients: Whether it will be differentiated.
     """
-    each = _BVH if settings.traversal == "bvh" else _TILES
+    each = _BVH if traversal == "bvh" else _TILES
     return pixels * (each + _FEATURE * features + _GRADIENT * gradients)
 
 

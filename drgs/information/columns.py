@@ -10,10 +10,10 @@ import numpy as np
 import torch
 
 from drgs.guards.arguments import must_be
-from drgs.guards.inputs import check_view, gaussians_at
 from drgs.information.groups import groups_of, scene_groups
 from drgs.information.quantity import Quantity
 from drgs.integrator import render_jvp
+from drgs.tracing.inputs import check_view, gaussians_at
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

@@ -39,11 +39,11 @@ import torch
 from drgs.dynamics.jacobian import scene_jacobian
 from drgs.ellipsoids import DeformableScene
 from drgs.guards.arguments import must_be
-from drgs.guards.inputs import three_weights
 from drgs.information.choices import NETWORK_ESTIMATES, NetworkEstimate
 from drgs.information.complement import Eliminated
 from drgs.information.elimination import eliminated_of
 from drgs.information.hit_sums import HitSums
+from drgs.information.inputs import three_weights
 from drgs.information.jacobian import GEOMETRY
 from drgs.information.network_groups import NETWORK_GROUPS, network_groups
 from drgs.information.nuisances import NO_NUISANCES, Nuisances

@@ -199,7 +199,7 @@ class Call:
         size = f"{pixels} rays" if rays is not None else f"an image of {camera.width}x{camera.height} pixels"
         width = 0 if gaussians.features is None else gaussians.features.shape[1]
         gradients = torch.is_grad_enabled() and any(x.requires_grad for x in gaussians.parameters().values())
-        needed = memory.frame_bytes(pixels, self.settings, width, gradients)
+        needed = memory.frame_bytes(pixels, self.settings.traversal, width, gradients)
         memory.require("render", needed, size, "render a smaller one", self.home.type == "cuda")
 
     def _moving(self, lens: torch.Tensor) -> torch.Tensor:
