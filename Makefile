@@ -123,14 +123,14 @@ $(STAMP): $(BASE)
 
 # Not a stamp: a library can go away, and looking takes a few hundredths of a second. A CUDA card needs no libLLVM.
 llvm: $(BASE)
-	@$(BIN)/python -c 'from drgs.libllvm import require_llvm; require_llvm()' 2>/dev/null \
+	@$(BIN)/python -c 'from drgs.runtime.libllvm import require_llvm; require_llvm()' 2>/dev/null \
 	  || ldconfig -p 2>/dev/null | grep -q libcuda.so.1 \
 	  || $(MAKE) --no-print-directory install-llvm
 
 .PHONY: install-llvm
 install-llvm:
 	@set -e; \
-	error=$$($(BIN)/python -c 'from drgs.libllvm import require_llvm; require_llvm()' 2>&1 | tail -n 1 | sed 's/^[A-Za-z]*Error: //'); \
+	error=$$($(BIN)/python -c 'from drgs.runtime.libllvm import require_llvm; require_llvm()' 2>&1 | tail -n 1 | sed 's/^[A-Za-z]*Error: //'); \
 	root=none; \
 	if [ -z "$$DRJIT_LIBLLVM_PATH" ] && command -v apt-get >/dev/null; then \
 	  if [ "$$(id -u)" = 0 ]; then root=; \
@@ -142,4 +142,4 @@ install-llvm:
 	  if apt-cache show libllvm$$version >/dev/null 2>&1; then break; fi; \
 	done; \
 	$$root apt-get install -y libllvm$$version; \
-	$(BIN)/python -c 'from drgs.libllvm import require_llvm; print("libLLVM:", require_llvm().path)'
+	$(BIN)/python -c 'from drgs.runtime.libllvm import require_llvm; print("libLLVM:", require_llvm().path)'

@@ -122,7 +122,7 @@ def grown(count: int, width: int) -> int:
     """Bytes that a coupled `fast` frame and its gradients add to a process that has the Gaussians and the kernels."""
     code = (
         "import features\n"
-        "from drgs.machine import forget_peak_memory, peak_memory\n"
+        "from drgs.runtime.machine import forget_peak_memory, peak_memory\n"
         f"small, large = (features.frame(features.with_features(n, {width}), features.Preset('fast'), True)"
         f" for n in (100, {count}))\n"
         "small(); forget_peak_memory()\n"  # the peak is what there is now

@@ -30,7 +30,7 @@ from where import ran  # noqa: E402
 import drgs  # noqa: E402
 from drgs import fisher  # noqa: E402
 from drgs.gain import information_gain  # noqa: E402
-from drgs.machine import peak_memory  # noqa: E402
+from drgs.runtime.machine import peak_memory  # noqa: E402
 from drgs.select import select  # noqa: E402
 from drgs.studies.tables import paragraph  # noqa: E402
 

@@ -40,7 +40,7 @@ from studies import rank_correlation  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
 import drgs  # noqa: E402
-from drgs.machine import peak_memory  # noqa: E402
+from drgs.runtime.machine import peak_memory  # noqa: E402
 from drgs.studies.tables import fill_between, markdown_table, paragraph  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "planner.jsonl"

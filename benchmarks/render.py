@@ -29,7 +29,7 @@ from where import ran  # noqa: E402
 import drgs  # noqa: E402
 from drgs import runtime  # noqa: E402
 from drgs.ellipsoids import semi_axes  # noqa: E402
-from drgs.machine import peak_memory  # noqa: E402
+from drgs.runtime.machine import peak_memory  # noqa: E402
 from drgs.studies.tables import paragraph  # noqa: E402
 
 Preset = drgs.RenderSettings.preset

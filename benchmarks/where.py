@@ -7,7 +7,8 @@ import json
 import os
 from pathlib import Path
 
-from drgs import machine, runtime
+from drgs import runtime
+from drgs.runtime import machine
 
 __all__ = ["DATA", "ROOT", "UNITS", "add_row", "ran", "read_rows"]
 

@@ -24,7 +24,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from drgs import libllvm as _libllvm
+from drgs import runtime
 
 __version__ = "0.2.0"
 
@@ -56,52 +56,50 @@ _NAMES = {
     "save_ply": "files",
     "select_views": "select:select",
 }
-_MODULES = frozenset(
-    {
-        "cameras",
-        "cli",
-        "cluster",
-        "codecs",
-        "crossval",
-        "data",
-        "deform",
-        "display",
-        "dynamics",
-        "ellipsoids",
-        "evaluation",
-        "features",
-        "files",
-        "fisher",
-        "fitting",
-        "gain",
-        "guards",
-        "information",
-        "integrator",
-        "lab",
-        "ladder",
-        "meshing",
-        "metrics",
-        "oracle",
-        "planner",
-        "plugin",
-        "rasterize",
-        "reference",
-        "report",
-        "runtime",
-        "select",
-        "selection",
-        "settings",
-        "sharing",
-        "shutters",
-        "splats",
-        "studies",
-        "testing",
-        "tracing",
-        "train",
-        "viewing",
-        "volume",
-    }
-)
+# Module that is reached as `drgs.NAME` -> where it is.
+_MODULES = {
+    "cameras": "cameras",
+    "cli": "cli",
+    "cluster": "cluster",
+    "codecs": "codecs",
+    "crossval": "crossval",
+    "data": "data",
+    "deform": "deform",
+    "display": "display",
+    "dynamics": "dynamics",
+    "ellipsoids": "ellipsoids",
+    "evaluation": "evaluation",
+    "features": "features",
+    "files": "files",
+    "fisher": "fisher",
+    "fitting": "fitting",
+    "gain": "gain",
+    "guards": "guards",
+    "information": "information",
+    "integrator": "integrator",
+    "lab": "lab",
+    "ladder": "ladder",
+    "meshing": "meshing",
+    "metrics": "metrics",
+    "oracle": "oracle",
+    "planner": "planner",
+    "plugin": "plugin",
+    "rasterize": "rasterize",
+    "reference": "reference",
+    "report": "report",
+    "select": "select",
+    "selection": "selection",
+    "settings": "settings",
+    "sharing": "sharing",
+    "shutters": "shutters",
+    "splats": "splats",
+    "studies": "studies",
+    "testing": "testing",
+    "tracing": "tracing",
+    "train": "train",
+    "viewing": "viewing",
+    "volume": "oracle.volume",
+}
 
 __all__ = [
     "Camera",
@@ -145,7 +143,7 @@ if TYPE_CHECKING:
     from drgs import cluster as cluster
     from drgs import codecs as codecs
     from drgs import crossval as crossval
-    from drgs import data, deform, fisher, gain, reference, runtime, select
+    from drgs import data, deform, fisher, gain, reference, select
     from drgs import display as display
     from drgs import dynamics as dynamics
     from drgs import ellipsoids as ellipsoids
@@ -175,7 +173,6 @@ if TYPE_CHECKING:
     from drgs import tracing as tracing
     from drgs import train as train
     from drgs import viewing as viewing
-    from drgs import volume as volume
     from drgs.cameras import Camera
     from drgs.codecs import load_gaussians, save_gaussians
     from drgs.data import Dataset, View
@@ -187,6 +184,7 @@ if TYPE_CHECKING:
     from drgs.fitting.records import load_run
     from drgs.gain import Prior
     from drgs.integrator import render, render_jvp
+    from drgs.oracle import volume as volume
     from drgs.planner import Planner
     from drgs.rasterize import rasterization
     from drgs.select import Scoring, Selection
@@ -195,7 +193,7 @@ if TYPE_CHECKING:
     from drgs.train import FitConfig, SelectionConfig, fit
 
 # Before anything can import drjit: it loads libLLVM at once, and the wrong one aborts the process.
-_libllvm.prepare()
+runtime.prepare()
 
 
 def __getattr__(name: str) -> Any:
@@ -204,7 +202,7 @@ def __getattr__(name: str) -> Any:
         module, _, attribute = _NAMES[name].partition(":")
         value = getattr(importlib.import_module(f"drgs.{module}"), attribute or name)
     elif name in _MODULES:
-        value = importlib.import_module(f"drgs.{name}")
+        value = importlib.import_module(f"drgs.{_MODULES[name]}")
     else:
         raise AttributeError(f"module 'drgs' has no attribute {name!r}")
     globals()[name] = value

@@ -59,7 +59,7 @@ from drgs.guards import interrupts
 from drgs.guards.memory import is_out_of_memory
 from drgs.guards.outputs import claim
 from drgs.integrator import render
-from drgs.machine import peak_memory
+from drgs.runtime.machine import peak_memory
 
 if TYPE_CHECKING:
     from drgs.data import Dataset

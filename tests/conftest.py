@@ -20,7 +20,7 @@ from pathlib import Path
 
 import pytest
 
-from drgs.libllvm import prepare
+from drgs.runtime.libllvm import prepare
 
 prepare()  # tests may import drjit before drgs
 # Before torch or Dr.Jit is imported, and inherited by the processes that tests start. One thread: sums of several

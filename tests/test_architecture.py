@@ -19,9 +19,6 @@ PACKAGE = Path(__file__).parents[1] / "drgs"
 FLOORS: list[tuple[set[str], str]] = [
     (
         {
-            "libllvm",
-            "llvm_target",
-            "machine",
             "lenses",
             "shutters",
             "information.prior",
@@ -35,7 +32,7 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"guards.memory", "guards.camera_checks"}, "guards that know the machine or the settings"),
     ({"cameras", "ellipsoids", "sizes"}, "the two things that a view is made of, and how large it is looked at"),
     ({"splats"}, "cameras and Gaussians as tensors that make them"),
-    ({"oracle", "volume", "reference"}, "the truth: below the engine, so that it cannot borrow from what it checks"),
+    ({"oracle", "reference"}, "the truth: below the engine, so that it cannot borrow from what it checks"),
     ({"files", "display"}, "what is written, for machines and people"),
     ({"scenes"}, "made data sets, path traced by Mitsuba: they know nothing of Gaussians"),
     ({"codecs"}, "Gaussians in the formats of others"),

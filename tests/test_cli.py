@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from drgs import cli, libllvm
+from drgs import cli
+from drgs.runtime import libllvm
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -11,9 +11,10 @@ import pytest
 import torch
 from scenes_random import camera, gaussians
 
-from drgs import fisher, reference, settings
+from drgs import fisher, settings
 from drgs.guards import registry
 from drgs.integrator import render, render_jvp
+from drgs.oracle import reference
 from drgs.tracing.peak import Peak
 from drgs.tracing.responses import RESPONSES, response_of
 

@@ -23,7 +23,7 @@ import drgs
 from drgs import cli
 from drgs.cameras import orbit
 from drgs.fitting.config import SelectionConfig
-from drgs.libllvm import require_llvm
+from drgs.runtime.libllvm import require_llvm
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 UPSTREAM = EXAMPLES / "upstream"

@@ -15,11 +15,12 @@ import pytest
 import torch
 
 import drgs
-from drgs import cli, machine, runtime
+from drgs import cli, runtime
 from drgs.cameras import orbit
 from drgs.data.camera_lists import save_cameras_json
 from drgs.files import save_ply
 from drgs.guards import memory
+from drgs.runtime import machine
 from drgs.tracing import tiles
 
 TILES = drgs.RenderSettings.preset("fast")

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from drgs import libllvm, llvm_target, machine, runtime
+from drgs import runtime
+from drgs.runtime import libllvm, llvm_target, machine
 
 ROOT = Path(__file__).resolve().parent.parent
 MULTIARCH = libllvm._MULTIARCH
@@ -361,17 +362,17 @@ def test_info_is_json():
 
 def test_commit_is_dirty_by_code_alone(tmp_path, monkeypatch):
     """Rows that a study appends leave the commit as it is; a change of code shows."""
-    for name in ("drgs/machine.py", "rows.jsonl"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
+    for name in ("drgs/runtime/machine.py", "rows.jsonl"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("")
     git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
     for command in (["init", "-q"], ["add", "."], ["commit", "-qm", "all"]):
         subprocess.run([*git, *command], check=True)
-    monkeypatch.setattr(machine, "__file__", str(tmp_path / "drgs/machine.py"))
+    monkeypatch.setattr(machine, "__file__", str(tmp_path / "drgs/runtime/machine.py"))
     clean = machine.commit()
     (tmp_path / "rows.jsonl").write_text("{}")
     assert clean == machine.commit()
-    (tmp_path / "drgs/machine.py").write_text("x = 1")
+    (tmp_path / "drgs/runtime/machine.py").write_text("x = 1")
     assert machine.commit() == f"{clean}-dirty"
     assert re.fullmatch("[0-9a-f]{7,}", clean)
 

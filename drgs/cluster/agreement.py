@@ -11,7 +11,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from drgs import machine, runtime
+from drgs import runtime
+from drgs.runtime import machine
 
 __all__ = ["Disagreement", "check_agreement", "statement", "this_worker", "worker_name", "worker_statement"]
 

@@ -17,8 +17,8 @@ from drgs.display.progress import Bar
 from drgs.files import SCHEMA, atomic_write, write_json
 from drgs.guards.json_files import check_json, read_json
 from drgs.guards.outputs import claim
-from drgs.machine import commit, cpu_model
 from drgs.metrics import Lpips
+from drgs.runtime.machine import commit, cpu_model
 from drgs.studies.cells import run_cells
 from drgs.studies.plan import StudyPlan, plan_of
 from drgs.studies.results import results_page, results_rows

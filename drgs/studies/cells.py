@@ -28,8 +28,8 @@ from drgs.fitting.timetable import VIEWS_TO_ADD
 from drgs.guards.json_files import read_json
 from drgs.guards.locks import InUse
 from drgs.guards.writing import is_full
-from drgs.machine import forget_peak_memory
 from drgs.metrics import Lpips
+from drgs.runtime.machine import forget_peak_memory
 from drgs.studies.protocols import PROTOCOLS
 from drgs.studies.rows import Cell, append_row, is_done, read_study
 from drgs.studies.statistics import decided

@@ -1,7 +1,8 @@
 """Responses: what opacity a Gaussian has for a ray. peak.py, integral.py and ewa.py have the formulas of one each.
 
 A new one is a class that keeps the `Response` protocol and an instance of it in `RESPONSES`, here or from another
-package. What is to be checked has its equations in the float64 oracle (reference.py), written independently of this.
+package. What is to be checked has its equations in the float64 oracle (oracle/reference.py), written independently of
+this.
 """
 
 from __future__ import annotations

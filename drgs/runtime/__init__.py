@@ -27,9 +27,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
-from drgs import machine
-from drgs.libllvm import MINIMUM_LLVM, dotted, find_libraries, prepare, require_llvm
-from drgs.llvm_target import compile_for, compiled_for, missing_features
+from drgs.runtime import machine
+from drgs.runtime.libllvm import MINIMUM_LLVM, dotted, find_libraries, prepare, require_llvm
+from drgs.runtime.llvm_target import compile_for, compiled_for, missing_features
 
 if TYPE_CHECKING:
     import torch

@@ -27,7 +27,7 @@ def commit() -> str | None:
 
     None when installed. Results that a study has added to the checkout are no change of what it computes.
     """
-    root = Path(__file__).resolve().parent.parent
+    root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return None
     git = "git", "-C", str(root)
