@@ -16,11 +16,10 @@ from typing import Any, TypedDict
 
 import torch
 
-from drgs import runtime
 from drgs.cameras import Camera
 from drgs.ellipsoids import Y_00, Gaussians
 from drgs.guards.arguments import ArgumentError
-from drgs.guards.derivatives import check_has_numbers
+from drgs.guards.derivatives import check_has_numbers, unwrapped
 
 __all__ = [
     "SplatScene",
@@ -159,7 +158,7 @@ def cameras_of(
     """
     return [
         Camera(
-            **{"K": runtime.unwrapped(K, lambda K: K.cpu().double().numpy()), **lens},
+            **{"K": unwrapped(K, lambda K: K.cpu().double().numpy()), **lens},
             w2c=viewmat,
             width=width,
             height=height,

@@ -49,7 +49,7 @@ def as_numpy(value: Any) -> np.ndarray:
     """An array of what is an array, a list or a torch tensor (detached)."""
     if not is_tensor(value):
         return np.asarray(value)
-    from drgs.runtime import unwrapped
+    from drgs.guards.derivatives import unwrapped
 
     def array(x: Any) -> np.ndarray:
         # NumPy has no bfloat16, nor torch's floats of 8 bits; float32 has all of their values.

@@ -6,14 +6,24 @@ The renderer's derivatives are computed by Dr.Jit, once: torch sees numbers, not
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NoReturn
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn, TypeVar
 
 import torch
 
 from drgs.guards.arguments import ArgumentError
 
-__all__ = ["check_has_numbers", "check_unbatched", "ends_of", "first_only", "refuse_batched", "refuse_meta"]
+__all__ = [
+    "check_has_numbers",
+    "check_unbatched",
+    "ends_of",
+    "first_only",
+    "refuse_batched",
+    "refuse_meta",
+    "unwrapped",
+]
+
+_Result = TypeVar("_Result")
 
 Derivatives = tuple[torch.Tensor | None, ...]
 
@@ -86,6 +96,21 @@ def check_unbatched(where: str, x: torch.Tensor) -> None:
         if functorch.is_batchedtensor(x):
             refuse_batched(where)
         x = functorch.get_unwrapped(x)
+
+
+def unwrapped(x: torch.Tensor, convert: Callable[[torch.Tensor], _Result]) -> _Result:
+    """`convert` of the values of a torch tensor, below any wrapper of `torch.func`, without a graph.
+
+    Raises:
+        NotImplementedError: If one of the wrappers is a batch of `torch.func.vmap`.
+    """
+    check_unbatched("render", x)
+    functorch = torch._C._functorch
+    # Otherwise every operation wraps its result again.
+    with torch._C._DisableFuncTorch():
+        while functorch.is_functorch_wrapped_tensor(x):
+            x = functorch.get_unwrapped(x)
+        return convert(x.detach())  # numpy takes no tensor with a graph
 
 
 def refuse_batched(where: str) -> NoReturn:

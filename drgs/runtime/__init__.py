@@ -25,14 +25,11 @@ import typing
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from drgs.runtime import machine
 from drgs.runtime.libllvm import MINIMUM_LLVM, dotted, find_libraries, prepare, require_llvm
 from drgs.runtime.llvm_target import compile_for, compiled_for, missing_features
-
-if TYPE_CHECKING:
-    import torch
 
 __all__ = [
     "VARIANTS",
@@ -250,25 +247,6 @@ def _refuse_fork() -> None:
             f"process {os.getpid()} forked from {_owner}; use multiprocessing.get_context('spawn'), or fork before the "
             "first render"
         )
-
-
-def unwrapped(x: torch.Tensor, convert: Callable[[torch.Tensor], _Result]) -> _Result:
-    """`convert` of the values of a torch tensor, below any wrapper of `torch.func`, without a graph.
-
-    Raises:
-        NotImplementedError: If one of the wrappers is a batch of `torch.func.vmap`.
-    """
-    import torch
-
-    from drgs.guards.derivatives import check_unbatched
-
-    check_unbatched("render", x)
-    functorch = torch._C._functorch
-    # Otherwise every operation wraps its result again.
-    with torch._C._DisableFuncTorch():
-        while functorch.is_functorch_wrapped_tensor(x):
-            x = functorch.get_unwrapped(x)
-        return convert(x.detach())  # numpy takes no tensor with a graph
 
 
 def setup(variant: str | None = None, threads: int | None = None) -> Backend:

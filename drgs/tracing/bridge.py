@@ -13,7 +13,7 @@ import drjit as dr
 import torch
 
 from drgs import runtime
-from drgs.guards.derivatives import first_only, refuse_batched
+from drgs.guards.derivatives import first_only, refuse_batched, unwrapped
 
 if TYPE_CHECKING:
     from drgs.tracing.call import Call
@@ -133,4 +133,4 @@ class _Functional(torch.autograd.Function):
 
 def _plain(lib: ModuleType, x: torch.Tensor) -> Any:
     """The values below any `torch.func` wrapper, as a Dr.Jit tensor."""
-    return runtime.unwrapped(x, lambda values: to_drjit(lib, values))
+    return unwrapped(x, lambda values: to_drjit(lib, values))

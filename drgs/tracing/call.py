@@ -13,7 +13,7 @@ from drgs.cameras import Camera
 from drgs.ellipsoids import DeformableScene, Gaussians
 from drgs.guards import memory
 from drgs.guards.arguments import ArgumentError, kind_of, must_be
-from drgs.guards.derivatives import check_has_numbers
+from drgs.guards.derivatives import check_has_numbers, unwrapped
 from drgs.settings import EPS_ALPHA, RenderSettings
 from drgs.tracing import projection
 from drgs.tracing.arrays import UInt32
@@ -250,9 +250,7 @@ class Call:
         self._set_rays(o, d)
         # Where rays are is a number: lists have no derivative.
         seen_from = shifted(pose, self.origin).reshape(3, 4)
-        o, d, known, seen_from = (
-            runtime.unwrapped(x.detach(), lambda x: x.cpu().numpy()) for x in (o, d, known, seen_from)
-        )
+        o, d, known, seen_from = (unwrapped(x.detach(), lambda x: x.cpu().numpy()) for x in (o, d, known, seen_from))
         if not known.all():
             self.holes = self.lib.UInt32(known[:, 0].astype(np.uint32))
             d = np.where(known, d, np.nan)
