@@ -60,12 +60,14 @@ class LensModel:
 
 def distort_opencv(plane: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
     """Image-plane points (P,2) through OpenCV's radial, tangential and thin-prism model."""
-    return np.stack(distorted(*plane.T, distortion), axis=-1)
+    x, y = plane.T
+    return np.stack(distorted(x, y, distortion), axis=-1)
 
 
 def distorted(x: Any, y: Any, distortion: tuple) -> tuple[Any, Any]:
     """Both coordinates of `distort_opencv`; of arrays, or of tensors, whose graph is kept."""
-    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = (*distortion, *([0.0] * (12 - len(distortion))))
+    coefficients = [*distortion, *[0.0] * (12 - len(distortion))]
+    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = coefficients
     r2 = x * x + y * y
     radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
     moved_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
@@ -232,7 +234,8 @@ def _equirectangular_project(local: np.ndarray, distortion: tuple[float, ...]) -
 
 
 def _equirectangular_unproject(plane: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
-    return np.stack(equirectangular(*plane.T, np), axis=-1)
+    x, y = plane.T
+    return np.stack(equirectangular(x, y, np), axis=-1)
 
 
 LENS_MODELS: dict[str, LensModel] = {

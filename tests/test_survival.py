@@ -148,7 +148,11 @@ def test_a_command_without_memory_says_so(tmp_path, monkeypatch, capsys):
         assert capsys.readouterr().err == (
             "drgs eval: there must be more memory, none was left; free some, or ask for smaller views\n"
         )
-    monkeypatch.setattr("drgs.evaluation.evaluate", lambda *_, **__: (_ for _ in ()).throw(RuntimeError("a bug")))
+
+    def broken(*_, **__):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr("drgs.evaluation.evaluate", broken)
     with pytest.raises(RuntimeError, match="a bug"):
         cli.main(["eval", str(tmp_path / "run"), "--quiet"])
 
