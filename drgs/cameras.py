@@ -70,8 +70,9 @@ _ROUNDING = 1e-14  # of a float64 rotation; what is less orthonormal was rounded
 # An undistorted pixel must come back to itself; beyond this many pixels the lens model has no inverse there.
 _INVERSE_TOLERANCE = 1e-3
 _SHOWN = 80  # characters of a name in messages
-_SHUTTER_ROUNDS = 30  # of pose and line in turn, at most, until a point is on the line that sees it:
-_SAME_LINE = 1e-8  # of a line, between two rounds
+# Which line of a rolling shutter sees a point is solved by turns: pose of the line, line of the projection.
+_SHUTTER_ROUNDS = 30  # at most
+_SAME_LINE = 1e-8  # lines; a smaller change between two rounds ends them
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ __all__ = [
 ]
 
 _STEPS = 30  # of Newton's, at most
-_FLAT = 1e-6  # a slope below stands for this one: what it leads to is found to be no inverse
+_FLAT = 1e-6  # smallest slope of a Newton step; `Camera` warns of a result that does not project back
 _CONVERGED = 1e-14  # radians; the next step of Newton's is far below the rounding of float64
 Guide = Literal["plane", "fisheye", "panorama"]
 """Where the silhouette of an ellipsoid is bounded (drgs/tracing/silhouettes.py): on the plane z = 1, under the

@@ -204,7 +204,7 @@ class RenderSettings:
         for name in ("fast", *PRESETS):
             preset = {**defaults, **_TABLE[name], "background": self.background}
             differences[name] = {x: getattr(self, x) for x in defaults if getattr(self, x) != preset[x]}
-        return min(differences.items(), key=lambda found: len(found[1]))
+        return min(differences.items(), key=lambda item: len(item[1]))
 
     def replace(self, **fields: Any) -> RenderSettings:
         """A copy with the given fields replaced; unknown names raise ValueError."""

@@ -1,4 +1,4 @@
-"""The parts of a file that torch writes, compared with the file before torch reads it."""
+"""Files of `torch.save`: zip archives whose entries are compared with the file's size before torch reads them."""
 
 from __future__ import annotations
 
@@ -7,28 +7,28 @@ from pathlib import Path
 
 __all__ = ["check_archive"]
 
-_SHOWN = 120  # characters of a part's name
+_SHOWN = 120  # characters of an entry's name in a message
 
 
 def check_archive(path: Path) -> None:
-    """Refuse a file of `torch.save` that ends early, or has parts that are compressed or claim more than the file.
+    """Raise ValueError for a file that ends early, or has entries that are compressed or claim more than the file.
 
-    Mapped, the bytes of compressed parts would be taken for numbers; torch allocates what a part claims.
+    Mapped, the bytes of a compressed entry would be taken for numbers; torch allocates what an entry claims.
     """
     size = path.stat().st_size
     try:
         with zipfile.ZipFile(path) as archive:
-            parts = archive.infolist()
+            entries = archive.infolist()
     except Exception:  # zipfile raises whatever the damage leads to
         raise ValueError(f"{path}: must be a whole file, got one without its index; copy it again") from None
-    for part in parts:
-        if part.compress_type != zipfile.ZIP_STORED:
+    for entry in entries:
+        if entry.compress_type != zipfile.ZIP_STORED:
             raise ValueError(
-                f"{path}: must hold tensors as they are, {part.filename[:_SHOWN]!r} is compressed; save it with "
+                f"{path}: must hold tensors as they are, {entry.filename[:_SHOWN]!r} is compressed; save it with "
                 "torch.save"
             )
-        if part.file_size > size:
+        if entry.file_size > size:
             raise ValueError(
-                f"{path}: must be a whole file, {part.filename[:_SHOWN]!r} claims {part.file_size} bytes of {size}; "
+                f"{path}: must be a whole file, {entry.filename[:_SHOWN]!r} claims {entry.file_size} bytes of {size}; "
                 "copy it again"
             )

@@ -41,7 +41,7 @@ _TURN_MAX = math.radians(170)  # of a camera within an exposure
 
 
 def is_tensor(value: Any) -> bool:
-    """Whether a value is a torch tensor, told without importing torch."""
+    """Whether a value is a torch tensor, without importing torch."""
     return hasattr(value, "detach")
 
 

@@ -139,7 +139,7 @@ def ends_of(x: torch.Tensor) -> tuple[float, float]:
 
 
 def refuse_meta(where: str, name: str, x: torch.Tensor) -> None:
-    """The first of these."""
+    """Raise `ArgumentError` for a tensor on the device `meta`, which has no numbers."""
     if x.device.type == "meta":
         raise ArgumentError(
             f"{where}: {name} must have numbers, got a tensor of shape {tuple(x.shape)} on the device meta, which has "

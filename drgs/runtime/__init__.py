@@ -169,7 +169,7 @@ def _take_over() -> None:
 # the garbage collector does not run by itself while something is computed, and nothing is computed while it runs.
 
 _is_paused = False  # the garbage collector, by a computation
-_COLLECTS = 10.0  # seconds that the garbage collector waits for another thread, whatever that is waiting for
+_COLLECTS = 10.0  # seconds, at most, that the garbage collector waits for the thread that computes
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""What computes: the processor, the card, and the commit of the checkout, for `drgs info` and env.json."""
+"""The processor, the card, the memory and the commit of the checkout, for `drgs info` and env.json."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["commit", "cpu_model", "forget_peak_memory", "gpu_name", "peak_memory
 
 
 def cpu_model() -> str:
-    """As the system names it."""
+    """Name of the processor, as the system gives it."""
     try:
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
