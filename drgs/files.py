@@ -23,7 +23,7 @@ from drgs.guards.arguments import ArgumentError, check_path
 from drgs.guards.foreign import refuse_foreign
 from drgs.guards.json_files import parse_json, read_json
 from drgs.guards.ply_headers import EXTRA, extra_kind, is_antialiased, ply_source, read_ply_header
-from drgs.guards.writing import append_line
+from drgs.io.journal import SCHEMA, Journal, check_schema
 
 if TYPE_CHECKING:
     import torch
@@ -44,8 +44,6 @@ __all__ = [
     "write_json",
 ]
 
-SCHEMA = 1
-"""Version of log.jsonl, metrics.json, state.safetensors and what commands write; raised when a reader must change."""
 CONFIG_SCHEMA = 2
 """Version of config.json. Of version 1, which is read too, the fields of a fit stand beside each other, those of its
 selection under `active`; of version 2 they are nested by subject."""
@@ -337,12 +335,7 @@ def _opened_state(path: Path) -> Iterator[tuple[Any, dict]]:
     try:
         with safe_open(str(path), "pt") as file:
             header = parse_json((file.metadata() or {}).get("drgs", "{}"), str(path))
-            schema = header.get("schema") if isinstance(header, dict) else None
-            if schema != SCHEMA:
-                raise ValueError(
-                    f"{path}: checkpoint schema must be {SCHEMA}, got {repr(schema)[:40]}; fit into another run "
-                    "folder (-o)"
-                )
+            check_schema(path, header, (SCHEMA,), "checkpoint schema", "fit into another run folder (-o)")
             yield file, header
     except (SafetensorError, struct.error) as error:
         text = " ".join(str(error).split())
@@ -392,7 +385,6 @@ class Run:
         if self.path.exists() and not self.path.is_dir():
             raise ValueError(f"{self.path}: must be a folder, is a file; choose another")
         self.path.mkdir(parents=True, exist_ok=True)
-        self._drop_partial_line()
         self.record(config)
         write_json(self.path / "env.json", {"schema": SCHEMA, **runtime.info()})
 
@@ -411,31 +403,23 @@ class Run:
         if not path.is_file():
             raise FileNotFoundError(f"{self.path}: must be a run folder, found no config.json; run `drgs fit` first")
         config = read_json(path, "a run's config.json", "fit again in another folder")
-        schema = config.get("schema") if isinstance(config, dict) else None
-        if isinstance(schema, bool) or schema not in (SCHEMA, CONFIG_SCHEMA):
-            got = schema if isinstance(config, dict) else type(config).__name__
-            raise ValueError(
-                f"{path}: schema must be {SCHEMA} or {CONFIG_SCHEMA}, got {repr(got)[:40]}; fit again in another folder"
-            )
+        check_schema(path, config, (SCHEMA, CONFIG_SCHEMA), "schema", "fit again in another folder")
         return config
 
+    @property
+    def journal(self) -> Journal:
+        """`log.jsonl`."""
+        return Journal(self.path / "log.jsonl", _jsonable)
+
     def log(self, event: str, **fields: Any) -> None:
-        """Append one event to `log.jsonl` in one write: a killed run leaves at most one partial last line."""
+        """Append one event to `log.jsonl`."""
         now = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
-        line = {"schema": SCHEMA, "time": now, "event": event, **fields}
-        append_line(self.path / "log.jsonl", line, default=_jsonable)
+        self.journal.append({"schema": SCHEMA, "time": now, "event": event, **fields})
 
     def events(self) -> list[dict]:
-        """The events of `log.jsonl`; a partial last line is left out.
+        """The events of `log.jsonl`.
 
         Raises:
             ValueError: If a line is no JSON.
         """
-        path = self.path / "log.jsonl"
-        lines = path.read_bytes().split(b"\n")[:-1] if path.exists() else []
-        return [parse_json(line, f"{path}, line {number}") for number, line in enumerate(lines, 1)]
-
-    def _drop_partial_line(self) -> None:
-        path = self.path / "log.jsonl"
-        if path.exists() and not (data := path.read_bytes()).endswith(b"\n"):
-            os.truncate(path, data.rfind(b"\n") + 1)
+        return self.journal.rows()

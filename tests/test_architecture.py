@@ -26,7 +26,7 @@ FLOORS: list[tuple[set[str], str]] = [
         },
         "know nothing of the rest: plain data, or math",
     ),
-    ({"guards", "display.progress", "display.tables"}, "refuse bad input, show progress: needed from everywhere"),
+    ({"guards", "io", "display.progress", "display.tables"}, "refuse bad input, show progress: needed from everywhere"),
     ({"information.criteria", "information.choices"}, "what views can be judged and chosen by, by name"),
     ({"settings", "runtime"}, "what a render can be asked for, and the machine it runs on"),
     ({"guards.memory", "guards.camera_checks"}, "guards that know the machine or the settings"),

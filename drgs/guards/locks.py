@@ -1,4 +1,10 @@
-"""One writer a folder: a lock file that names its process, and is taken over from a process that no longer runs."""
+"""One writer a folder: a lock file that names its process, and is taken over from a process that no longer runs.
+
+`filelock` is not used: its lock is the system's (`flock`), which says neither which command on which machine holds it
+nor, on file systems of a network, anything about other machines; its lock that is a file stays after a crash. Here a
+process that died on this machine is recognized by its number and the time at which it began, and one of another machine
+is named and never overruled. `exclusive` is the system's lock, for the instant in which a file is changed.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +18,7 @@ from pathlib import Path
 
 from drgs.guards.json_files import parse_json
 
-__all__ = ["NAME", "InUse", "acquire", "host_of", "release"]
+__all__ = ["NAME", "InUse", "acquire", "exclusive", "host_of", "release"]
 
 NAME = ".drgs.lock"
 """Name of the lock in the folder that is being written."""
@@ -137,18 +143,34 @@ def _started(pid: object) -> str | None:
 
 
 @contextlib.contextmanager
-def _one_at_a_time(folder: Path) -> Iterator[None]:
-    """Let one process of this machine in: else two that find the same stale lock might each remove the other's new one.
+def exclusive(handle: int) -> Iterator[None]:
+    """Let one process of this machine at a time into the block, by the system's lock of an open file or folder, which
+    ends with the process. On a file system that has no such locks nothing is locked.
+    """
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        yield
+        return
+    is_locked = False
+    with contextlib.suppress(OSError):
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        is_locked = True
+    try:
+        yield
+    finally:
+        if is_locked:
+            fcntl.flock(handle, fcntl.LOCK_UN)
 
-    Only processes of this machine may remove a lock, so that this is enough; other machines are kept out by the
-    exclusive creation of the file.
+
+@contextlib.contextmanager
+def _one_at_a_time(folder: Path) -> Iterator[None]:
+    """Else two that find the same stale lock might each remove the other's new one. Only processes of this machine may
+    remove a lock, so that this is enough; other machines are kept out by the exclusive creation of the file.
     """
     handle = os.open(folder, os.O_RDONLY)
     try:
-        with contextlib.suppress(OSError, ImportError):  # a file system without it
-            import fcntl
-
-            fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
+        with exclusive(handle):
+            yield
     finally:
         os.close(handle)

@@ -19,8 +19,8 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from drgs.guards import locks, unfinished
-from drgs.guards.json_files import parse_json
-from drgs.guards.writing import append_line, named
+from drgs.guards.writing import named
+from drgs.io.journal import Journal
 
 __all__ = [
     "Claim",
@@ -119,7 +119,7 @@ class Claim:
         if known.get(row["sha256"]) == row["command"]:
             return
         known[row["sha256"]] = row["command"]
-        append_line(self.path / JOURNAL, row)
+        Journal(self.path / JOURNAL).append(row)
 
     def adopt(self, names: Iterable[str], command: str) -> None:
         """Take what is there for a command's own, where there is no record: a copy without hidden files."""
@@ -206,17 +206,9 @@ class Claim:
     def _read(self) -> None:
         """Read the journal, and shorten it to what is still so."""
         path = self.path / JOURNAL
-        if not path.exists():
-            return
-        rows = []
-        for line in path.read_bytes().splitlines():
-            with contextlib.suppress(ValueError, TypeError, KeyError):  # a killed process leaves half a line
-                row = parse_json(line, str(path))
-                file, digest, command = (row[key] for key in ("file", "sha256", "command"))
-                if not all(isinstance(x, str) and "\0" not in x for x in (file, digest, command)):
-                    continue  # edited: no row of ours
-                rows.append(row)
-                self._made.setdefault(file, {})[digest] = command
+        rows = Journal(path).rows(_check_row, skip_damaged=True)  # an edited row is none of ours
+        for row in rows:
+            self._made.setdefault(row["file"], {})[row["sha256"]] = row["command"]
         if len(rows) > 2 * len(self._made) + 100:
             kept = [row for row in rows if _is_there(self.path / row["file"], row["sha256"])]
             with replacing(path, claimed=False) as name:
@@ -356,6 +348,13 @@ def _locked(folder: Path, path: Path, command: str, held: Claim | None) -> Claim
             raise _unwritable(folder, error) from None
         raise
     return made
+
+
+def _check_row(row: dict) -> None:
+    """Raise unless it is a row that `Claim.record` wrote."""
+    for key in ("file", "sha256", "command"):
+        if not isinstance(row[key], str) or "\0" in row[key]:
+            raise ValueError(f"{key} must be a text")
 
 
 def _make(folder: Path, path: Path) -> list[Path]:

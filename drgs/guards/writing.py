@@ -1,39 +1,17 @@
-"""Writing where there may be no room or no permission: errors that name the file, and lines that are whole."""
+"""Writing where there may be no room or no permission: errors that name the file."""
 
 from __future__ import annotations
 
 import errno
-import json
 import os
 import shutil
 from pathlib import Path
-from typing import Any
 
-__all__ = ["append_line", "check_room", "is_full", "named"]
+__all__ = ["check_room", "is_full", "named"]
 
 _FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 _CLOSED = (errno.EACCES, errno.EPERM, errno.EROFS)
 _LEAST_ROOM = 1e6  # bytes that a library's database or log takes before it holds anything
-
-
-def append_line(path: Path, value: dict, **options: Any) -> None:
-    """Append a JSON object to a file of lines in one write: a process that is killed leaves at most half of the last.
-
-    Args:
-        path: The file.
-        value, options: What `json.dumps` takes.
-    Raises:
-        OSError: If there is no room for all of it, which leaves the file as it was, or no permission.
-    """
-    line = json.dumps(value, **options).encode() + b"\n"
-    try:
-        with path.open("ab", buffering=0) as file:
-            whole = file.tell()
-            if file.write(line) < len(line):  # as much as there was room for
-                file.truncate(whole)
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    except OSError as error:
-        raise named(path, error) from None
 
 
 def named(path: Path, error: OSError) -> OSError:

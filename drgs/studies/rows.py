@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from drgs.fitting.config import Start
-from drgs.guards.writing import named
+from drgs.io.journal import Journal
 
 __all__ = ["Cell", "append_row", "cell_of", "is_done", "read_study"]
 
@@ -60,29 +57,13 @@ def cell_of(row: Mapping[str, Any]) -> tuple[str, Cell]:
 
 
 def read_study(*paths: Path) -> list[dict]:
-    """The rows of JSON-lines files, merged by cell; of two rows of one cell the later one counts.
-
-    A last line that a killed process left half written is left out, as is a file that is not there.
+    """The rows of JSON-lines files (`drgs.io.journal`), merged by cell; of two rows of one cell the later one counts.
 
     Raises:
-        ValueError: If another line is damaged.
+        ValueError: If a line is damaged.
     """
-    rows = {}
-    for path in paths:
-        lines = path.read_bytes().split(b"\n") if path.exists() else []
-        for number, line in enumerate(lines, 1):
-            if not line.strip():
-                continue
-            try:
-                row = json.loads(line)
-                rows[cell_of(row)] = row
-            except (ValueError, KeyError, TypeError) as error:
-                if number == len(lines):  # every whole line ends with a newline
-                    continue
-                raise ValueError(
-                    f"{path}: line {number} must be a row of a study, is not ({error}); remove it"
-                ) from None
-    return list(rows.values())
+    rows = [row for path in paths for row in Journal(path).rows(cell_of, "a row of a study")]
+    return list({cell_of(row): row for row in rows}.values())
 
 
 def is_done(study: str, cell: Cell, rows: Iterable[Mapping[str, Any]], keys: Iterable[str]) -> bool:
@@ -94,28 +75,4 @@ def is_done(study: str, cell: Cell, rows: Iterable[Mapping[str, Any]], keys: Ite
 def append_row(path: Path, row: Mapping[str, Any]) -> None:
     """Add a row to a file that other processes add to as well, unless one that says as much of its cell is there."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with _alone(path) as file:
-        if is_done(*cell_of(row), read_study(path), row["metrics"]):
-            return
-        file.seek(0)
-        whole = file.read().rfind(b"\n") + 1
-        file.truncate(whole)  # a killed process may have left half a line
-        try:
-            file.write(json.dumps(row).encode() + b"\n")
-            file.flush()
-            os.fsync(file.fileno())
-        except OSError as error:
-            with suppress(OSError):
-                os.truncate(path, whole)
-            raise named(path, error) from None
-
-
-@contextmanager
-def _alone(path: Path) -> Iterator[Any]:
-    """A file, opened for reading and appending, locked against the other processes that do the same."""
-    with path.open("a+b") as file:
-        with suppress(OSError, ImportError):  # a file system without it
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX)
-        yield file
+    Journal(path, durable=True).append(row, unless=lambda rows: is_done(*cell_of(row), rows, row["metrics"]))
