@@ -30,7 +30,8 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 from studies import write_csv  # noqa: E402
 from where import DATA, add_row, ran, read_rows  # noqa: E402
 
-from drgs.commands import capture  # noqa: E402
+from drgs.capturing import fit as capture_fit  # noqa: E402
+from drgs.commands.capture import capture_photographs  # noqa: E402
 from drgs.commands.making_options import Capture  # noqa: E402
 from drgs.data import load  # noqa: E402
 from drgs.data.checks import list_images  # noqa: E402
@@ -48,7 +49,7 @@ CONFIG = FitConfig.of(max_steps=400, max_pixels=12_000, max_gaussians=8_000, exp
 
 def measure(count: int, folder: Path) -> None:
     """All ways of one split."""
-    capture._ANEW = float("inf")
+    capture_fit.NEW_FIT_SHARE = float("inf")
     photographs = list_images(DATA / "banana" / "images")
     more = tuple(photographs[k] for k in JOINING[count])
     first = tuple(path for path in photographs if path not in more)
@@ -71,11 +72,11 @@ def measure(count: int, folder: Path) -> None:
         print(row, flush=True)
 
     began = time.process_time()
-    capture.capture_photographs(Capture(paths=first, output=run, quiet=True), CONFIG)
+    capture_photographs(Capture(paths=first, output=run, quiet=True), CONFIG)
     added("first", run, began)
     shutil.copytree(run, folder / "before", symlinks=True, ignore=shutil.ignore_patterns(".drgs.lock"))
     began = time.process_time()
-    capture.capture_photographs(Capture(paths=more, output=run, add=True, quiet=True), CONFIG)
+    capture_photographs(Capture(paths=more, output=run, add=True, quiet=True), CONFIG)
     added("joined", run, began)
     config = recorded_config(Run(run).config()["fit"])
     for steps in ANEW:

@@ -21,10 +21,10 @@ import pytest
 import torch
 
 from drgs import cli
-from drgs.capturing import diagnosis, plan
-from drgs.capturing.pace import FEWEST_STEPS, Pacer
+from drgs.capturing import budget, diagnosis
+from drgs.capturing import fit as capture_fit
+from drgs.capturing.budget import FEWEST_STEPS, Pacer
 from drgs.capturing.record import CaptureRecord
-from drgs.commands import capture
 from drgs.commands.capture import capture_photographs, run
 from drgs.commands.making_options import Capture
 from drgs.data import load
@@ -261,7 +261,7 @@ def test_further_photographs_end_with_the_same_bits(joined, captured, tmp_path):
 @pytest.mark.slow
 def test_many_that_join_are_fitted_anew(captured, photographs, tmp_path, monkeypatch, capsys):
     """With all steps, from points, and a line says so; the checkpoint of before does not stay behind."""
-    monkeypatch.setattr(capture, "_ANEW", 0.3)
+    monkeypatch.setattr(capture_fit, "NEW_FIT_SHARE", 0.3)
     folder = tmp_path / "run"
     shutil.copytree(captured, folder, symlinks=True)
     run(Capture(output=folder, paths=(photographs / "more",), add=True))
@@ -453,7 +453,7 @@ def test_a_view_that_nothing_else_shows(rng):
 # ------------------------------------------------------------------------------------------------- budget
 
 
-class MadeStopwatch(plan.Stopwatch):
+class MadeStopwatch(budget.Stopwatch):
     """A machine of a given speed, whose clock moves by what is timed on it."""
 
     def __init__(self, speed: float) -> None:
@@ -484,7 +484,7 @@ def test_a_plan_fits_its_budget(speed):
     sizes = []
     for left in (60, 300, 1200, 7200):
         watch = MadeStopwatch(speed)
-        found = plan.plan_fit(large_views(), FitConfig(), left, stopwatch=watch)
+        found = budget.plan_fit(large_views(), FitConfig(), left, stopwatch=watch)
         each = watch.seconds(found.max_pixels, found.max_gaussians)
         assert found.seconds == pytest.approx(found.max_steps * each)
         used = watch.time + found.seconds + found.after
@@ -498,7 +498,7 @@ def test_a_plan_fits_its_budget(speed):
 
 def test_a_plan_leaves_gaussians_where_they_are():
     """Of a fit that goes on there are at least as many as before."""
-    found = plan.plan_fit(large_views(), FitConfig(), 60, least=50_000, stopwatch=MadeStopwatch(1.0))
+    found = budget.plan_fit(large_views(), FitConfig(), 60, least=50_000, stopwatch=MadeStopwatch(1.0))
     assert found.max_gaussians == 50_000
 
 
@@ -520,25 +520,27 @@ def test_a_fit_keeps_to_its_budget(slower):
 
 def test_a_budget_that_is_not_enough(photographs):
     """The plan says what it takes instead, and a fit that begins too late has its fewest steps, not one."""
-    poses = plan.PosePlan(480, 240.0)
-    assert plan.planned_poses(poses, 292, 50.0, 60.0) == (
+    poses = budget.PosePlan(480, 240.0)
+    assert budget.planned_poses(poses, 292, 50.0, 60.0) == (
         "60 s are not enough: poses of 292 photographs take about 4 min even at 480 pixels, and the smallest fit "
         "follows; --budget 10min leaves time for a fit, fewer photographs take less"
     )
-    enough = plan.planned_poses(poses, 292, 590.0, 600.0)
+    enough = budget.planned_poses(poses, 292, 590.0, 600.0)
     assert enough.startswith(
         "plan for 10 min: 292 photographs at 480 pixels for poses, about 4 min; then a fit as large"
     )
-    late = plan.plan_fit(large_views(), FitConfig(), -239.0, stopwatch=MadeStopwatch(1.0))
+    late = budget.plan_fit(large_views(), FitConfig(), -239.0, stopwatch=MadeStopwatch(1.0))
     assert late.max_steps == FEWEST_STEPS
     told = late.line(-239.0, 299.0)
     assert told.startswith(
         "the budget is used up: the smallest fit has 100 steps at 12000 pixels with up to 8000 Gauss"
     )
-    assert told.endswith(f"about {plan.duration(299.0 + late.seconds + late.after)} in all")
+    assert told.endswith(f"about {budget.duration(299.0 + late.seconds + late.after)} in all")
     assert late.line(5.0, 55.0).startswith("only 5 s of the budget are left: the smallest fit has 100 steps")
     assert (
-        plan.FitPlan(12_000, 8_000, 600, 30.0, 9.0).line(45.0, 15.0).startswith("plan for the 45 s left: 600 steps at")
+        budget.FitPlan(12_000, 8_000, 600, 30.0, 9.0)
+        .line(45.0, 15.0)
+        .startswith("plan for the 45 s left: 600 steps at")
     )
     now, done, total = 0.0, 0, late.max_steps
     pacer = Pacer(-239.0, late.max_steps, lambda: now)
@@ -550,11 +552,11 @@ def test_a_budget_that_is_not_enough(photographs):
 
 def test_poses_are_planned(photographs):
     """Smaller photographs in less time, and more time for more of them."""
-    few = plan._pose_seconds(10, 1.0, 0.1, 1.0)
-    assert plan._pose_seconds(50, 1.0, 0.1, 1.0) > 5 * few
-    assert plan._pose_seconds(10, 1.0, 0.1, 0.5) < few
+    few = budget._pose_seconds(10, 1.0, 0.1, 1.0)
+    assert budget._pose_seconds(50, 1.0, 0.1, 1.0) > 5 * few
+    assert budget._pose_seconds(10, 1.0, 0.1, 0.5) < few
     names = [f"IMG_{index}.png" for index in range(6)]
-    found = plan.plan_poses(photographs / "first", names, 1e6)
+    found = budget.plan_poses(photographs / "first", names, 1e6)
     assert found.max_image_size == 320  # the photographs' own
 
 
@@ -566,17 +568,17 @@ def test_frames_are_planned(tmp_path):
     for index in range(30):
         writer.write(np.ascontiguousarray(image[:, index : index + 96]))
     writer.release()
-    assert plan.plan_frames(video, 0, 150, 1e7) == 150
-    assert plan.plan_frames(video, 0, 150, 1e-3) == 20
-    assert plan.plan_frames(video, 0, 8, 1e-3) == 8
+    assert budget.plan_frames(video, 0, 150, 1e7) == 150
+    assert budget.plan_frames(video, 0, 150, 1e-3) == 20
+    assert budget.plan_frames(video, 0, 8, 1e-3) == 8
 
 
 @pytest.mark.parametrize(("text", "seconds"), [("90s", 90), ("10min", 600), ("1.5h", 5400), (" 2 m ", 120)])
 def test_budgets(text, seconds):
-    assert plan.seconds_of_budget(text) == seconds
+    assert budget.seconds_of_budget(text) == seconds
 
 
 @pytest.mark.parametrize("text", ["10", "ten minutes", "5s", "-3min", "1e9h", ""])
 def test_bad_budgets(text):
     with pytest.raises(ValueError, match="--budget must be"):
-        plan.seconds_of_budget(text)
+        budget.seconds_of_budget(text)

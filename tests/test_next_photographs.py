@@ -16,8 +16,8 @@ from viewing_client import Client
 import drgs
 from drgs import cli
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, look_at
+from drgs.capturing.next_views import rank_next
 from drgs.capturing.places import Place, meters_of, places_around, told_length
-from drgs.commands.next_views import rank_next
 from drgs.commands.options import View
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewed import subject_of

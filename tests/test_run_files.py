@@ -150,11 +150,11 @@ def test_fisher(place):
 
 
 _WRITERS = {
+    "capturing/next_views.py": {"next.json"},
     "capturing/record.py": {"capture.json"},
     "commands/crossval.py": {"crossval.json"},
     "commands/demo.py": {"demo.json"},
     "commands/fisher.py": {"fisher.json"},
-    "commands/next_views.py": {"next.json"},
     "commands/query.py": {"query.json"},
     "commands/render.py": {"render.json"},
     "commands/reproduce.py": {"reproduce.json"},  # and data.json, a map

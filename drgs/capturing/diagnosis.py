@@ -8,7 +8,7 @@ structure from motion knows no meters.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -46,18 +46,21 @@ _SPACED = 40  # photographs that say how far apart they usually are
 _LOWERED = 1.0  # dB by which a single view lowers the mean of all, that are worth telling
 
 
-def of_photographs(folder: Path, names: Sequence[str]) -> list[Finding]:
+def of_photographs(
+    folder: Path, names: Sequence[str], decode: Callable[[Path], np.ndarray] = read_image
+) -> list[Finding]:
     """Blurred and dark photographs.
 
     Args:
         folder, names: The photographs, in the order in which they were taken.
+        decode: As `drgs.data.checks.read_image`.
     """
     import cv2
 
     sharp, gray = [], []
     with Bar("sharpness", len(names)) as bar:
         for name in names:
-            image = read_image(folder / name)
+            image = decode(folder / name)
             plain = image if image.ndim == 2 else np.ascontiguousarray(image[..., :3]).mean(axis=2)
             plain = (plain / (255.0 if image.dtype == np.uint8 else 65535.0)).astype(np.float32)
             scale = _WIDTH / max(plain.shape)

@@ -16,14 +16,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from drgs.cameras import Camera, intrinsics_from_fov, look_at, orbit
 from drgs.commands.orbit_keys import UP, parsed_orbit
 from drgs.data.capture import Focus, path, upright
-from drgs.integrator import render
-from drgs.settings import RenderSettings
-from drgs.sizes import at_most
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -31,7 +27,7 @@ if TYPE_CHECKING:
     from drgs.commands.option_groups import Around
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["Wish", "capture_orbit", "dome", "scene_orbit", "seen_distance"]
+__all__ = ["Wish", "capture_orbit", "dome", "scene_orbit"]
 
 _ELEVATION = 20.0
 _FOV = 45.0
@@ -41,9 +37,6 @@ _FAR = 3.0  # times the median distance from the center: beyond are floaters and
 _INSIDE = 0.998  # share of the rest that every frame shows
 _MARGIN = 1.1
 _SOLID = 0.05  # opacity below which a Gaussian is no part of the shape
-_PROBE_PIXELS = 2_500  # of a picture that says how far away what a camera sees is
-_OPAQUE = 0.5
-_NEARER = 0.25  # quantile of its distances: what is photographed stands before a background
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -207,26 +200,6 @@ def dome(circle: list[Camera], count: int) -> list[Camera]:
     return [
         dataclasses.replace(circle[0], w2c=camera.w2c, name=f"dome_{index:04d}") for index, camera in enumerate(made)
     ]
-
-
-def seen_distance(gaussians: Gaussians) -> Callable[[Camera], float | None]:
-    """A function that tells how far away what a camera looks at is: the nearer quarter of the distances in the middle
-    of its picture, in scene units, or None where it sees nothing.
-    """
-
-    fast = RenderSettings.preset("fast")
-
-    def distance(camera: Camera) -> float | None:
-        small = at_most(camera.undistorted(), _PROBE_PIXELS)
-        with torch.no_grad():  # looked at, not optimized
-            out = render(gaussians, small, fast, ("depth",))
-        rows, columns = (slice(n // 4, n - n // 4) for n in (small.height, small.width))
-        depth = out.depth[rows, columns].cpu().numpy()
-        alpha = out.alpha[rows, columns].cpu().numpy()
-        solid = alpha > _OPAQUE
-        return float(np.quantile(depth[solid], _NEARER)) if solid.any() else None
-
-    return distance
 
 
 def _shape(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

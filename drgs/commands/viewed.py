@@ -9,7 +9,7 @@ import numpy as np
 
 from drgs.commands.fisher import asked_blocks
 from drgs.commands.orbit_keys import UP
-from drgs.commands.orbits import Wish, capture_orbit, scene_orbit, seen_distance
+from drgs.commands.orbits import Wish, capture_orbit, scene_orbit
 from drgs.commands.painters import PAINTINGS, painters
 from drgs.commands.viewpoints import Known, Source, known_views
 from drgs.data import View as DataView
@@ -20,6 +20,7 @@ from drgs.fitting.records import fitted_views
 from drgs.guards.foreign import refuse_foreign
 from drgs.information.blocks import MAP_PRIOR
 from drgs.information.sums import together
+from drgs.meshing.depths import seen_distance
 from drgs.viewing.client import pose_of
 from drgs.viewing.layers import Uncertainty, layers_of
 from drgs.viewing.placed_views import NEXT, PlacedView, Ranking, placed_views_of, read_ranking

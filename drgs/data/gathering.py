@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from drgs.data.checks import IMAGE_SUFFIXES, list_images
+from drgs.data.checks import IMAGE_SUFFIXES, list_images, read_image
 from drgs.data.photo_files import entry_fault, leave_out, link_or_copy, usable_photos
 from drgs.data.shooting import Finding
 from drgs.data.video_frames import Picked, examine
@@ -102,7 +102,12 @@ def named_files(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
 
 
 def usable_files(
-    photographs: Sequence[Path], videos: Sequence[Path], where: Path, fewest: int, max_image_size: int = 1600
+    photographs: Sequence[Path],
+    videos: Sequence[Path],
+    where: Path,
+    fewest: int,
+    max_image_size: int = 1600,
+    decode: Callable[[Path], np.ndarray] = read_image,
 ) -> tuple[list[Path], list[Path]]:
     """Those photographs and videos that can be used; all photographs are decoded. The log names the others.
 
@@ -111,11 +116,12 @@ def usable_files(
         where: What was named, for the message.
         fewest: How many photographs there must be where there are no videos.
         max_image_size: Pixels on the longer side that features are found at; 0 for the photographs' own.
+        decode: As `drgs.data.checks.read_image`, which it may keep the pictures of.
     Raises:
         ValueError: Fewer are left; the message says what is wrong with the first of the others.
     """
     videos = leave_out(videos, _video_fault, where, 0 if photographs else 1, "videos")
-    return usable_photos(photographs, where, 0 if videos else fewest, max_image_size), videos
+    return usable_photos(photographs, where, 0 if videos else fewest, max_image_size, decode), videos
 
 
 def _video_fault(path: Path) -> str:

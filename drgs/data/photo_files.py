@@ -6,7 +6,6 @@ feature is looked for.
 
 from __future__ import annotations
 
-import functools
 import logging
 import re
 import shutil
@@ -36,7 +35,10 @@ _SHOWN = 5  # names that a message repeats
 _FAULTS = 20  # photographs that the log says what is wrong with
 _SMALLEST = 16  # pixels: COLMAP 4's detector with affine shapes crashes over images with 15 rows or columns
 
+_KNOWN = 4096  # photographs of which is remembered what decoding them has shown
+
 _log = logging.getLogger(__name__)
+_decoded: dict[tuple[Path, int, int], tuple[int, int] | str] = {}  # by file, size in bytes and time of change
 
 
 def check_names(folder: Path, names: Sequence[str], masked: bool = False) -> None:
@@ -59,7 +61,13 @@ def check_names(folder: Path, names: Sequence[str], masked: bool = False) -> Non
         _log.warning("%s: %d hidden photos are left out (%s); rename them to use them", folder, len(hidden), shown)
 
 
-def usable_photos(photos: Sequence[Path], where: Path, fewest: int = 0, max_image_size: int = 1600) -> list[Path]:
+def usable_photos(
+    photos: Sequence[Path],
+    where: Path,
+    fewest: int = 0,
+    max_image_size: int = 1600,
+    decode: Callable[[Path], np.ndarray] = read_image,
+) -> list[Path]:
     """Those photographs that features can be found in; all are decoded. The log names the others.
 
     Args:
@@ -67,11 +75,12 @@ def usable_photos(photos: Sequence[Path], where: Path, fewest: int = 0, max_imag
         where: What was named, for the message.
         fewest: How many there must be.
         max_image_size: Pixels on the longer side that features are found at; 0 for the photographs' own.
+        decode: As `read_image`, which it may keep the pictures of.
     Raises:
         ValueError: The package that reads one is missing, or fewer are left; the message then says what is wrong with
             the first of the others.
     """
-    return leave_out(photos, lambda photo: photo_fault(photo, max_image_size), where, fewest)
+    return leave_out(photos, lambda photo: photo_fault(photo, max_image_size, decode), where, fewest)
 
 
 def leave_out(
@@ -116,12 +125,13 @@ def entry_fault(path: Path) -> str:
     return f"{path}: must be a file, is {kind}; restore or remove it"
 
 
-def photo_fault(path: Path, max_image_size: int = 1600) -> str:
+def photo_fault(path: Path, max_image_size: int = 1600, decode: Callable[[Path], np.ndarray] = read_image) -> str:
     """Why features cannot be found in a photograph, a line that names it; empty where they can. It is decoded, once.
 
     Args:
         path: The photograph.
         max_image_size: Pixels on the longer side that features are found at; 0 for its own.
+        decode: As `read_image`.
     Raises:
         MissingReader: The package that reads it is missing.
     """
@@ -129,7 +139,12 @@ def photo_fault(path: Path, max_image_size: int = 1600) -> str:
         return fault
     path = own_file(path)
     status = path.stat()
-    found = _decoded(path, status.st_size, status.st_mtime_ns)
+    key = path, status.st_size, status.st_mtime_ns
+    if key not in _decoded:
+        while len(_decoded) >= _KNOWN:
+            _decoded.pop(next(iter(_decoded)))
+        _decoded[key] = _size_or_fault(path, decode)
+    found = _decoded[key]
     if isinstance(found, str):
         return found
     shrunk = min(1.0, max_image_size / max(found)) if max_image_size else 1.0
@@ -141,11 +156,10 @@ def photo_fault(path: Path, max_image_size: int = 1600) -> str:
     return ""
 
 
-@functools.lru_cache(maxsize=4096)
-def _decoded(path: Path, size: int, changed: int) -> tuple[int, int] | str:
-    """(width, height) of a photograph that can be decoded, else what the reader says. Kept until the file changes."""
+def _size_or_fault(path: Path, decode: Callable[[Path], np.ndarray]) -> tuple[int, int] | str:
+    """(width, height) of a photograph that can be decoded, else what the reader says."""
     try:
-        height, width = read_image(path).shape[:2]
+        height, width = decode(path).shape[:2]
     except MissingReader:
         raise
     except (ValueError, OSError) as error:

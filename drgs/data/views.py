@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -44,6 +45,7 @@ class View:
             else empty.
         frame: The frame of a video, where the photograph is one; `image_path` is None then.
         keeps_lens: Images and what belongs to them are as they were taken, of `camera` itself, not undistorted.
+        decode: Decodes the image file, as `drgs.data.checks.read_image`; a capture's keeps what it has decoded.
         is_checked: False while the camera's size is what the camera file states and no image has been opened.
     """
 
@@ -63,6 +65,7 @@ class View:
     frame: VideoFrame | None = None
     keeps_lens: bool = False
     empty_outside: bool = True
+    decode: Callable[[Path], np.ndarray] = dataclasses.field(default=read_image, repr=False, compare=False)
 
     @property
     def shown_camera(self) -> Camera:
@@ -125,7 +128,7 @@ class View:
             data = self.frame.read()
             path = self.frame.path
         elif self.image_path is not None:
-            data = read_image(self.image_path)
+            data = self.decode(self.image_path)
             path = self.image_path
         else:
             raise ValueError(f"view {self.name!r}: must have an image, has none; drop this view")

@@ -10,17 +10,21 @@ import numpy as np
 import torch
 
 from drgs.integrator import render
+from drgs.settings import RenderSettings
+from drgs.sizes import at_most
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
     from drgs.meshing.options import DepthKind
-    from drgs.settings import RenderSettings
 
-__all__ = ["DepthView", "depth_views", "footprint"]
+__all__ = ["DepthView", "depth_views", "footprint", "seen_distance"]
 
 _SOLID = 0.5  # alpha from which on a pixel shows a surface: the median of its depth exists
 _LEAST_COSINE = 0.05  # between a ray and a surface; beyond 87 degrees the normal of a depth image says nothing
+_PROBE_PIXELS = 2_500  # of a picture that says how far away what a camera looks at is: it is looked at, not shown
+_OPAQUE = 0.5  # alpha from which on something is seen
+_NEARER = 0.25  # quantile of its depths: what is photographed stands before a background
 _SMALLEST = 1e-30  # of numbers that a logarithm is taken of
 
 
@@ -114,3 +118,22 @@ def footprint(views: Sequence[DepthView]) -> float | None:
             widths.append(float(np.median(solid)) * float(np.linalg.norm(rays[row, column] - other)))
     positive = [width for width in widths if width > 0]
     return float(np.median(positive)) if positive else None
+
+
+def seen_distance(gaussians: Gaussians) -> Callable[[Camera], float | None]:
+    """A function of a pinhole or distorted camera: the distance, in scene units, of what it looks at (the nearer
+    quarter of the depths in the middle of its picture), or None where it sees nothing.
+    """
+    fast = RenderSettings.preset("fast")
+
+    def distance(camera: Camera) -> float | None:
+        small = at_most(camera.undistorted(), _PROBE_PIXELS)
+        with torch.no_grad():  # looked at, not optimized
+            out = render(gaussians, small, fast, ("depth",))
+        rows, columns = (slice(n // 4, n - n // 4) for n in (small.height, small.width))
+        depth = out.depth[rows, columns].cpu().numpy()
+        alpha = out.alpha[rows, columns].cpu().numpy()
+        solid = alpha > _OPAQUE
+        return float(np.quantile(depth[solid], _NEARER)) if solid.any() else None
+
+    return distance

@@ -1,6 +1,7 @@
 """A scene as one HTML file that opens from disk, drawn by a viewer from npm.
 
-write       the page of a scene, gathered and written
+scene       what the page of a run or of a file shows
+write       the page, written
 gaussians   its Gaussians, as an archive of SOG
 layers      what is known of each of them: class, uncertainty, where it is at other times
 placing     where the page's camera stands

@@ -14,13 +14,13 @@ import logging
 import math
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.capturing.pace import FEWEST_STEPS
 from drgs.data.checks import image_size, read_image
 from drgs.data.matching import extract, match, quiet, start_extraction
 from drgs.data.pairing import MAX_EXHAUSTIVE
@@ -36,7 +36,9 @@ if TYPE_CHECKING:
     from drgs.data import Dataset, View
 
 __all__ = [
+    "FEWEST_STEPS",
     "FitPlan",
+    "Pacer",
     "PosePlan",
     "Stopwatch",
     "duration",
@@ -46,6 +48,16 @@ __all__ = [
     "planned_poses",
     "seconds_of_budget",
 ]
+
+FEWEST_STEPS = 100
+"""Steps that a fit has, however little time is left: with fewer there is nothing to look at."""
+
+_EVERY = 20  # steps between two looks at the clock
+_RECENT = 60  # steps whose time is that of those to come: five cycles of the renderers' longest one
+_FIRST_LOOK = 40  # steps before the first look: renderers compile in their first ones
+_GROWN = 0.5  # share of the steps from which on there are as many Gaussians as there will be (`grow_until`)
+_WORTH = 0.03  # of the steps; a smaller change is none
+_MOST = 4.0  # times the planned steps, however fast they turn out to be: timed beside other programs they are too slow
 
 _UNITS = {"s": 1.0, "sec": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 _LEAST = 30.0  # seconds: less is not even enough to start all parts
@@ -130,6 +142,46 @@ class FitPlan:
         return f"{left_of_it}: the smallest fit has {size}, about {duration(used + needed)} in all"
 
 
+class Pacer:
+    """How many steps a fit is to have so that the last one is done in time; what `drgs.train.fit` takes as `pace`.
+
+    While Gaussians still grow in number, later steps take longer than those seen so far: steps are only taken away
+    then, where even these are too slow. After that their number follows the clock in both directions, up to 4 times
+    what was planned. Schedules of a fit go by the share of its steps that is done, so that they end where they should.
+
+    Args:
+        end: Time at which the last step is to be done, as `clock` counts.
+        planned: Steps that were planned.
+        clock: Seconds of a clock that never goes back.
+    """
+
+    def __init__(self, end: float, planned: int, clock: Callable[[], float] = time.monotonic) -> None:
+        self._end = end
+        self._most = round(_MOST * planned)
+        self._clock = clock
+        self._marks: deque[tuple[int, float]] = deque(maxlen=_RECENT)
+        self._first: int | None = None
+
+    def __call__(self, done: int, total: int) -> int:
+        """Steps of the whole fit.
+
+        Args:
+            done: Steps that are done.
+            total: Steps that the fit has so far.
+        """
+        now = self._clock()
+        if self._first is None:
+            self._first = done
+        self._marks.append((done, now))
+        if done - self._first < _FIRST_LOOK or done % _EVERY or done >= total:
+            return total
+        first, began = self._marks[0]
+        each = (now - began) / (done - first)
+        there = max(done + max(1, int((self._end - now) / max(each, 1e-9))), min(total, FEWEST_STEPS))
+        wanted = min(there, total if done < _GROWN * total else max(total, self._most))
+        return wanted if abs(wanted - total) > _WORTH * total or wanted <= done + _EVERY < total else total
+
+
 def seconds_of_budget(text: str) -> float:
     """Seconds of `90s`, `10min`, `1.5h`.
 
@@ -152,17 +204,20 @@ def duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-def plan_poses(folder: Path, names: Sequence[str], budget: float) -> PosePlan:
+def plan_poses(
+    folder: Path, names: Sequence[str], budget: float, decode: Callable[[Path], np.ndarray] = read_image
+) -> PosePlan:
     """How large photographs may be looked at, from what two of them take.
 
     Args:
         folder, names: The photographs, at least two.
         budget: Seconds of the whole capture.
+        decode: As `drgs.data.checks.read_image`.
     """
     largest = max(image_size(folder / names[0]))
     chosen = [names[len(names) // 3], names[min(len(names) // 3 + 1, len(names) - 1)]]
     with Bar("how long poses will take"):
-        features, pair = _timed_pair([read_image(folder / name) for name in chosen])
+        features, pair = _timed_pair([decode(folder / name) for name in chosen])
     measured = min(_FIRST_SIZE, largest)
     sizes = [size for size in _IMAGE_SIZES if size < largest]
     sizes = [*sizes[: len(_IMAGE_SIZES)], *([largest] if largest <= _IMAGE_SIZES[0] else [])]

@@ -11,19 +11,20 @@ import numpy as np
 import torch
 
 from drgs.capturing.places import Place, meters_of, places_around
-from drgs.commands.orbits import seen_distance
-from drgs.commands.scene_input import SceneInput
 from drgs.data.camera_lists import described
 from drgs.data.capture import upright
 from drgs.display.progress import Bar
-from drgs.files import SCHEMA, write_json
+from drgs.files import SCHEMA, Run, write_json
 from drgs.fitting.frames import load_dataset
-from drgs.fitting.records import fitted_views
+from drgs.fitting.records import fitted_views, load_run
 from drgs.guards.outputs import claim
 from drgs.information.scoring import Scoring
+from drgs.information.semantics import SemanticMetric
 from drgs.integrator import render
+from drgs.meshing.depths import seen_distance
 from drgs.select import select
 from drgs.selection.cache import Cache
+from drgs.settings import RenderSettings
 from drgs.sizes import at_most
 from drgs.viewing.placed_views import NEXT
 
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.data import View
     from drgs.ellipsoids import Gaussians
-    from drgs.settings import RenderSettings
 
 __all__ = ["rank_next"]
 
@@ -59,50 +59,44 @@ def rank_next(run: Path, k: int, length: str | None, show: bool = True) -> list[
         FileNotFoundError: If it is no run, or its data set has gone.
         ValueError: If things move, the photographs say nothing of where one can stand, or `length` is wrong.
     """
+    folder = Run(run)
     with claim(run, "capture", [NEXT]), Bar("next photographs", show=show) as bar:
-        given = SceneInput.at(run)
-        assert given.record is not None
-        assert given.run is not None
-        if given.moving is not None:
+        loaded = load_run(folder)
+        record = loaded.record
+        if loaded.moving is not None:
             raise ValueError(f"{run}: --more must have a scene that stands still, this one moves; use drgs select")
-        given.record.check_data(run)
-        dataset = load_dataset(given.record.data, given.record.config, lazy=True, points=False, semantics=False)
-        views = given.record.with_refined_poses(dataset).views
-        cameras = {view.name: _camera(view, given) for view in views}
+        record.check_data(run)
+        dataset = load_dataset(record.data, record.config, lazy=True, points=False, semantics=False)
+        pixels = min(_PIXELS, record.config.data.max_pixels)
+        cameras = {view.name: _camera(view, pixels) for view in record.with_refined_poses(dataset).views}
         meters = None if length is None else meters_of(length, {name: x.center for name, x in cameras.items()})
-        train = [cameras[name] for name in fitted_views(given.run, given.record) if name in cameras]
-        up = upright(list(cameras.values()))
-        obstacles = _solid(given.gaussians, train)
-        places = places_around(list(cameras.values()), up, seen_distance(given.gaussians), obstacles)
-        settings = given.settings("fast")
-        # What looks past the scene would tell most, of what nobody wants to see.
-        most = _EMPTY + max(_empty_share(given.gaussians, camera, settings) for camera in train)
-        places = [place for place in places if _empty_share(given.gaussians, place.camera, settings) <= most]
+        train = [cameras[name] for name in fitted_views(folder, record) if name in cameras]
+        settings = RenderSettings.preset("fast")
+        places = _places(loaded.gaussians, list(cameras.values()), train, settings)
         if not places:
             raise ValueError(f"{run}: there must be a place to stand at, found none that is free; use drgs select")
-        scoring = Scoring(settings=settings, semantics=given.semantics()).over(given.estimated)
-        cache = Cache()
-        told = len(train) + len(places)
-        bar.update(0, told)
-        count = min(k, len(places))
-        found = select(
-            given.scene,
+        metric = None if loaded.decoder is None else SemanticMetric(loaded.decoder.metric())
+        scoring, cache = Scoring(settings=settings, semantics=metric).over(record.estimated), Cache()
+        bar.update(0, len(train) + len(places))
+        ranked = select(
+            loaded.scene,
             [place.camera for place in places],
             train,
-            count,
+            min(k, len(places)),
             scoring=scoring,
             cache=cache,
             progress=bar.update,
         )
+        # What one of the photographs that are there adds to all others, on average.
         usual = statistics.mean(
-            select(given.scene, [one], [x for x in train if x is not one], 1, scoring=scoring, cache=cache).scores[0]
+            select(loaded.scene, [one], [x for x in train if x is not one], 1, scoring=scoring, cache=cache).scores[0]
             for one in train[:: -(-len(train) // _MOST_PHOTOGRAPHS)]
         )
         rows = [{"index": i, "name": place.camera.name} for i, place in enumerate(places)]
-        after = [_told(place, meters) for place in places]
+        after = [_place_json(place, meters) for place in places]
         picks = [
             {"rank": rank, **pick, "gain": pick["score"] / usual if usual > 0 else None}
-            for rank, pick in enumerate(found.picks_json(rows, after), 1)
+            for rank, pick in enumerate(ranked.picks_json(rows, after), 1)
         ]
         write_json(
             run / NEXT,
@@ -114,14 +108,23 @@ def rank_next(run: Path, k: int, length: str | None, show: bool = True) -> list[
                 "known": [camera.name for camera in train],
                 "meters": meters,
                 "picks": picks,
-                "candidates": found.candidates_json(rows, after),
-                "seconds": found.seconds,
+                "candidates": ranked.candidates_json(rows, after),
+                "seconds": ranked.seconds,
             },
         )
     return picks
 
 
-def _told(place: Place, meters: float | None) -> dict[str, Any]:
+def _places(gaussians: Gaussians, cameras: list[Camera], train: list[Camera], settings: RenderSettings) -> list[Place]:
+    """Places where a person can stand, and from which there is not more emptiness than in the photographs."""
+    obstacles = _solid(gaussians, train)
+    places = places_around(cameras, upright(cameras), seen_distance(gaussians), obstacles)
+    # What looks past the scene would tell most, of what nobody wants to see.
+    most = _EMPTY + max(_empty_share(gaussians, camera, settings) for camera in train)
+    return [place for place in places if _empty_share(gaussians, place.camera, settings) <= most]
+
+
+def _place_json(place: Place, meters: float | None) -> dict[str, Any]:
     """What a file says of a place."""
     return {
         "base": place.base,
@@ -131,10 +134,8 @@ def _told(place: Place, meters: float | None) -> dict[str, Any]:
     }
 
 
-def _camera(view: View, given: SceneInput) -> Camera:
-    """The pinhole camera of a photograph, reduced."""
-    assert given.record is not None
-    pixels = min(_PIXELS, given.record.config.data.max_pixels)
+def _camera(view: View, pixels: int) -> Camera:
+    """The pinhole camera of a photograph, of at most so many pixels."""
     return at_most(dataclasses.replace(view.camera.undistorted(), name=view.name), pixels)
 
 

@@ -1,0 +1,213 @@
+"""What the page of a scene shows: its Gaussians, the photographs' cameras, where it is uncertain, its classes."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from drgs.data.capture import Focus, upright
+from drgs.fitting.records import fitted_views, load_run
+from drgs.fitting.renderers import VIEWERS, planar_of
+from drgs.information.nuisances import Nuisances
+from drgs.meshing.depths import seen_distance
+from drgs.report.pictures import spread
+from drgs.sharing.layers import classes_layer, uncertainty_of
+from drgs.sharing.write import Shared
+from drgs.sizes import at_most
+from drgs.viewing.placed_views import NEXT, Ranking, placed_views_of, read_ranking
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.data import Dataset
+    from drgs.ellipsoids import Gaussians
+    from drgs.files import Run
+    from drgs.fitting.records import LoadedRun
+    from drgs.sharing.placing import PhotoKind
+
+__all__ = ["FILE", "MOMENTS", "scene_of_file", "scene_of_run"]
+
+FILE = "scene.html"
+"""The page in a run folder."""
+
+MOMENTS = 12
+"""Times at which a scene that moves is stored, where nobody says."""
+
+_UP = np.array((0.0, -1.0, 0.0))  # as COLMAP's worlds stand, where no photographs say
+_COUNTED = 24  # photographs whose information is added up; of more, these stand for all, as in the report
+_INFO_PIXELS = 30_000  # of each of them
+
+_log = logging.getLogger(__name__)
+
+
+def scene_of_file(
+    gaussians: Gaussians,
+    title: str,
+    around: Callable[[Gaussians], Camera],
+    ranking: Ranking | None = None,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Shared:
+    """What the page of Gaussians without photographs shows.
+
+    Args:
+        gaussians: At least one.
+        title: Name of the scene.
+        around: A camera that sees all of it, where a ranking has no cameras.
+        ranking: Photographs to take next.
+        background: RGB in [0, 1].
+    """
+    shown = gaussians.replace(features=None).detach()
+    return _shared(shown, title, [f"{len(gaussians):,} Gaussians."], _cameras([], (), ranking), around, background)
+
+
+def scene_of_run(
+    run: Run,
+    dataset: Dataset | None,
+    *,
+    loaded: LoadedRun | None = None,
+    ranking: Ranking | None = None,
+    around: Callable[[Gaussians], Camera] | None = None,
+    moments: int = MOMENTS,
+    uncertainty: bool = True,
+) -> Shared:
+    """What the page of a fit shows.
+
+    Args:
+        run: The run folder.
+        dataset: The data set that was fitted, with the poses that the fit has found; None where it has gone.
+        loaded: What the run holds, where it has been read already.
+        ranking: Photographs to take next; default those of the run.
+        around: A camera that sees all of it, where there are no others.
+        moments: Number of times at which what moves is stored, at most.
+        uncertainty: Whether to add what the photographs leave uncertain.
+    Raises:
+        FileNotFoundError, ValueError: If the run is none, damaged, or has no Gaussians.
+    """
+    loaded = loaded or load_run(run)
+    if not len(loaded.gaussians):
+        raise ValueError(f"{run.path}: there must be at least one Gaussian, got none; fit longer, or name another")
+    record, moving = loaded.record, loaded.moving
+    times = _times(loaded, moments)
+    # The page itself says when what is there for a time is there.
+    gaussians = loaded.gaussians if moving is None else moving.without_lives().at(times[0])
+    names = fitted_views(run, record)
+    views, fitted_names = ([], []) if dataset is None else (dataset.views, names)
+    cameras = _cameras(views, fitted_names, ranking or _ranking_of(run, loaded))
+    fitted = [camera for kind, camera in cameras if kind == "fitted"]
+    return dataclasses.replace(
+        _shared(
+            gaussians.replace(features=None).detach(),
+            run.path.resolve().name,
+            _lines(run, loaded, len(names)),
+            cameras,
+            around,
+            record.config.settings.background,
+        ),
+        uncertainty=_uncertainty(loaded, fitted) if uncertainty else None,
+        classes=_classes(loaded),
+        moving=moving,
+        times=times,
+    )
+
+
+def _shared(
+    gaussians: Gaussians,
+    title: str,
+    lines: Sequence[str],
+    cameras: list[tuple[PhotoKind, Camera]],
+    around: Callable[[Gaussians], Camera] | None,
+    background: tuple[float, float, float],
+) -> Shared:
+    """A scene, looked at from where its photographs were taken."""
+    fitted = [camera for kind, camera in cameras if kind == "fitted"]
+    target, up = None, _UP
+    if fitted:
+        up = upright(fitted)
+        focus = Focus.of(fitted, None, seen_distance(gaussians))
+        target = None if focus is None else focus.center
+    if not cameras:
+        if around is None:
+            raise ValueError(f"{title}: there must be a camera that sees the scene, got none; restore its data set")
+        cameras = [("other", dataclasses.replace(around(gaussians), name="all of it"))]
+    return Shared(
+        title=title,
+        lines=lines,
+        gaussians=gaussians,
+        cameras=cameras,
+        target=_ahead(gaussians, cameras[0][1]) if target is None else target,
+        up=up,
+        background=background,
+    )
+
+
+def _ranking_of(run: Run, loaded: LoadedRun) -> Ranking | None:
+    """Views that an active fit chose, or places of next photographs; None where the run has neither."""
+    path = run.path / ("selection.json" if loaded.record.is_active else NEXT)
+    return read_ranking(path) if path.is_file() else None
+
+
+def _lines(run: Run, loaded: LoadedRun, photographs: int) -> list[str]:
+    """What a page says of its scene; what does not carry over is said in the log, too."""
+    config = loaded.record.config
+    lines = [f"{len(loaded.gaussians):,} Gaussians, fitted to {photographs:,} photographs."]
+    if not planar_of(config.renderers, config.settings):
+        text = f"fitted for {', '.join(config.renderers)} alone; pages draw as {VIEWERS} does, where it may look worse"
+        _log.warning("%s: %s: fit with --for any or --for viewers (docs/one-model.md)", run.path, text)
+        lines.append(text[0].upper() + text[1:] + ".")
+    return lines
+
+
+def _classes(loaded: LoadedRun) -> tuple[dict[str, Any], np.ndarray] | None:
+    """Names, colors and each Gaussian's class; None where they have none."""
+    features, classes, decoder = loaded.gaussians.features, loaded.classes, loaded.decoder
+    if features is None or decoder is None or classes is None or classes.embeddings is None:
+        return None
+    return classes_layer(features, classes, decoder)
+
+
+def _cameras(views: Sequence, names: Sequence[str], ranking: Ranking | None) -> list[tuple[PhotoKind, Camera]]:
+    """Cameras of the photographs that a run was fitted to, and of those to take next; none where nobody knows."""
+    placed = placed_views_of(views, names, ranking)
+    fitted = [place.camera for place in placed if place.kind == "training"]
+    picks = {place.best.pick: place.best.camera for place in placed if place.kind != "training" and place.best.pick}
+    following = [dataclasses.replace(picks[k], name=f"{k}. {picks[k].name}") for k in sorted(picks)]
+    ordered: list[tuple[PhotoKind, Camera]] = [("fitted", camera) for camera in sorted(fitted, key=lambda x: x.name)]
+    return ordered + [("next", camera) for camera in following]
+
+
+def _times(loaded: LoadedRun, count: int) -> tuple[float, ...]:
+    """At most so many times, from the first to the last; none where nothing moves."""
+    if loaded.moving is None:
+        return ()
+    low, high = (float(x) for x in loaded.moving.field.grid.span)
+    known = loaded.record.times
+    if known:
+        if len(known) <= count:
+            return known
+        low, high = known[0], known[-1]
+    return tuple(float(x) for x in np.linspace(low, high, count))
+
+
+def _uncertainty(loaded: LoadedRun, fitted: list[Camera]) -> np.ndarray | None:
+    """(N,) what the photographs leave uncertain of where each Gaussian is, in scene units."""
+    if loaded.moving is not None:
+        fitted = [camera for camera in fitted if camera.time is not None]
+    if not fitted:
+        return None
+    config = loaded.record.config
+    cameras = [at_most(camera, min(_INFO_PIXELS, config.data.max_pixels)) for camera in fitted]
+    scene = loaded.gaussians.replace(features=None) if loaded.moving is None else loaded.moving
+    nuisances = Nuisances(eliminate=loaded.record.estimated)
+    return uncertainty_of(scene, spread(cameras, _COUNTED), config.settings, nuisances)
+
+
+def _ahead(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """(3,) the point of a camera's axis that is as far away as what is before it."""
+    axis = camera.c2w[:3, 2]
+    means = gaussians.means.double().numpy() + np.array(gaussians.origin, np.float64)
+    ahead = (means - camera.center) @ axis
+    ahead = ahead[ahead > 0]
+    return camera.center + axis * (float(np.median(ahead)) if len(ahead) else 1.0)
