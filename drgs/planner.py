@@ -19,8 +19,11 @@ one while another asks.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import hashlib
 import itertools
+import json
 import math
 import numbers
 import os
@@ -28,19 +31,24 @@ import statistics
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from drgs import planner_files, runtime
+from drgs import runtime
 from drgs.cameras import Camera, camera_list
 from drgs.ellipsoids import Gaussians
+from drgs.files import load_state, save_state, state_header
 from drgs.fitting.config import FitConfig
 from drgs.fitting.online import OnlineFit
 from drgs.gain import Information
-from drgs.guards.arguments import ArgumentError, kind_of, must_be
+from drgs.guards import unfinished
+from drgs.guards.arguments import ArgumentError, check_path, kind_of, must_be
+from drgs.guards.camera_checks import as_numpy
+from drgs.guards.json_files import check_json, parse_json
 from drgs.select import Scoring, select
 from drgs.selection.cache import Cache, NotKept, named_by
 from drgs.selection.informed import compute_candidates
@@ -55,8 +63,45 @@ Cost = Sequence[float] | Callable[[Camera, Camera], float]
 """What it costs to go to each candidate, in the caller's unit; or a function: from where, to where."""
 
 _FAST = Scoring(settings=RenderSettings.preset("fast"))
-_RNG = torch.Generator()  # which nothing that is asked here draws from
-_LATELY = 9  # times that are remembered of how long something took
+_RNG = torch.Generator()  # scores of informed policies draw nothing
+_LATELY = 9  # times that are remembered of how long something took: an odd number, for their median
+
+_ADVICE = "restore the file, or begin anew"
+_KIND = "planner"
+_CAMERA = {
+    "K": [[float]],
+    "w2c": [[float]],
+    "w2c_end": (None, [[float]]),
+    "width": int,
+    "height": int,
+    "model": str,
+    "distortion": [float],
+    "name": str,
+    "time": (None, float),
+    "shutter": str,
+}
+_HEADER = {
+    "digest": str,
+    "version": str,
+    "info_pixels": int,
+    "max_views": int,
+    "look": float,
+    "bound": float,
+    "max_bytes": int,
+    "counted": int,
+    "known": [_CAMERA],
+    "here": (None, _CAMERA),
+    "pool": [_CAMERA],
+    "costs": (None, bool, [float]),
+    "scoring": str,
+    "asked_in": [float],
+    "answered_in": [float],
+    "origin": (None, [float]),
+    "fit": dict,
+    "photographs": [_CAMERA],
+    "cache": dict,
+    "expected": [_CAMERA],
+}
 
 
 def default_config() -> FitConfig:
@@ -167,9 +212,9 @@ class Planner:
         self._own: Gaussians | None = None
         self._seen: Gaussians | None = None  # what was asked last, while nothing has changed
         self._counted = 0
-        self._asked_in, self._answered_in = _Duration(), _Duration()
-        self._fitting = threading.RLock()
-        self._asking = threading.RLock()
+        self._view_seconds, self._answer_seconds = _Duration(), _Duration()
+        self._fit_lock = threading.RLock()
+        self._answer_lock = threading.RLock()
         if scene is not None:
             self.scene = scene
 
@@ -181,7 +226,7 @@ class Planner:
         last. Where there are fewer than before, all views are asked again. `observe` then notes where a photograph was
         taken, and `fit` has nothing to do.
         """
-        with self._fitting:
+        with self._fit_lock:
             if self._own is not None:
                 return self._own
             if self._seen is None and self._fit.trainer is not None:
@@ -191,7 +236,7 @@ class Planner:
     @scene.setter
     def scene(self, gaussians: Gaussians) -> None:
         must_be("Planner", "scene", gaussians, Gaussians, "a scene that moves has none that could be planned for")
-        with self._fitting:
+        with self._fit_lock:
             self._own = gaussians.detach()
 
     @property
@@ -210,7 +255,7 @@ class Planner:
             ValueError: If shapes do not agree, values are out of range, or there is no image for the planner's model.
         """
         must_be("Planner.observe", "camera", camera, Camera, "drgs.Camera(K=..., w2c=..., width=..., height=...)")
-        with self._fitting:
+        with self._fit_lock:
             camera = dataclasses.replace(camera, name=self._name(camera.name))
             added = 0
             if self._own is None:
@@ -220,7 +265,7 @@ class Planner:
             self._here = camera
             self._known = [*self._known, at_most(camera, self.info_pixels)]
         if len(self._known) > self.max_views:
-            self._let_go()
+            self._drop_view()
         return added
 
     def fit(self, steps: int | None = None, seconds: float | None = None) -> int:
@@ -241,7 +286,7 @@ class Planner:
         most = 20 if steps is None and seconds is None else math.inf if steps is None else steps
         done = 0
         while done < most and (seconds is None or time.monotonic() - begun < seconds):
-            with self._fitting:
+            with self._fit_lock:
                 if self._own is not None or self._fit.trainer is None:
                     return done
                 self._fit.step()
@@ -268,7 +313,7 @@ class Planner:
         pool = camera_list("Planner.scores", "candidates", candidates)
         if not pool:
             raise ValueError("Planner.scores: there must be at least one candidate, got none; give poses")
-        with self._asking:
+        with self._answer_lock:
             before = self._pool, self._cost
             self._pool, self._cost = [at_most(camera, self.info_pixels) for camera in pool], cost
             try:
@@ -291,7 +336,7 @@ class Planner:
             ValueError: If there are fewer candidates than k, or `seconds` is not a number >= 0.
         """
         _check_seconds("Planner.next", seconds)
-        with self._asking:
+        with self._answer_lock:
             if not (type(k) is int and 1 <= k <= len(self._pool)):
                 raise ValueError(
                     f"Planner.next: k must be a whole number in 1..{len(self._pool)} candidates, got {k!r}; give "
@@ -310,16 +355,15 @@ class Planner:
             tell, scored beside no other candidates.
         """
         must_be("Planner.refine", "camera", camera, Camera, "e.g. plan.picks[0].camera")
-        with self._asking:
-            scene, known = self._asked()
+        with self._answer_lock:
+            scene, known = self._model_and_views()
             start = at_most(camera, self.info_pixels)
             if refine is None or refine.box is None:
                 centers = np.stack([one.center for one in (*known, *self._pool, start)])
                 box = tuple(np.r_[centers.min(0), centers.max(0)].tolist())
                 refine = dataclasses.replace(refine or Refine(evaluations=20), box=box)
             self._expect([*known, *self._pool, start])
-            found = select(scene, [start], known, 1, scoring=self._scoring, cache=self._cache, refine=refine)
-            return found.picks[0]
+            return select(scene, [start], known, 1, scoring=self._scoring, cache=self._cache, refine=refine).picks[0]
 
     # -------------------------------------------------- kill and resume
 
@@ -335,11 +379,11 @@ class Planner:
             ValueError: If there is something else of that name, or notes are no JSON.
             OSError: If the file cannot be written.
         """
-        records = lambda cameras: [planner_files.camera_record(camera) for camera in cameras]  # noqa: E731
-        with self._asking, self._fitting:
+        records = lambda cameras: [_camera_json(camera) for camera in cameras]  # noqa: E731
+        with self._answer_lock, self._fit_lock:
             fit, fit_header, photographs = self._fit.state()
-            told, cache_header, expected = self._cache.state()
-            own, origin = planner_files.scene_record(self._own)
+            answers, cache_header, expected = self._cache.state()
+            own, origin = _scene_tensors(self._own)
             costs = self._cost if self._cost is None or callable(self._cost) else [float(x) for x in self._cost]
             header = {
                 "version": runtime.version(),
@@ -350,12 +394,12 @@ class Planner:
                 "max_bytes": self._cache.max_bytes,
                 "counted": self._counted,
                 "known": records(self._known),
-                "here": None if self._here is None else planner_files.camera_record(self._here),
+                "here": None if self._here is None else _camera_json(self._here),
                 "pool": records(self._pool),
                 "costs": True if callable(costs) else costs,
                 "scoring": named_by(self._scoring) or "",
-                "asked_in": list(self._asked_in.seconds),
-                "answered_in": list(self._answered_in.seconds),
+                "asked_in": list(self._view_seconds.seconds),
+                "answered_in": list(self._answer_seconds.seconds),
                 "origin": origin,
                 "fit": fit_header,
                 "photographs": records(photographs),
@@ -363,7 +407,7 @@ class Planner:
                 "expected": records(expected),
                 "notes": notes,
             }
-        planner_files.save_planner(path, {**fit, **told, **own}, header)
+        _write_file(path, {**fit, **answers, **own}, header)
 
     @classmethod
     def load(cls, path: str | os.PathLike, *, scoring: Scoring | None = None) -> Planner:
@@ -379,37 +423,37 @@ class Planner:
             FileNotFoundError: If there is no such file.
             ValueError: If it is none that a planner wrote, or damaged, or the scoring is another one.
         """
-        where, tensors, header = planner_files.load_planner(path)
+        where, tensors, header = _read_file(path)
         names = ("info_pixels", "max_views", "bound", "look", "max_bytes")
         try:
-            found = cls(scoring=scoring, **{name: header[name] for name in names})
+            planner = cls(scoring=scoring, **{name: header[name] for name in names})
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from None
-        if header["scoring"] != (named_by(found._scoring) or ""):
+        if header["scoring"] != (named_by(planner._scoring) or ""):
             raise ValueError(
                 f"{where}: scoring must be that of the planner that was saved, is another one; give it to Planner.load"
             )
         cameras = lambda name, pixels=math.inf: [  # noqa: E731
-            planner_files.recorded_camera(where, one, pixels) for one in header[name]
+            _camera_of(where, one, pixels) for one in header[name]
         ]
-        found._fit = OnlineFit.from_state(tensors, header["fit"], cameras("photographs"), where)
+        planner._fit = OnlineFit.from_state(tensors, header["fit"], cameras("photographs"), where)
         if header["origin"] is not None:
-            found._own = planner_files.recorded_scene(where, tensors, header["origin"])
-        found._known, found._pool = (cameras(name, found.info_pixels) for name in ("known", "pool"))
-        found._here = None if header["here"] is None else planner_files.recorded_camera(where, header["here"])
-        found._counted = header["counted"]
+            planner._own = _scene_of(where, tensors, header["origin"])
+        planner._known, planner._pool = (cameras(name, planner.info_pixels) for name in ("known", "pool"))
+        planner._here = None if header["here"] is None else _camera_of(where, header["here"])
+        planner._counted = header["counted"]
         costs = header["costs"]
-        found._cost = _forgotten if isinstance(costs, bool) else costs
-        for name in ("asked_in", "answered_in"):
+        planner._cost = _unknown_cost if isinstance(costs, bool) else costs
+        for name, durations in (("asked_in", planner._view_seconds), ("answered_in", planner._answer_seconds)):
             for seconds in header[name]:
-                getattr(found, f"_{name}").note(seconds)
-        expected = cameras("expected", found.info_pixels)
+                durations.note(seconds)
+        expected = cameras("expected", planner.info_pixels)
         if header["version"] == runtime.version():  # another one may ask something else, which is asked anew
-            found._cache.restore(tensors, header["cache"], expected, str(where))
-        found.notes = header.get("notes")
-        if len(found._known) > found.max_views:  # saved by one thread while another had just taken a photograph
-            found._let_go()
-        return found
+            planner._cache.restore(tensors, header["cache"], expected, str(where))
+        planner.notes = header.get("notes")
+        if len(planner._known) > planner.max_views:  # saved by one thread while another had just taken a photograph
+            planner._drop_view()
+        return planner
 
     # -------------------------------------------------- what is known
 
@@ -420,32 +464,32 @@ class Planner:
             raise ValueError(f"Planner.observe: names must be different, got {name!r} again; leave them empty")
         return name
 
-    def _let_go(self) -> None:
-        """Let go of the view that the others cover best."""
-        with self._asking, self._fitting:
+    def _drop_view(self) -> None:
+        """Drop the view that the others cover best."""
+        with self._answer_lock, self._fit_lock:
             if (scene := self.scene) is None:
                 return
             known = self._known
             self._expect([*known, *self._pool])
-            found = select(scene, known, [], len(known) - 1, "coverage", information=self._coverage_of(scene))
-            (gone,) = set(range(len(known))) - {pick.index for pick in found.picks}
+            kept = select(scene, known, [], len(known) - 1, "coverage", information=self._coverage_of(scene))
+            (gone,) = set(range(len(known))) - {pick.index for pick in kept.picks}
             self._known = [camera for i, camera in enumerate(known) if i != gone]
             if self._own is None:
                 self._fit.drop(known[gone].name)
 
     def _coverage_of(self, scene: Gaussians) -> Callable[[Camera], Information]:
-        """What policy `coverage` goes by, as far as views have been asked; one that has not been is asked now."""
+        """Coverage of a view, as policy `coverage` takes it; computed where it is not known yet."""
 
-        def told(camera: Camera) -> Information:
+        def coverage(camera: Camera) -> Information:
             if self._cache.seen(scene, camera) is None:
-                self._ask_one(scene, camera)
+                self._evaluate(scene, camera)
             return {"coverage": self._cache.seen(scene, camera)}
 
-        return told
+        return coverage
 
-    def _asked(self) -> tuple[Gaussians, list[Camera]]:
+    def _model_and_views(self) -> tuple[Gaussians, list[Camera]]:
         """The model and the known views, together."""
-        with self._fitting:
+        with self._fit_lock:
             scene = self.scene
             if scene is None:
                 raise ValueError(
@@ -461,13 +505,13 @@ class Planner:
     # -------------------------------------------------- answers
 
     def _plan(self, k: int, seconds: float | None) -> ViewPlan:
-        """Ask what there is time for, and answer by what is known then."""
+        """Compute information of as many views as there is time for, and answer by what is known then."""
         begun = time.monotonic()
-        scene, known = self._asked()
+        scene, known = self._model_and_views()
         self._expect([*known, *self._pool])
         calls = 1 if self._cost is None else max(k, 1)
-        until = math.inf if seconds is None else begun + seconds - self._answered_in.usual * calls
-        computed = self._ask(scene, known, until)
+        until = math.inf if seconds is None else begun + seconds - self._answer_seconds.usual * calls
+        computed = self._evaluate_changed(scene, known, until)
         answering = time.monotonic()
         self._cache.computes = False
         try:
@@ -475,11 +519,15 @@ class Planner:
         finally:
             self._cache.computes = True
         now = time.monotonic()
-        self._answered_in.note((now - answering) / calls)
+        self._answer_seconds.note((now - answering) / calls)
         return dataclasses.replace(plan, computed=computed, seconds=now - begun)
 
-    def _ask(self, scene: Gaussians, known: list[Camera], until: float) -> int:
-        """Ask the views that have changed most, known ones and candidates in turn, until a time; how many were."""
+    def _evaluate_changed(self, scene: Gaussians, known: list[Camera], until: float) -> int:
+        """Compute information of the views that have changed most, known ones and candidates in turn, until a time.
+
+        Returns:
+            How many views.
+        """
         queues = []
         for cameras in (known, self._pool):
             changes = {i: self._cache.change(scene, camera) for i, camera in enumerate(cameras)}
@@ -490,15 +538,15 @@ class Planner:
         done = 0
         for camera in turns:
             began = time.monotonic()
-            if done and began + self._asked_in.usual > until:  # one at least, so that every call brings something
+            if done and began + self._view_seconds.usual > until:  # one at least, so that every call brings something
                 break
-            self._ask_one(scene, camera)
-            self._asked_in.note(time.monotonic() - began)
+            self._evaluate(scene, camera)
+            self._view_seconds.note(time.monotonic() - began)
             done += 1
         return done
 
-    def _ask_one(self, scene: Gaussians, camera: Camera) -> None:
-        """Ask one view, beside no others, which what it tells does not depend on."""
+    def _evaluate(self, scene: Gaussians, camera: Camera) -> None:
+        """Compute the information of one view, which does not depend on others."""
         compute_candidates(
             Pool(scene=scene, candidates=[camera], train=[], k=1, scoring=self._scoring, rng=_RNG, cache=self._cache)
         )
@@ -515,8 +563,8 @@ class Planner:
             for i, score in zip(places, selection.scores, strict=True):
                 scores[i] = score
             if self._cost is None:
-                found = [(places[pick.index], pick.score) for pick in selection.picks[:k]]
-                picks = [PlannedView(i, self._pool[i], score, 0.0, score) for i, score in found]
+                scored = [(places[pick.index], pick.score) for pick in selection.picks[:k]]
+                picks = [PlannedView(i, self._pool[i], score, 0.0, score) for i, score in scored]
         here = self._here
         while self._cost is not None and selection is not None and len(picks) < k:
             costs = self._costs(places, here)
@@ -535,12 +583,12 @@ class Planner:
         while places:
             pool = [self._pool[i] for i in places]
             try:
-                found = select(scene, pool, known, min(k, len(pool)), scoring=self._scoring, cache=self._cache)
+                selection = select(scene, pool, known, min(k, len(pool)), scoring=self._scoring, cache=self._cache)
             except NotKept as lacking:
                 places = [i for i in places if self._cache.keeps(lacking.quantity, self._pool[i])]
                 known = [camera for camera in known if self._cache.keeps(lacking.quantity, camera)]
             else:
-                return found, places, known
+                return selection, places, known
         return None, places, known
 
     def _costs(self, places: list[int], here: Camera | None) -> list[float]:
@@ -550,17 +598,17 @@ class Planner:
             return [0.0] * len(places)
         if callable(cost):
             assert here is not None
-            found = [float(cost(here, self._pool[i])) for i in places]
+            costs = [float(cost(here, self._pool[i])) for i in places]
         else:
             if len(cost) != len(self._pool):
                 raise ValueError(
                     f"Planner: costs must be {len(self._pool)}, one a candidate, got {len(cost)}; give the missing ones"
                 )
-            found = [float(cost[i]) for i in places]
-        bad = next((x for x in found if not (math.isfinite(x) and x >= 0)), None)
+            costs = [float(cost[i]) for i in places]
+        bad = next((x for x in costs if not (math.isfinite(x) and x >= 0)), None)
         if bad is not None:
             raise ValueError(f"Planner: costs must be finite and >= 0, got {bad}; leave out what cannot be reached")
-        return found
+        return costs
 
 
 class _Duration:
@@ -583,7 +631,7 @@ class _Duration:
         return statistics.median(self.seconds) if self.seconds else 0.0
 
 
-def _forgotten(here: Camera, there: Camera) -> float:
+def _unknown_cost(here: Camera, there: Camera) -> float:
     """What is in the place of costs that were a function when a planner was saved."""
     raise ValueError("Planner.next: costs were a function, which no file holds; give it to Planner.scores again")
 
@@ -616,3 +664,139 @@ def _checked_depth(depth: np.ndarray | None, camera: Camera) -> np.ndarray | Non
             f"Planner.observe: depth must be an array of shape {shape}, its camera's, got {got}; resize it"
         )
     return np.nan_to_num(depth.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0).clip(min=0)
+
+
+# ---------------------------------------------------------------------------------------------------- its file
+
+
+def _write_file(path: str | os.PathLike, tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> None:
+    """Write a planner's file; what a killed process left half written beside it is removed.
+
+    Args:
+        path: The file, which this process alone writes.
+        tensors: What it holds.
+        header: What else it holds, JSON.
+    Raises:
+        ValueError: If there is something else of that name, or the header is no JSON.
+        OSError: If it cannot be written.
+    """
+    path = check_path("Planner.save", path)
+    if os.path.lexists(path) and not _is_planner_file(path):
+        raise ValueError(f"{path}: must not be replaced, is no planner's file that can be read; choose another name")
+    try:
+        header = parse_json(json.dumps(header, allow_nan=False), "Planner.save")  # as it will be read
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"Planner.save: notes must be JSON, got what is none ({error}); leave it out") from None
+    if path.parent.is_dir():
+        for other in path.parent.iterdir():
+            if other.name.startswith(f".drgs.{path.name}.") and unfinished.is_left_over(other.resolve()):
+                unfinished.delete(other)
+    tensors = _apart(tensors)
+    save_state(path, tensors, {"kind": _KIND, **header, "digest": _digest(tensors, header)})
+
+
+def _read_file(path: str | os.PathLike) -> tuple[Path, dict[str, torch.Tensor], dict[str, Any]]:
+    """The path, the tensors and the header of `_write_file`.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is none that a planner has written, or damaged.
+    """
+    path = check_path("Planner.load", path)
+    tensors, header = load_state(path)
+    if header.pop("kind", None) != _KIND:
+        raise ValueError(f"{path}: must be what Planner.save has written, is a checkpoint of a fit; see drgs fit")
+    header.pop("schema")
+    check_json(str(path), header, _HEADER, _ADVICE)
+    if _digest(tensors, header) != header["digest"]:
+        raise ValueError(f"{path}: must be as Planner.save has written it, has been changed since; {_ADVICE}")
+    return path, tensors, header
+
+
+def _camera_json(camera: Camera) -> dict[str, Any]:
+    """A camera in JSON, to the bit."""
+    pose = lambda x: np.asarray(as_numpy(x), np.float64).tolist()  # noqa: E731
+    return {
+        "K": camera.K.tolist(),
+        "w2c": pose(camera.w2c),
+        "w2c_end": None if camera.w2c_end is None else pose(camera.w2c_end),
+        **{name: getattr(camera, name) for name in ("width", "height", "model", "name", "time", "shutter")},
+        "distortion": list(camera.distortion),
+    }
+
+
+def _camera_of(where: Path, record: dict[str, Any], pixels: float = math.inf) -> Camera:
+    """The camera of a record that `_read_file` has looked at.
+
+    Args:
+        where: The file, for messages.
+        record: What `_camera_json` made.
+        pixels: Number of pixels that its image may have.
+    Raises:
+        ValueError: If there is no such camera.
+    """
+    fields = {name: record[name] for name in _CAMERA}
+    try:
+        for name in ("K", "w2c", "w2c_end"):
+            if fields[name] is not None:
+                fields[name] = np.array(fields[name], np.float64)
+        camera = Camera(**fields | {"distortion": tuple(fields["distortion"])})
+    except (ValueError, OverflowError) as error:
+        raise ValueError(f"{where}: {error}; {_ADVICE}") from None
+    if camera.width * camera.height > pixels:
+        raise ValueError(f"{where}: {camera.name!r} must have at most {pixels} pixels, has more; {_ADVICE}")
+    return camera
+
+
+def _scene_tensors(scene: Gaussians | None) -> tuple[dict[str, torch.Tensor], list[float] | None]:
+    """Tensors of a caller's own model and its origin; None where there is none."""
+    if scene is None:
+        return {}, None
+    return {f"scene.{name}": x for name, x in scene.parameters().items()}, np.asarray(scene.origin).tolist()
+
+
+def _scene_of(where: Path, tensors: Mapping[str, torch.Tensor], origin: list[float]) -> Gaussians:
+    """The inverse of `_scene_tensors`.
+
+    Raises:
+        ValueError: If it is no model.
+    """
+    fields: dict[str, Any] = {
+        name.removeprefix("scene."): x for name, x in tensors.items() if name.startswith("scene.")
+    }
+    try:
+        scene = Gaussians(**fields, origin=np.array(origin, np.float64))
+        scene.validate(str(where))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{where}: {str(error).removeprefix(f'{where}: ')}; {_ADVICE}") from None
+    return scene
+
+
+def _is_planner_file(path: Path) -> bool:
+    """Whether a file, no link, says that a planner has written it."""
+    with contextlib.suppress(ValueError, OSError):
+        return not path.is_symlink() and state_header(path).get("kind") == _KIND
+    return False
+
+
+def _apart(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """The same without two that share memory, which safetensors refuses."""
+    seen: set[int] = set()
+    apart = {}
+    for name, x in tensors.items():
+        x = x.detach().cpu()  # a file holds values
+        place = x.untyped_storage().data_ptr()
+        apart[name] = x.clone() if place in seen else x
+        seen.add(place)
+    return apart
+
+
+def _digest(tensors: Mapping[str, torch.Tensor], header: Mapping[str, Any]) -> str:
+    """A hash of all tensors, and of the header but for the hash."""
+    text = json.dumps({key: x for key, x in header.items() if key != "digest"}, sort_keys=True)
+    digest = hashlib.blake2b(text.encode(), digest_size=16)
+    for name in sorted(tensors):
+        x = tensors[name].contiguous().numpy()
+        digest.update(f"{name} {x.dtype.str} {x.shape}".encode())
+        digest.update(x.data if x.size else b"")
+    return digest.hexdigest()

@@ -54,7 +54,7 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"fitting"}, "the parts of a fit"),
     ({"metrics"}, "pictures against photographs"),
     ({"train", "evaluation"}, "fits, for users, and what they are worth"),
-    ({"planner", "planner_files"}, "where to look next, photograph by photograph, for a robot"),
+    ({"planner"}, "where to look next, photograph by photograph, for a robot"),
     ({"report"}, "what a fit looked like, as a page"),
     ({"lab"}, "experiments on all of the above"),
     ({"studies"}, "many fits, and what they say together"),

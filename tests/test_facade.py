@@ -19,7 +19,7 @@ import drgs
 from drgs.cameras import orbit
 
 # Files of the package's own folder that are nobody's but its own.
-_INSIDE = {"covariances", "lenses", "planner_files", "sizes"}
+_INSIDE = {"covariances", "lenses", "sizes"}
 
 
 @pytest.fixture(scope="module")

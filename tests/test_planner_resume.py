@@ -246,7 +246,7 @@ def test_damaged_files(saved, tmp_path):
 
 def test_values_that_cannot_be(saved, tmp_path):
     """Also where the digest fits: somebody who writes such a file gets one line, too."""
-    from drgs.planner_files import _digest
+    from drgs.planner import _digest
 
     path = tmp_path / "p.safetensors"
     tensors, header = load_state(saved)

@@ -181,7 +181,7 @@ _OTHERS = {
     "guards/locks.py",  # .drgs.lock
     "guards/outputs.py",  # .drgs.jsonl
     "io/journal.py",  # lines of log.jsonl, rows.jsonl, .drgs.jsonl
-    "planner_files.py",  # the header of Planner.save's file: docs/planner.md
+    "planner.py",  # the header of Planner.save's file: docs/planner.md
     "report/page.py",  # a cell of the report
     "sharing/page.py",  # what a page is told
 }
