@@ -10,6 +10,7 @@ from typing import Any
 from drgs.data.shooting import Finding
 from drgs.files import SCHEMA, write_json
 from drgs.guards.json_files import check_json, read_json
+from drgs.io.journal import check_schema
 
 __all__ = ["FOLDER", "Batch", "CaptureRecord", "DoneStep", "inputs_of"]
 
@@ -47,7 +48,7 @@ class DoneStep:
 
 @dataclasses.dataclass
 class Batch:
-    """Photographs that were captured together: the first, or further ones that joined these.
+    """Photographs that were captured together: the first ones, or ones that joined them.
 
     Attributes:
         inputs: What was named: path, size in bytes and time of change of each file.
@@ -55,8 +56,8 @@ class Batch:
         steps: Steps that are done, in order.
         findings: What is wrong with the photographs, and what to do at the next shoot.
         plan: What the budget is spent on, by step.
-        handover: How far the run of the batch before has made room for the fit that goes on from it: empty not
-            yet, `kept` its checkpoint is in the folder of the capture, `cleared` its other files are gone, too.
+        handover: How far the run of the batch before has made room for the next fit. Empty: not yet; `kept`: its
+            checkpoint is in the folder of the capture; `cleared`: its files are gone from the run folder, too.
         result: Mean PSNR of the held-out views after the fit, in dB (None: there are none), and the pixels of a
             photograph; empty before.
     """
@@ -102,6 +103,7 @@ class CaptureRecord:
         if not file.is_file():
             return None
         value = read_json(file, "the record of a capture", _ADVICE)
+        check_schema(file, value, (SCHEMA,), "schema", _ADVICE)
         check_json(str(file), value, {"batches": [_BATCH]}, _ADVICE)
         if not value["batches"]:
             raise ValueError(f"{file}: batches must be one or more, got none; {_ADVICE}")
