@@ -17,7 +17,7 @@ import drgs
 from drgs import cli
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, look_at
 from drgs.capturing.next_views import rank_next
-from drgs.capturing.places import Place, meters_of, places_around, told_length
+from drgs.capturing.places import Place, length_in_words, meters_of, places_around
 from drgs.commands.options import View
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewed import subject_of
@@ -280,7 +280,7 @@ def test_up_of_level_photographs():
     ],
 )
 def test_lengths_in_words(share, meters, words):
-    assert told_length(share, meters) == words
+    assert length_in_words(share, meters) == words
 
 
 def test_known_lengths():

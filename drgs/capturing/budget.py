@@ -52,38 +52,53 @@ __all__ = [
 FEWEST_STEPS = 100
 """Steps that a fit has, however little time is left: with fewer there is nothing to look at."""
 
-_EVERY = 20  # steps between two looks at the clock
-_RECENT = 60  # steps whose time is that of those to come: five cycles of the renderers' longest one
-_FIRST_LOOK = 40  # steps before the first look: renderers compile in their first ones
-_GROWN = 0.5  # share of the steps from which on there are as many Gaussians as there will be (`grow_until`)
-_WORTH = 0.03  # of the steps; a smaller change is none
-_MOST = 4.0  # times the planned steps, however fast they turn out to be: timed beside other programs they are too slow
+# How the number of steps follows the clock (`Pacer`).
+_STEPS_BETWEEN_LOOKS = 20  # steps between two looks at the clock: often enough to end within a few seconds
+_STEPS_AVERAGED = 60  # latest steps whose time is that of those to come: five cycles of the longest list of renderers
+_STEPS_OF_COMPILATION = 40  # steps before the first look: every renderer compiles its kernels in its first ones
+_GROWTH_ENDS = 0.5  # share of the steps from which on Gaussians do not grow in number (`DensityConfig.grow_until`)
+_LEAST_CHANGE = 0.03  # share of the steps; a smaller change would reschedule rates for less than the clock's noise
+_MOST_STEPS = 4.0  # times the planned steps, however fast they are: a plan timed beside other programs is too short
 
-_UNITS = {"s": 1.0, "sec": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
-_LEAST = 30.0  # seconds: less is not even enough to start all parts
-_FIRST_SIZE = 800  # pixels of the longer side at which two photographs are measured
-_IMAGE_SIZES = (1600, 1200, 1000, 800, 640, 480)
-_POSES_SHARE = 0.4  # of the budget, that poses should not exceed
+_SECONDS = {"s": 1.0, "sec": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
+_LEAST_BUDGET = 30.0  # seconds: less is not enough to start all libraries
+
+# Poses: what two photographs take says what all of them take.
+_MEASURED_SIZE = 800  # pixels of the longer side at which two photographs are timed: a second or two
+_IMAGE_SIZES = (1600, 1200, 1000, 800, 640, 480)  # pixels of the longer side that poses may be computed at
+_POSES_SHARE = 0.4  # of the budget, that poses should not exceed: the rest is the fit's
 # Mapping of 16 photographs of 752 pixels (`banana`) took 1.1 times as long as features of one of them, of 292 of 800
-# pixels (`bonsai`) 507 times: what features take tells how fast the machine is. Measured of smaller ones: a third.
-_MAPPING = (1.1 / 16**2.11, 2.11)
-_NEIGHBORS = 18  # pairs of each photograph where those near by name and by appearance are matched
-_FEWEST_FRAMES = 20  # however little time there is
-# (pixels of a photograph, Gaussians, steps) of fits, each about three times as long as the one before.
-_SIZES = (
-    (12_000, 8_000, 400),
-    (30_000, 12_000, 800),
-    (60_000, 20_000, 1_500),
-    (130_000, 30_000, 3_000),
-    (250_000, 60_000, 5_000),
-    (430_000, 120_000, 9_000),
+# pixels (`bonsai`) 507 times: what features take says how fast the machine is. Measured of smaller ones: a third.
+_MAPPING_FACTOR, _MAPPING_POWER = 1.1 / 16**2.11, 2.11  # features' seconds of one photograph, power of their number
+_PAIRS_EACH = 18  # pairs of each photograph where those near by name and by appearance are matched
+_MOST_MATCHING = 4.0  # times the matches of `_MEASURED_SIZE`: COLMAP finds at most 8192 features, whatever the size
+_FEWEST_FRAMES = 20  # of videos, however little time there is: fewer do not connect
+
+_FEWER_STEPS, _MORE_STEPS = 0.5, 1.5  # of the steps of a size that it may have; beyond, another size is better
+_TIMED_VIEWS = 8  # photographs that timed steps go through, evenly of all
+_TIMED_STEPS = 12  # steps that are timed: twice the longest cycle of renderers
+_RESERVE = 0.05  # of what is left, for steps that take longer than the timed ones
+_REPORT_SECONDS = 6.0  # of held-out views and report, whatever the size
+_TRAINING_STEPS, _HELD_OUT_STEPS = 2.0, 4.0  # and, in steps, of each view: a held-out one is drawn by each renderer
+
+
+@dataclasses.dataclass(frozen=True)
+class _FitSize:
+    """A size of a fit: pixels of a photograph, Gaussians, steps."""
+
+    pixels: int
+    gaussians: int
+    steps: int
+
+
+_SIZES = (  # each takes about three times as long as the one before
+    _FitSize(12_000, 8_000, 400),
+    _FitSize(30_000, 12_000, 800),
+    _FitSize(60_000, 20_000, 1_500),
+    _FitSize(130_000, 30_000, 3_000),
+    _FitSize(250_000, 60_000, 5_000),
+    _FitSize(430_000, 120_000, 9_000),
 )
-_FEWER, _MORE = 0.5, 1.5  # of the steps of a size, that it may have
-_TIMED_VIEWS = 8
-_TIMED = 12  # steps: twice all renderers
-_END = 0.05  # of what is left, for what was measured too low
-# Held-out views and report, in seconds and in steps a view.
-_AFTER, _TRAINING, _HELD_OUT = 6.0, 2.0, 4.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,9 +172,9 @@ class Pacer:
 
     def __init__(self, end: float, planned: int, clock: Callable[[], float] = time.monotonic) -> None:
         self._end = end
-        self._most = round(_MOST * planned)
+        self._most = round(_MOST_STEPS * planned)
         self._clock = clock
-        self._marks: deque[tuple[int, float]] = deque(maxlen=_RECENT)
+        self._marks: deque[tuple[int, float]] = deque(maxlen=_STEPS_AVERAGED)
         self._first: int | None = None
 
     def __call__(self, done: int, total: int) -> int:
@@ -173,13 +188,17 @@ class Pacer:
         if self._first is None:
             self._first = done
         self._marks.append((done, now))
-        if done - self._first < _FIRST_LOOK or done % _EVERY or done >= total:
+        if done - self._first < _STEPS_OF_COMPILATION or done % _STEPS_BETWEEN_LOOKS or done >= total:
             return total
         first, began = self._marks[0]
         each = (now - began) / (done - first)
-        there = max(done + max(1, int((self._end - now) / max(each, 1e-9))), min(total, FEWEST_STEPS))
-        wanted = min(there, total if done < _GROWN * total else max(total, self._most))
-        return wanted if abs(wanted - total) > _WORTH * total or wanted <= done + _EVERY < total else total
+        possible = max(done + max(1, int((self._end - now) / max(each, 1e-9))), min(total, FEWEST_STEPS))
+        wanted = min(possible, total if done < _GROWTH_ENDS * total else max(total, self._most))
+        return (
+            wanted
+            if abs(wanted - total) > _LEAST_CHANGE * total or wanted <= done + _STEPS_BETWEEN_LOOKS < total
+            else total
+        )
 
 
 def seconds_of_budget(text: str) -> float:
@@ -188,12 +207,12 @@ def seconds_of_budget(text: str) -> float:
     Raises:
         ValueError: If it is no such time, or less than half a minute.
     """
-    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?|\.\d+)\s*([a-z]+)\s*", text.lower())
-    if found is None or found[2] not in _UNITS:
+    matched = re.fullmatch(r"\s*(\d+(?:\.\d+)?|\.\d+)\s*([a-z]+)\s*", text.lower())
+    if matched is None or matched[2] not in _SECONDS:
         raise ValueError(f"--budget must be a time with its unit, e.g. 90s, 10min or 1.5h, got {text!r}; correct it")
-    seconds = float(found[1]) * _UNITS[found[2]]
-    if not _LEAST <= seconds <= 1e7:
-        raise ValueError(f"--budget must be at least {_LEAST:.0f}s, got {text}; allow more time")
+    seconds = float(matched[1]) * _SECONDS[matched[2]]
+    if not _LEAST_BUDGET <= seconds <= 1e7:
+        raise ValueError(f"--budget must be at least {_LEAST_BUDGET:.0f}s, got {text}; allow more time")
     return seconds
 
 
@@ -218,7 +237,7 @@ def plan_poses(
     chosen = [names[len(names) // 3], names[min(len(names) // 3 + 1, len(names) - 1)]]
     with Bar("how long poses will take"):
         features, pair = _timed_pair([decode(folder / name) for name in chosen])
-    measured = min(_FIRST_SIZE, largest)
+    measured = min(_MEASURED_SIZE, largest)
     sizes = [size for size in _IMAGE_SIZES if size < largest]
     sizes = [*sizes[: len(_IMAGE_SIZES)], *([largest] if largest <= _IMAGE_SIZES[0] else [])]
     plans = [PosePlan(size, _pose_seconds(len(names), features, pair, size / measured)) for size in sorted(sizes)[::-1]]
@@ -234,12 +253,12 @@ def plan_frames(video: Path, photographs: int, most: int, budget: float) -> int:
         most: Number of frames that is asked for.
         budget: Seconds of the whole capture.
     """
-    found = read_video(video)
-    first = found.count // 3
+    read = read_video(video)
+    first = read.count // 3
     with Bar("how long poses will take"):
-        features, pair = _timed_pair([VideoFrame(video, min(first + k, found.count - 1)).read() for k in (0, 10)])
-    largest = max(found.width, found.height)
-    scale = min(_IMAGE_SIZES[-1], largest) / min(_FIRST_SIZE, largest)
+        features, pair = _timed_pair([VideoFrame(video, min(first + k, read.count - 1)).read() for k in (0, 10)])
+    largest = max(read.width, read.height)
+    scale = min(_IMAGE_SIZES[-1], largest) / min(_MEASURED_SIZE, largest)
     allowed = _POSES_SHARE * budget
     for count in range(most, _FEWEST_FRAMES, -1):
         if _pose_seconds(photographs + count, features, pair, scale) <= allowed:
@@ -248,7 +267,7 @@ def plan_frames(video: Path, photographs: int, most: int, budget: float) -> int:
 
 
 def _timed_pair(images: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Seconds that features of a photograph take, and to match two of them, at `_FIRST_SIZE` pixels."""
+    """Seconds that features of a photograph take, and to match two of them, at `_MEASURED_SIZE` pixels."""
     with temporary_folder("plan") as made:
         database = made / "database.db"
         names = [f"{number}.png" for number in range(len(images))]
@@ -275,7 +294,7 @@ def planned_poses(plan: PosePlan, count: int, left: float, budget: float) -> str
         budget: Seconds of the whole capture.
     """
     size, rest = plan.max_image_size, left - plan.seconds
-    if rest >= _LEAST:
+    if rest >= _LEAST_BUDGET:
         return (
             f"plan for {duration(budget)}: {count} photographs at {size} pixels for poses, about "
             f"{duration(plan.seconds)}; then a fit as large as the {duration(rest)} after it allow, by timed steps"
@@ -289,21 +308,24 @@ def planned_poses(plan: PosePlan, count: int, left: float, budget: float) -> str
 
 
 def _write_small(image: np.ndarray, target: Path) -> None:
-    """A photograph as PNG of at most `_FIRST_SIZE` pixels along the longer side."""
+    """A photograph as PNG of at most `_MEASURED_SIZE` pixels along the longer side."""
     import cv2
 
     image = image[..., 2::-1] if image.ndim == 3 else image
-    scale = min(1.0, _FIRST_SIZE / max(image.shape[:2]))
+    scale = min(1.0, _MEASURED_SIZE / max(image.shape[:2]))
     small = cv2.resize(np.ascontiguousarray(image), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     target.write_bytes(cv2.imencode(".png", small)[1].tobytes())
 
 
 def _pose_seconds(count: int, features: float, pair: float, scale: float) -> float:
     """Seconds of poses of `count` photographs at `scale` times the size at which `features` and `pair` were taken."""
-    pairs = count * (count - 1) / 2 if count <= MAX_EXHAUSTIVE else count * _NEIGHBORS
-    factor, power = _MAPPING
+    pairs = count * (count - 1) / 2 if count <= MAX_EXHAUSTIVE else count * _PAIRS_EACH
     # There are as many features as pixels, and they are compared all to all.
-    return count * features * scale**2 + pairs * pair * min(scale**4, 4.0) + factor * features * scale**2 * count**power
+    return (
+        count * features * scale**2
+        + pairs * pair * min(scale**4, _MOST_MATCHING)
+        + _MAPPING_FACTOR * features * scale**2 * count**_MAPPING_POWER
+    )
 
 
 def plan_fit(
@@ -325,19 +347,21 @@ def plan_fit(
     end = stopwatch.now() + left
     before: float | None = None
     with Bar("how long steps take") as bar:
-        for number, (pixels, gaussians, steps) in enumerate(_SIZES):
-            bar.update(number, text=f"at {min(pixels, largest)} pixels")
-            rest = end - stopwatch.now()
-            if best is not None and before is not None and 2 * before * (_FEWER * steps + _TIMED) > rest - best.after:
-                break  # a step takes about twice as long as in the size before
-            size = FitPlan(min(pixels, largest), max(gaussians, least), steps, 0.0)
-            each = stopwatch.step(train, dataset, size.config(config), is_first=number == 0)
-            after = _AFTER + each * (_TRAINING * len(train) + _HELD_OUT * len(test))
-            room = (1 - _END) * (end - stopwatch.now() - after)
-            there = math.floor(room / each)
-            if best is not None and there < _FEWER * steps:
+        for number, allowed in enumerate(_SIZES):
+            pixels, fewest = min(allowed.pixels, largest), _FEWER_STEPS * allowed.steps
+            bar.update(number, text=f"at {pixels} pixels")
+            # A step takes about twice as long as in the size before.
+            needed = 0.0 if before is None else 2 * before * (fewest + _TIMED_STEPS)
+            if best is not None and needed > end - stopwatch.now() - best.after:
                 break
-            count = int(min(max(there, FEWEST_STEPS), _MORE * steps))
+            size = FitPlan(pixels, max(allowed.gaussians, least), allowed.steps, 0.0)
+            each = stopwatch.step(train, dataset, size.config(config), is_first=number == 0)
+            after = _REPORT_SECONDS + each * (_TRAINING_STEPS * len(train) + _HELD_OUT_STEPS * len(test))
+            room = (1 - _RESERVE) * (end - stopwatch.now() - after)
+            possible = math.floor(room / each)
+            if best is not None and possible < fewest:
+                break
+            count = int(min(max(possible, FEWEST_STEPS), _MORE_STEPS * allowed.steps))
             best = FitPlan(size.max_pixels, size.max_gaussians, count, count * each, after)
             before = each
             if pixels >= largest:
@@ -375,12 +399,12 @@ def _seconds_a_step(train: list[View], dataset: Dataset, config: FitConfig, is_f
         # As late in a fit, where all degrees of color are there.
         while trainer.rows.sh_degree < config.sh_degree:
             trainer.rows.raise_sh_degree()
-        for _ in range(_TIMED if is_first else 0):
+        for _ in range(_TIMED_STEPS if is_first else 0):
             trainer.step()
         began = time.perf_counter()
-        for _ in range(_TIMED):
+        for _ in range(_TIMED_STEPS):
             trainer.step()
-        return (time.perf_counter() - began) / _TIMED
+        return (time.perf_counter() - began) / _TIMED_STEPS
 
 
 @contextlib.contextmanager

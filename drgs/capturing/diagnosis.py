@@ -28,22 +28,22 @@ if TYPE_CHECKING:
 
 __all__ = ["of_exposure", "of_photographs", "of_poses", "of_views"]
 
-_WIDTH = 640  # pixels of the longer side at which sharpness is looked at
-_NEIGHBORS = 3  # photographs on each side that say how sharp one should be
+_SHARPNESS_SIZE = 640  # pixels of the longer side at which sharpness is measured: noise of single pixels is gone
+_COMPARED = 3  # photographs on each side that say how sharp one should be: they show much the same
 _BLURRED = 0.3  # of the sharpness of its neighbors: below it a photograph is blurred
-_DARK, _BRIGHT = 0.06, 0.97  # mean gray, in [0, 1]
-_FEW = 12  # photographs with a pose
-_TURN = 8.0  # degrees between neighbors that count as a turn
-_ON_THE_SPOT = 0.2  # of the way that a walk around what is seen would take for the same turn
-_RUN = 2  # turns in a row that are worth a sentence
-_WIDE = 35.0  # degrees between neighbors, seen from what they show, above which they show little in common
-_SHOWN = 3  # names, or gaps, that a finding repeats
-_EXPOSURE_PIXELS = 20_000
-_BAD = 3.0  # dB below the median of the other held-out views
-_FAR = 1.5  # times the usual angle to the nearest training view
-_ALONE = 3.0  # the same, of the only held-out view, whose PSNR nothing is there to compare with
-_SPACED = 40  # photographs that say how far apart they usually are
-_LOWERED = 1.0  # dB by which a single view lowers the mean of all, that are worth telling
+_DARK, _BRIGHT = 0.06, 0.97  # mean gray, in [0, 1], below and above which a photograph shows next to nothing
+_FEW_POSES = 12  # photographs with a pose, below which a scene has holes
+_LEAST_TURN = 8.0  # degrees between neighbors that count as a turn
+_SPOT_SHARE = 0.2  # of the way that a walk around what is seen would take for the same turn
+_FEWEST_TURNS = 2  # turns in a row that are worth a sentence
+_WIDEST_STEP = 35.0  # degrees between neighbors, seen from what they show, above which they show little in common
+_SHOWN = 3  # names, or gaps, that a finding repeats: it is one line
+_EXPOSURE_PIXELS = 20_000  # pixels of a photograph whose colors are compared: points are few, their colors smooth
+_BAD_DB = 3.0  # dB below the median of the other held-out views
+_FAR_VIEW = 1.5  # times the usual distance (`_apart`) to the nearest training view
+_FAR_ALONE = 3.0  # the same, of the only held-out view, whose PSNR nothing is there to compare with
+_SPACING_VIEWS = 40  # photographs that say how far apart they usually are; more would take seconds
+_LOWERED_DB = 1.0  # dB by which a single view lowers the mean of all, that are worth a sentence
 
 
 def of_photographs(
@@ -63,16 +63,16 @@ def of_photographs(
             image = decode(folder / name)
             plain = image if image.ndim == 2 else np.ascontiguousarray(image[..., :3]).mean(axis=2)
             plain = (plain / (255.0 if image.dtype == np.uint8 else 65535.0)).astype(np.float32)
-            scale = _WIDTH / max(plain.shape)
+            scale = _SHARPNESS_SIZE / max(plain.shape)
             if scale < 1:
                 plain = cv2.resize(plain, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
             sharp.append(float(cv2.Laplacian(plain, cv2.CV_32F).var()))
             gray.append(float(plain.mean()))
             bar.advance()
-    found = []
+    findings = []
     if blurred := [name for name, share in zip(names, _relative(sharp), strict=True) if share < _BLURRED]:
         one = "is" if len(blurred) == 1 else "are"
-        found.append(
+        findings.append(
             Finding(
                 "blur",
                 f"{_some(blurred)} {one} blurred, compared with the photographs next to {_them(blurred)}",
@@ -80,25 +80,25 @@ def of_photographs(
             )
         )
     if dark := [name for name, mean in zip(names, gray, strict=True) if not _DARK < mean < _BRIGHT]:
-        found.append(
+        findings.append(
             Finding(
                 "blank",
                 f"{_some(dark)} show next to nothing, too dark or too bright",
                 "leave these out, or take them again in other light",
             )
         )
-    return found
+    return findings
 
 
 def _relative(values: Sequence[float]) -> list[float]:
     """Each value over the median of its neighbors."""
-    found = []
+    ratios = []
     for index, value in enumerate(values):
-        first = max(0, index - _NEIGHBORS)
-        near = [x for other, x in enumerate(values[first : index + _NEIGHBORS + 1], first) if other != index]
+        first = max(0, index - _COMPARED)
+        near = [x for other, x in enumerate(values[first : index + _COMPARED + 1], first) if other != index]
         usual = max(float(np.median(near)), 1e-12) if near else value  # a blank neighbor has a sharpness of 0
-        found.append(value / usual if usual else 1.0)
-    return found
+        ratios.append(value / usual if usual else 1.0)
+    return ratios
 
 
 def of_poses(dataset: Dataset, names: Sequence[str], summary: SfmSummary | None = None) -> list[Finding]:
@@ -109,48 +109,57 @@ def of_poses(dataset: Dataset, names: Sequence[str], summary: SfmSummary | None 
         names: All photographs, in the order in which they were taken.
         summary: What structure from motion said; None where it was not asked.
     """
-    found = []
+    findings = []
     count = len(dataset.views)
     if summary is not None and summary.missing:
         advice = [line.removeprefix("what would help: ") for line in summary.explanation if line.startswith("what")]
         advice = [line for line in advice if not line.startswith("--matcher")]
-        found.append(
+        findings.append(
             Finding(
                 "poses",
                 f"{len(summary.missing)} of {summary.total} photographs have no pose: {runs(summary.missing, names)}",
                 f"take {advice[0]}" if advice and advice[0].startswith("photos") else (advice or ["take more"])[0],
             )
         )
-    if count < _FEW:
-        found.append(
+    if count < _FEW_POSES:
+        findings.append(
             Finding(
                 "poses",
                 f"only {count} photographs have a pose",
                 "take thirty to eighty, each overlapping the one before by two thirds",
             )
         )
-    views = sorted(dataset.views, key=lambda view: view.name)
     if dataset.points is None or not len(dataset.points) or count < 3 or dataset.times:
-        return found
-    depths = [_depth(view, dataset.points) for view in views]
+        return findings
+    return findings + _of_steps(sorted(dataset.views, key=lambda view: view.name), dataset.points)
+
+
+def _of_steps(views: list[View], points: np.ndarray) -> list[Finding]:
+    """Turns on the spot, and gaps, from one photograph to the next.
+
+    Args:
+        views: In the order in which they were taken.
+        points: (P, 3) of the data set.
+    """
+    depths = [_depth(view, points) for view in views]
     usual = float(np.median([depth for depth in depths if depth is not None] or [1.0]))
-    spots, gaps = list[list[str]](), list[tuple[float, str, str]]()
+    spots, gaps, findings = list[list[str]](), list[tuple[float, str, str]](), []
     for before, view, depth in zip(views[:-1], views[1:], depths[1:], strict=True):
         near = depth or usual
         moved = float(np.linalg.norm(view.camera.center - before.camera.center))
         turned = _angle(view.camera.c2w[:3, 2], before.camera.c2w[:3, 2])
-        if turned > _TURN and moved < _ON_THE_SPOT * near * math.radians(turned):
+        if turned > _LEAST_TURN and moved < _SPOT_SHARE * near * math.radians(turned):
             if spots and spots[-1][-1] == before.name:
                 spots[-1].append(view.name)
             else:
                 spots.append([before.name, view.name])
         target = before.camera.center + near * before.camera.c2w[:3, 2]
         parallax = _angle(view.camera.center - target, before.camera.center - target)
-        if min(parallax, 180.0) > _WIDE and turned > _WIDE / 2:
+        if min(parallax, 180.0) > _WIDEST_STEP and turned > _WIDEST_STEP / 2:
             gaps.append((parallax, before.name, view.name))
-    if turns := [spot for spot in spots if len(spot) > _RUN]:
+    if turns := [spot for spot in spots if len(spot) > _FEWEST_TURNS]:
         shown = ", ".join(f"{spot[0]} to {spot[-1]}" for spot in turns[:_SHOWN])
-        found.append(
+        findings.append(
             Finding(
                 "turn",
                 f"from {shown} you turned on the spot",
@@ -162,10 +171,10 @@ def of_poses(dataset: Dataset, names: Sequence[str], summary: SfmSummary | None 
     wide = [gap for gap in gaps if not _is_filled(gap, views, usual)][:_SHOWN]
     if wide:
         shown = ", ".join(f"{a} and {b} ({angle:.0f} degrees apart)" for angle, a, b in wide)
-        found.append(
+        findings.append(
             Finding("overlap", f"too little overlap between {shown}", "take two or three photographs in between")
         )
-    return found
+    return findings
 
 
 def _is_filled(gap: tuple[float, str, str], views: Sequence[View], usual: float) -> bool:
@@ -228,25 +237,25 @@ def of_views(dataset: Dataset, train: Sequence[str], psnr: Mapping[str, float]) 
     by_name = {view.name: view for view in dataset.views}
     fitted = [by_name[name] for name in train if name in by_name]
     apart = {name: _apart(by_name[name], fitted) for name in psnr if name in by_name}
-    some = fitted[:: -(-len(fitted) // _SPACED)] if fitted else []
+    some = fitted[:: -(-len(fitted) // _SPACING_VIEWS)] if fitted else []
     spacing = [_apart(view, [other for other in fitted if other is not view]) for view in some]
     usual = float(np.median([*spacing, *apart.values()])) if fitted else 0.0
     others = {name: [x for other, x in psnr.items() if other != name] for name in psnr}
     if len(psnr) > 1:
-        bad = sorted((value, name) for name, value in psnr.items() if value < np.median(others[name]) - _BAD)
+        bad = sorted((value, name) for name, value in psnr.items() if value < np.median(others[name]) - _BAD_DB)
     else:
-        bad = [(value, name) for name, value in psnr.items() if apart.get(name, 0.0) > _ALONE * usual]
-    found = []
+        bad = [(value, name) for name, value in psnr.items() if apart.get(name, 0.0) > _FAR_ALONE * usual]
+    findings = []
     for value, name in bad[:_SHOWN]:
-        far = apart.get(name, 0.0) > _FAR * usual
-        told = f"held-out view {name} has {value:.1f} dB"
+        far = apart.get(name, 0.0) > _FAR_VIEW * usual
+        text = f"held-out view {name} has {value:.1f} dB"
         if others[name]:
-            told += f", the others {np.median(others[name]):.1f}"
+            text += f", the others {np.median(others[name]):.1f}"
             mean, without = np.mean(list(psnr.values())), np.mean(others[name])
-            if without - mean >= _LOWERED:
-                told += f", and their mean is {mean:.1f} dB, without it {without:.1f}"
+            if without - mean >= _LOWERED_DB:
+                text += f", and their mean is {mean:.1f} dB, without it {without:.1f}"
         else:
-            told += ", and is the only one"
+            text += ", and is the only one"
         nearest = min(fitted, key=lambda view: _apart(by_name[name], [view])).name if fitted and name in by_name else ""
         why = f": the nearest photograph, {nearest}, looks from elsewhere, maybe nothing else shows what it does"
         advice = (
@@ -254,8 +263,8 @@ def of_views(dataset: Dataset, train: Sequence[str], psnr: Mapping[str, float]) 
             if far
             else f"look at it in the report: is {name} blurred, or is something in it that moved?"
         )
-        found.append(Finding("view", f"{told}{why if far and nearest else ''}", advice))
-    return found
+        findings.append(Finding("view", f"{text}{why if far and nearest else ''}", advice))
+    return findings
 
 
 def _apart(view: View, others: Sequence[View]) -> float:

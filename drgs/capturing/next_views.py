@@ -35,13 +35,13 @@ if TYPE_CHECKING:
 
 __all__ = ["rank_next"]
 
-_PIXELS = 20_000  # of views whose information is compared
-_SOLID = 0.3  # opacity of Gaussians that one does not walk through
-_MOST_SOLID = 20_000
-_EMPTY = 0.25  # of a picture, that may show nothing beyond what photographs leave empty: a hole is to be looked at
-_LOOK = 2_500  # pixels of a picture that says how much shows nothing
-_MOST_PHOTOGRAPHS = 8  # of those there are, that the gain is compared with
-_SPREAD = 3.0  # times the median distance of cameras and what they see: floaters are beyond
+_INFORMATION_PIXELS = 20_000  # pixels of a view whose information is compared: a ranking takes many views
+_SOLID_OPACITY = 0.3  # opacity of Gaussians that one does not walk through
+_MOST_OBSTACLES = 20_000  # of these, that paths are compared with
+_MOST_EMPTY = 0.25  # share of a picture that may show nothing beyond what photographs leave empty: holes are wanted
+_EMPTY_PIXELS = 2_500  # pixels of the picture that says so
+_COMPARED_PHOTOGRAPHS = 8  # of those there are, whose own gain a place's is divided by
+_FARTHEST = 3.0  # times the median distance of Gaussians from the cameras: beyond are floaters
 
 
 def rank_next(run: Path, k: int, length: str | None, show: bool = True) -> list[dict[str, Any]]:
@@ -53,8 +53,8 @@ def rank_next(run: Path, k: int, length: str | None, show: bool = True) -> list[
         length: Two photographs and the distance between them, from which meters follow; None: shares of the way.
         show: Whether to show progress.
     Returns:
-        The picks of the file, the best first, with `text`: what to do, and `gain`: what it would tell, over what one of
-        the photographs that are there tells beside all others, on average.
+        The picks of the file, the best first, with `text`: what to do, and `gain`: its information gain over that of
+        one of the photographs that are there beside all others, on average.
     Raises:
         FileNotFoundError: If it is no run, or its data set has gone.
         ValueError: If things move, the photographs say nothing of where one can stand, or `length` is wrong.
@@ -67,7 +67,7 @@ def rank_next(run: Path, k: int, length: str | None, show: bool = True) -> list[
             raise ValueError(f"{run}: --more must have a scene that stands still, this one moves; use drgs select")
         record.check_data(run)
         dataset = load_dataset(record.data, record.config, lazy=True, points=False, semantics=False)
-        pixels = min(_PIXELS, record.config.data.max_pixels)
+        pixels = min(_INFORMATION_PIXELS, record.config.data.max_pixels)
         cameras = {view.name: _camera(view, pixels) for view in record.with_refined_poses(dataset).views}
         meters = None if length is None else meters_of(length, {name: x.center for name, x in cameras.items()})
         train = [cameras[name] for name in fitted_views(folder, record) if name in cameras]
@@ -90,7 +90,7 @@ def rank_next(run: Path, k: int, length: str | None, show: bool = True) -> list[
         # What one of the photographs that are there adds to all others, on average.
         usual = statistics.mean(
             select(loaded.scene, [one], [x for x in train if x is not one], 1, scoring=scoring, cache=cache).scores[0]
-            for one in train[:: -(-len(train) // _MOST_PHOTOGRAPHS)]
+            for one in train[:: -(-len(train) // _COMPARED_PHOTOGRAPHS)]
         )
         rows = [{"index": i, "name": place.camera.name} for i, place in enumerate(places)]
         after = [_place_json(place, meters) for place in places]
@@ -120,7 +120,7 @@ def _places(gaussians: Gaussians, cameras: list[Camera], train: list[Camera], se
     obstacles = _solid(gaussians, train)
     places = places_around(cameras, upright(cameras), seen_distance(gaussians), obstacles)
     # What looks past the scene would tell most, of what nobody wants to see.
-    most = _EMPTY + max(_empty_share(gaussians, camera, settings) for camera in train)
+    most = _MOST_EMPTY + max(_empty_share(gaussians, camera, settings) for camera in train)
     return [place for place in places if _empty_share(gaussians, place.camera, settings) <= most]
 
 
@@ -142,15 +142,15 @@ def _camera(view: View, pixels: int) -> Camera:
 def _empty_share(gaussians: Gaussians, camera: Camera, settings: RenderSettings) -> float:
     """Share of a picture in which nothing is seen."""
     with torch.no_grad():  # looked at only
-        alpha = render(gaussians, at_most(camera, _LOOK), settings, outputs=()).alpha
+        alpha = render(gaussians, at_most(camera, _EMPTY_PIXELS), settings, outputs=()).alpha
     return float((alpha.cpu() < 0.5).float().mean())
 
 
 def _solid(gaussians: Gaussians, cameras: list[Camera]) -> np.ndarray:
     """(P, 3) centers of Gaussians that one does not walk through."""
     means = gaussians.means.detach().cpu().double().numpy() + gaussians.origin  # looked at only
-    solid = means[gaussians.opacities.detach().cpu().numpy() > _SOLID]
+    solid = means[gaussians.opacities.detach().cpu().numpy() > _SOLID_OPACITY]
     middle = np.median(np.stack([camera.center for camera in cameras]), axis=0)
     far = np.linalg.norm(solid - middle, axis=1)
-    solid = solid[far <= _SPREAD * np.median(far)] if len(solid) else solid
-    return solid[:: max(1, -(-len(solid) // _MOST_SOLID))]
+    solid = solid[far <= _FARTHEST * np.median(far)] if len(solid) else solid
+    return solid[:: max(1, -(-len(solid) // _MOST_OBSTACLES))]

@@ -104,8 +104,8 @@ def _explained(capture: Capture) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        found = "".join(f"; {finding.line()}" for finding in capture.batch.findings)
-        raise ValueError(f"poses: {error}{found}") from None
+        reasons = "".join(f"; {finding.line()}" for finding in capture.batch.findings)
+        raise ValueError(f"poses: {error}{reasons}") from None
 
 
 def _shown_by(bar: Bar) -> Callable[[str], None]:

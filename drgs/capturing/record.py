@@ -136,7 +136,7 @@ class CaptureRecord:
         )
 
     def done(self, step: DoneStep, findings: Sequence[Finding] = ()) -> None:
-        """Add a step to the last batch, with what was found in it, and write."""
+        """Add a step to the last batch, with its findings, and write."""
         self.batch.steps.append(step)
         self.batch.findings += findings
         self.write()

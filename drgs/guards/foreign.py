@@ -44,9 +44,9 @@ def refuse_foreign(path: Path, wanted: str) -> None:
             return
     with path.open("rb") as file:
         head = file.read(_HEAD)
-    found = _lfs(head, path) or _splats(head, path) or _other(head, path)
-    if found:
-        raise ValueError(f"{path}: must be {wanted}, is {found[0]}; {found[1]}")
+    other = _lfs(head, path) or _splats(head, path) or _other(head, path)
+    if other:
+        raise ValueError(f"{path}: must be {wanted}, is {other[0]}; {other[1]}")
 
 
 def _conversion(path: Path, suffix: str) -> str:

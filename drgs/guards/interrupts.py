@@ -74,8 +74,8 @@ class _Handlers:
 
     def watch(self, pipe: int, leave: Callable[[int], None]) -> None:
         """Hear of a signal when it comes, in a second thread, and leave if the main thread does not answer."""
-        while (found := os.read(pipe, 64)) and 0 not in found:
-            numbers = [number for number in found if number in _SIGNALS]
+        while (received := os.read(pipe, 64)) and 0 not in received:
+            numbers = [number for number in received if number in _SIGNALS]
             if not numbers:
                 continue
             began = time.monotonic()

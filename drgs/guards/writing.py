@@ -21,9 +21,9 @@ def named(path: Path, error: OSError) -> OSError:
     advice = "free some space" if error.errno in _FULL else "allow it" if error.errno in _CLOSED else ""
     if not advice:
         return error
-    told = OSError(f"{path}: must be written, got: {error.strerror}; {advice} or choose another folder")
-    told.errno = error.errno
-    return told
+    sentence = OSError(f"{path}: must be written, got: {error.strerror}; {advice} or choose another folder")
+    sentence.errno = error.errno
+    return sentence
 
 
 def check_room(folder: Path, needed: float = 0.0) -> None:

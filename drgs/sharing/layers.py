@@ -105,7 +105,7 @@ def moments_of(moving: DynamicGaussians, times: Sequence[float], rest: Gaussians
         rest: Those that the page's archive holds.
         order: (N,) the archive's order of them.
     Returns:
-        What a page is told of it; indices of what moves in the archive's order, uint32; (T, 10, M) uint16 means, log
+        JSON that the page reads; indices of what moves in the archive's order, uint32; (T, 10, M) uint16 means, log
         scales and quaternions (wxyz) of these, as if they were there all the time, each within its own range; and
         (9, M) float32 center and width in time (0: always there), velocity, acceleration and time of birth, which a
         page adds.
@@ -117,19 +117,19 @@ def moments_of(moving: DynamicGaussians, times: Sequence[float], rest: Gaussians
         for time in times:
             numbers.append(_numbers(moving.at(time))[:, order])
             bar.advance()
-    found = np.stack(numbers)  # (T, 10, N)
-    quats = found[:, 6:]
+    values = np.stack(numbers)  # (T, 10, N)
+    quats = values[:, 6:]
     quats *= np.where((quats * quats[:1]).sum(1, keepdims=True) < 0, -1, 1)  # q and -q are one turn: the nearer one
     still = _numbers(rest)[:, order]
     extent = np.ptp(still[:3], axis=1).max()
     scale = np.array([extent] * 3 + [1.0] * 7)[:, None]
-    moves = ((np.ptp(found, axis=0) / scale).max(0) > _STILL) | ((np.abs(found[0] - still) / scale).max(0) > _STILL)
+    moves = ((np.ptp(values, axis=0) / scale).max(0) > _STILL) | ((np.abs(values[0] - still) / scale).max(0) > _STILL)
     places = np.flatnonzero(moves | living)
-    found = found[:, :, places]
-    low = found.min((0, 2)) if len(places) else np.zeros(10)
-    high = found.max((0, 2)) if len(places) else np.zeros(10)
+    values = values[:, :, places]
+    low = values.min((0, 2)) if len(places) else np.zeros(10)
+    high = values.max((0, 2)) if len(places) else np.zeros(10)
     span = np.where(high > low, high - low, 1.0)[:, None]
-    codes = np.rint((found - low[:, None]) / span * 65535)
+    codes = np.rint((values - low[:, None]) / span * 65535)
     known = {"times": [float(x) for x in times], "count": len(places), "low": low.tolist(), "high": high.tolist()}
     there = np.zeros((9, len(places)))
     if lives is not None:

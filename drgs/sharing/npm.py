@@ -138,10 +138,10 @@ def _fetched(package: Package) -> bytes:
 
 def _checked(package: Package, archive: bytes) -> dict[str, bytes]:
     """Name -> content of the files that are kept of an archive."""
-    found = base64.b64encode(hashlib.sha512(archive).digest()).decode()
-    if found != package.sha512:
+    digest = base64.b64encode(hashlib.sha512(archive).digest()).decode()
+    if digest != package.sha512:
         raise ValueError(
-            f"share: {package.address} must have the SHA-512 {package.sha512[:12]}..., has {found[:12]}...; it was "
+            f"share: {package.address} must have the SHA-512 {package.sha512[:12]}..., has {digest[:12]}...; it was "
             "changed on the way, fetch it from another network"
         )
     content = {}

@@ -33,7 +33,7 @@ def scene_html(
     Args:
         title: Name of the scene.
         lines: Sentences about it.
-        scene: What `page.js` is told, as JSON.
+        scene: What `page.js` reads, JSON.
         parts: Name -> bytes of the larger things: `gaussians`, an archive of SOG, and what layers are made of.
         viewer: Folder with the packages of npm (`npm.viewer_files`).
     """

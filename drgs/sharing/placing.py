@@ -18,7 +18,7 @@ _AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # of OpenGL's cameras, which look along
 
 
 def photo(camera: Camera, kind: PhotoKind, origin: np.ndarray) -> dict[str, Any]:
-    """What a page is told of a camera.
+    """A camera as a page reads it.
 
     Args:
         camera: A pinhole.

@@ -29,7 +29,7 @@ class BuildWithViewer(build_py):
         if self.editable_mode:
             return
         try:
-            found = _npm().viewer_files()
+            viewer = _npm().viewer_files()
         except OSError as error:
             self.warn(f"the wheel goes without the viewer of `drgs share`: {error}")
             return
@@ -37,7 +37,7 @@ class BuildWithViewer(build_py):
             for name in package.files:
                 target = Path(self.build_lib) / "drgs" / "sharing" / "npm" / package.folder / name
                 target.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(found / package.folder / name, target)
+                shutil.copyfile(viewer / package.folder / name, target)
 
 
 def _npm() -> ModuleType:

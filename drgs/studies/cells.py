@@ -125,14 +125,14 @@ class Study:
         """The cells of units (scene, split or camera held out, start, protocol, seed), units outermost: what is there
         at any time is a complete study of fewer units, one unit aside for each process.
         """
-        found = []
+        cells = []
         for scene, held_out, start, protocol, seed in units:
             split, camera = ((0, 0), held_out) if isinstance(held_out, str) else (held_out, "")
-            found += [Cell(scene, split, start, policy, protocol, seed, camera) for policy in self.policies]
-        return found
+            cells += [Cell(scene, split, start, policy, protocol, seed, camera) for policy in self.policies]
+        return cells
 
     def config_of(self, cell: Cell) -> FitConfig:
-        """What the fit of a cell is told."""
+        """The configuration of the fit of a cell."""
         (every, offset) = cell.split
         protocol = PROTOCOLS[cell.protocol]
         changed: dict[str, Any] = {"seed": cell.seed, "test_every": every, "test_offset": offset}
@@ -147,14 +147,14 @@ class Study:
 
     def _made(self, cell: Cell) -> Path:
         """The folder of a cell's data set, once no other process is making it any more."""
-        told = False
+        is_announced = False
         while True:
             try:
                 return self.folder(cell.scene, cell.split)
             except InUse as busy:
-                if not told:
+                if not is_announced:
                     _log.warning("waiting: %s", busy)
-                told = True
+                is_announced = True
                 time.sleep(_PATIENCE)
 
     def dataset(self, cell: Cell) -> Dataset:
@@ -201,12 +201,12 @@ def distinct_seeds(study: Study, scene: str, split: tuple[int, int], count: int,
             f"{selection.initial} at the start and {picked} to be picked, has {len(train)}; add photographs, or "
             "hold out fewer"
         )
-    found: dict[frozenset[int], int] = {}
+    seeds: dict[frozenset[int], int] = {}
     for seed in range(100 * count if count <= len(train) else 0):
         config = study.config_of(dataclasses.replace(cell, seed=seed))
-        found.setdefault(frozenset(ActiveViews(train, config).chosen), seed)
-        if len(found) == count:
-            return list(found.values())
+        seeds.setdefault(frozenset(ActiveViews(train, config).chosen), seed)
+        if len(seeds) == count:
+            return list(seeds.values())
     raise ValueError(
         f"{scene}: must have {count} sets of initial views, its {len(train)} training views give fewer; ask for less"
     )
@@ -249,7 +249,7 @@ def run_cells(
 ) -> tuple[list[Cell], dict[Cell, str]]:
     """Work through cells, in their order; rows are appended as they come.
 
-    A fit that fails is told and left for the next call; the others go on, unless there is no room left on the disk.
+    A fit that fails is reported and left for the next call; the others go on, unless there is no room left on the disk.
 
     Args:
         study, cells: What to do.
@@ -264,16 +264,16 @@ def run_cells(
     """
     taken = list[Cell]()
     failed = dict[Cell, str]()
-    told = set[str]()
+    announced = set[str]()
     for number, cell in enumerate(cells, 1):
         known = read_study(rows)
         if is_done(study.name, cell, known, study.measured_later):
             continue
         out = out_of_race(study, known, cell.protocol)
         for sentence in out.values():
-            if sentence not in told:
+            if sentence not in announced:
                 say(sentence)
-                told.add(sentence)
+                announced.add(sentence)
         if cell.policy in out:
             continue
         say(f"{number} of {len(cells)}: {cell.name}")
@@ -301,7 +301,7 @@ def out_of_race(study: Study, rows: Iterable[Mapping[str, Any]], protocol: str) 
 
 
 def result_line(study: Study, cell: Cell, row: Mapping[str, Any]) -> str:
-    """What a finished cell has found, in a line."""
+    """The metrics of a finished cell, in a line."""
     numbers = ", ".join(_said(m, row["metrics"][m.key]) for m in study.metrics)
     return f"{cell.name}: {numbers}" + (f", {row['seconds']:.0f} s" if row["seconds"] is not None else "")
 
@@ -315,12 +315,12 @@ def _check_same(run: Run, config: FitConfig) -> None:
     was = fit_record(run).config
     if config.data.undistort == "auto":  # the run has recorded what that was
         was = was.replace(data=dataclasses.replace(was.data, undistort="auto"))
-    found = config.difference(was)
-    if found is None and config.selection is not None:
+    change = config.difference(was)
+    if change is None and config.selection is not None:
         mine, theirs = config.selection.flat(), (was.selection or SelectionConfig()).flat()
-        found = next(((name, x, theirs[name]) for name, x in mine.items() if x != theirs[name]), None)
-    if found is not None:
-        name, now, before = found
+        change = next(((name, x, theirs[name]) for name, x in mine.items() if x != theirs[name]), None)
+    if change is not None:
+        name, now, before = change
         raise ValueError(
             f"{run.path}: must be the run of this cell, {name} was {before!r} and is {now!r}; "
             "give the study another name, or move the folder away"
@@ -339,7 +339,7 @@ def _metrics(run: Run) -> dict:
 
 
 def _row(study: Study, cell: Cell, run: Run) -> dict:
-    """What a finished run found."""
+    """The row of a finished run."""
     metrics = _metrics(run)
     env = read_json(run.path / "env.json", "where a run ran", _ADVICE)
     measured: list[dict] = []

@@ -69,14 +69,7 @@ def plan_of(
     """
     experiment = EXPERIMENTS[name]
     moves = experiment.study == "dynamic"
-    if moves and PROTOCOLS[protocol].static:
-        able = ", ".join(key for key, x in PROTOCOLS.items() if not x.static)
-        raise ValueError(f"reproduce: --protocol must be one of {able} where things move, got {protocol}; choose one")
-    if unknown := [label for label in policies if label not in experiment.policies]:
-        known = "; ".join(experiment.policies)
-        raise ValueError(f"reproduce: --policy must be one of: {known}; got {unknown[0]!r}; correct it")
-    if seeds < 1:
-        raise ValueError(f"reproduce: --seeds must be at least 1, got {seeds}; raise it")
+    _check_options(experiment, moves, protocol, policies, seeds)
     wanted = [label for label in experiment.policies if not policies or label in policies]
     scenes = {path.resolve().name: path.resolve() for path in given}
     if len(scenes) < len(given):
@@ -100,17 +93,36 @@ def plan_of(
             path, test_every=split[0], test_offset=split[1], lazy=True, points=False, times=study.fit.data.times
         )
         turns.append(_units_of(study, scene, dataset, moves, splits, seeds, protocol))
-        told, missing = _missing(study, scene, dataset)
-        notes += told
+        sentences, missing = _missing(study, scene, dataset)
+        notes += sentences
         lacking |= {(scene, label) for label in missing}
     units = [turn[k] for k in range(seeds) for turn in turns]  # seeds outermost, as of scenes that are made
-    if not given and moves:
-        units = [(f"kitchen-{seed}", _CAMERA, "first", protocol, 0) for seed in range(1, seeds + 1)]
-    elif not given:
-        drawn = {scene: distinct_seeds(study, scene, MADE_SPLIT, seeds, protocol) for scene in _ROOMS[scale]}
-        units = [(scene, MADE_SPLIT, "seed", protocol, drawn[scene][k]) for k in range(seeds) for scene in drawn]
+    if not given:
+        units = _made_units(study, scale, moves, seeds, protocol)
     cells = [cell for cell in study.cells(units) if (cell.scene, cell.policy) not in lacking]
     return StudyPlan(experiment, study, tuple(cells), tuple(notes))
+
+
+def _check_options(
+    experiment: Experiment, moves: bool, protocol: ProtocolName, policies: Sequence[str], seeds: int
+) -> None:
+    """Refuse options that an experiment does not have."""
+    if moves and PROTOCOLS[protocol].static:
+        able = ", ".join(key for key, x in PROTOCOLS.items() if not x.static)
+        raise ValueError(f"reproduce: --protocol must be one of {able} where things move, got {protocol}; choose one")
+    if unknown := [label for label in policies if label not in experiment.policies]:
+        known = "; ".join(experiment.policies)
+        raise ValueError(f"reproduce: --policy must be one of: {known}; got {unknown[0]!r}; correct it")
+    if seeds < 1:
+        raise ValueError(f"reproduce: --seeds must be at least 1, got {seeds}; raise it")
+
+
+def _made_units(study: Study, scale: StudyScale, moves: bool, seeds: int, protocol: ProtocolName) -> list:
+    """Units of scenes that are made, seeds outermost."""
+    if moves:
+        return [(f"kitchen-{seed}", _CAMERA, "first", protocol, 0) for seed in range(1, seeds + 1)]
+    drawn = {scene: distinct_seeds(study, scene, MADE_SPLIT, seeds, protocol) for scene in _ROOMS[scale]}
+    return [(scene, MADE_SPLIT, "seed", protocol, drawn[scene][k]) for k in range(seeds) for scene in drawn]
 
 
 def _units_of(
@@ -165,5 +177,5 @@ def _missing(study: Study, scene: str, dataset: data.Dataset) -> tuple[list[str]
         for label, fields in study.policies.items()
         if fields is not None and "semantic" in (fields.get("blocks") or ())
     ]
-    told = f"{scene} has no teacher's maps: its rows have no accuracies and no mIoU"
-    return [f"{told}, and without features there is no {'; '.join(lacks)}." if lacks else f"{told}."], lacks
+    text = f"{scene} has no teacher's maps: its rows have no accuracies and no mIoU"
+    return [f"{text}, and without features there is no {'; '.join(lacks)}." if lacks else f"{text}."], lacks

@@ -68,8 +68,8 @@ def read_study(*paths: Path) -> list[dict]:
 
 def is_done(study: str, cell: Cell, rows: Iterable[Mapping[str, Any]], keys: Iterable[str]) -> bool:
     """Whether a cell has a row that holds these metrics, be it None for what could not be computed."""
-    found = [row for row in rows if cell_of(row) == (study, cell)]
-    return any(set(keys) <= set(row["metrics"]) for row in found)
+    matching = [row for row in rows if cell_of(row) == (study, cell)]
+    return any(set(keys) <= set(row["metrics"]) for row in matching)
 
 
 def append_row(path: Path, row: Mapping[str, Any]) -> None:
