@@ -29,7 +29,7 @@ import torch  # noqa: E402
 from where import ran  # noqa: E402
 
 from drgs.files import Run, load_ply, load_state  # noqa: E402
-from drgs.guards import unfinished  # noqa: E402
+from drgs.io import atomic  # noqa: E402
 from drgs.scenes import kitchen, room, still_life  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
 
@@ -91,7 +91,7 @@ def check_whole(path: Path) -> int:
     run = Run(path)
     logged = 0
     for file in sorted(path.rglob("*")):
-        if not file.is_file() or unfinished.PATTERN.fullmatch(file.name) or file.name.startswith("."):
+        if not file.is_file() or atomic.PATTERN.fullmatch(file.name) or file.name.startswith("."):
             continue
         if file.suffix == ".json":
             json.loads(file.read_text())

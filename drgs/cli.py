@@ -48,7 +48,7 @@ from drgs.commands.options import (
 )
 from drgs.commands.renamed import as_written_now
 from drgs.display.progress import Bar
-from drgs.guards import interrupts
+from drgs.io import interrupts
 
 __all__ = ["main"]
 
@@ -100,7 +100,7 @@ def main(argv: list[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         _complain(argv[0], str(error))
         return 2
-    from drgs.guards import outputs  # not for --help
+    from drgs.io import outputs  # not for --help
 
     name = next(name for name, options in _OPTIONS.items() if type(args) is options)
     logging.basicConfig(format="%(message)s", handlers=[_Stderr()])

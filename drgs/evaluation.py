@@ -17,11 +17,11 @@ from drgs.sizes import reduced_size
 if TYPE_CHECKING:
     from drgs.data import Dataset, View
     from drgs.deform import DynamicGaussians
-    from drgs.files import Run
     from drgs.fitting.frames import Frame
     from drgs.fitting.records import LoadedRun
     from drgs.fitting.segments import Segmentation
-    from drgs.guards.outputs import Claim
+    from drgs.io.outputs import Claim
+    from drgs.io.run import Run
 
 __all__ = ["evaluate_run"]
 

@@ -16,18 +16,19 @@ import torch
 from drgs.display.pictures import file_names, write_png
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
-from drgs.files import SCHEMA, write_json
 from drgs.fitting.losses import psnr_of
 from drgs.guards.archives import check_archive
 from drgs.integrator import render
+from drgs.io.journal import SCHEMA
+from drgs.io.outputs import write_json
 from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Scene
-    from drgs.files import Run
     from drgs.fitting.frames import Frame
     from drgs.fitting.segments import Segmentation
     from drgs.integrator import Output
+    from drgs.io.run import Run
 
 __all__ = [
     "METRICS",

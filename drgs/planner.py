@@ -41,14 +41,14 @@ import torch
 from drgs import runtime
 from drgs.cameras import Camera, camera_list
 from drgs.ellipsoids import Gaussians
-from drgs.files import load_state, save_state, state_header
 from drgs.fitting.config import FitConfig
 from drgs.fitting.online import OnlineFit
 from drgs.gain import Information
-from drgs.guards import unfinished
 from drgs.guards.arguments import ArgumentError, check_path, kind_of, must_be
 from drgs.guards.camera_checks import as_numpy
-from drgs.guards.json_files import check_json, parse_json
+from drgs.io import atomic
+from drgs.io.checkpoint import load_state, save_state, state_header
+from drgs.io.json_files import check_json, parse_json
 from drgs.select import Scoring, select
 from drgs.selection.cache import Cache, NotKept, named_by
 from drgs.selection.informed import compute_candidates
@@ -689,8 +689,8 @@ def _write_file(path: str | os.PathLike, tensors: dict[str, torch.Tensor], heade
         raise ValueError(f"Planner.save: notes must be JSON, got what is none ({error}); leave it out") from None
     if path.parent.is_dir():
         for other in path.parent.iterdir():
-            if other.name.startswith(f".drgs.{path.name}.") and unfinished.is_left_over(other.resolve()):
-                unfinished.delete(other)
+            if other.name.startswith(f".drgs.{path.name}.") and atomic.is_left_over(other.resolve()):
+                atomic.delete(other)
     tensors = _apart(tensors)
     save_state(path, tensors, {"kind": _KIND, **header, "digest": _digest(tensors, header)})
 

@@ -20,12 +20,12 @@ import numpy as np
 import torch
 
 from drgs import metrics, runtime
+from drgs.codecs.ply import save_ply
 from drgs.data.camera_lists import save_cameras_json
 from drgs.data.view_checks import check_cameras, check_parallax
 from drgs.display.pictures import file_names, write_png
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
-from drgs.files import Run, save_ply, save_state
 from drgs.fitting.active import ActiveViews
 from drgs.fitting.config import (
     ActiveConfig,
@@ -55,10 +55,12 @@ from drgs.fitting.start import motion_of, start
 from drgs.fitting.telling import told
 from drgs.fitting.threads import fewer_torch_threads, one_thread
 from drgs.fitting.trainer import StepResult, Trainer
-from drgs.guards import interrupts
 from drgs.guards.memory import is_out_of_memory
-from drgs.guards.outputs import claim
 from drgs.integrator import render
+from drgs.io import interrupts
+from drgs.io.checkpoint import save_state
+from drgs.io.outputs import claim
+from drgs.io.run import Run
 from drgs.runtime.machine import peak_memory
 
 if TYPE_CHECKING:

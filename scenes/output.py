@@ -8,8 +8,8 @@ import os
 
 import numpy as np
 
-from drgs.guards import unfinished
-from drgs.guards.outputs import claim
+from drgs.io import atomic
+from drgs.io.outputs import claim
 
 __all__ = ["DEPTH_UNIT", "check_numbers", "publish", "write_depth", "write_file", "write_png"]
 
@@ -70,14 +70,14 @@ def publish(out_dir, parameters, fill, where):
                 f"{where}: {partial} must be what an interrupted call has left, it was not made here; move it away"
             )
         if not (mark.is_file() and mark.read_text() == digest):
-            unfinished.delete(partial)
+            atomic.delete(partial)
             partial.mkdir()
             write_file(mark, digest.encode())
         try:
             fill(partial)
         except BaseException:
             if not any(path.is_file() and path != mark for path in partial.rglob("*")):
-                unfinished.delete(partial)  # nothing to go on with
+                atomic.delete(partial)  # nothing to go on with
             raise
         stamped = json.dumps({"sha256": digest, **parameters}, indent=1) + "\n"
         write_file(partial / "params.json", stamped.encode())

@@ -33,9 +33,10 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"cameras", "ellipsoids", "sizes"}, "the two things that a view is made of, and how large it is looked at"),
     ({"splats"}, "cameras and Gaussians as tensors that make them"),
     ({"oracle", "reference"}, "the truth: below the engine, so that it cannot borrow from what it checks"),
-    ({"files", "display"}, "what is written, for machines and people"),
+    ({"io.run", "display"}, "what is written, for machines and people"),
     ({"scenes"}, "made data sets, path traced by Mitsuba: they know nothing of Gaussians"),
     ({"codecs"}, "Gaussians in the formats of others"),
+    ({"files"}, "files, for users"),
     ({"tracing"}, "the engine"),
     ({"integrator", "plugin"}, "rendering with it, from torch and from Mitsuba"),
     (

@@ -356,7 +356,7 @@ def test_archives_with_broken_places(tmp_path):
     """
     from drgs.data.checks import read_npz
     from drgs.features.teacher import read_map
-    from drgs.guards.foreign import refuse_foreign
+    from drgs.io.foreign import refuse_foreign
 
     path = tmp_path / "points.npz"
     np.savez(path, data=np.ones((2, 7)))

@@ -229,7 +229,7 @@ def test_bad_files_are_refused_in_one_line(tmp_path, rng):
 
 def test_lists_and_empty_rows_claim_nothing(tmp_path):
     """A list says how long it is where no header does, rows without a column take no byte: neither is believed."""
-    from drgs.guards.ply_headers import ply_source
+    from drgs.codecs.ply_headers import ply_source
 
     write(tmp_path / "a.ply", header(["x"]).replace("property float x", "property list uint float x"), b"\xff" * 8)
     with pytest.raises(ValueError, match="a 3DGS PLY must have the vertex columns"):

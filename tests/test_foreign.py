@@ -1,4 +1,4 @@
-"""Claims of drgs.guards.foreign: a file of another kind is named as what it is, with the way round."""
+"""Claims of drgs.io.foreign: a file of another kind is named as what it is, with the way round."""
 
 from __future__ import annotations
 

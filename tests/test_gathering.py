@@ -18,7 +18,7 @@ from drgs import cli
 from drgs.data import load
 from drgs.data.checks import list_images
 from drgs.data.gathering import FRAMES, gather, joined_frames, named_files, recorded_frames, usable_files
-from drgs.guards.outputs import claim
+from drgs.io.outputs import claim
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Claims of drgs.guards.interrupts: signals end a command soon and cleanly, and a fit at a step's end."""
+"""Claims of drgs.io.interrupts: signals end a command soon and cleanly, and a fit at a step's end."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 
 import drgs
-from drgs.guards import interrupts
 from drgs.information import jacobian
+from drgs.io import interrupts
 from drgs.tracing.composite import Compositor
 
 # A command that waits in Python, or in native code that no signal ends, which takes minutes.
 _COMMAND = """
 import hashlib, sys, time
 from pathlib import Path
-from drgs.guards import interrupts
-from drgs.guards import outputs
-from drgs.guards import unfinished
+from drgs.io import interrupts
+from drgs.io import outputs
+from drgs.io import atomic
 
 def native():
     hashlib.pbkdf2_hmac("sha256", b"x", b"y", 10**9)
@@ -37,7 +37,7 @@ def wait(kind):
 try:
     say = lambda error: type(error).__name__ + "\\n"
     with interrupts.handled(outputs.clean, say):
-        with outputs.claim(sys.argv[1], "fit"), unfinished.temporary_folder("sfm", sys.argv[1]) as folder:
+        with outputs.claim(sys.argv[1], "fit"), atomic.temporary_folder("sfm", sys.argv[1]) as folder:
             (folder / "a").write_text("b")
             if sys.argv[2] == "callback":
                 with interrupts.in_native_code():
@@ -129,7 +129,7 @@ def test_the_same_signal_again_once_the_command_has_ended(wait):
     """While the process says its line, and while Python shuts down; a second later it is one more, which ends it."""
     code = f"""
 import atexit, os, signal, time
-from drgs.guards import interrupts
+from drgs.io import interrupts
 atexit.register(lambda: (os.kill(os.getpid(), signal.SIGTERM), print("still here", flush=True)))
 try:
     with interrupts.handled(lambda: None, str):
@@ -148,7 +148,7 @@ def test_another_signal_later_is_no_repetition():
     """A program that goes on after a command was ended has its own handlers back after that second."""
     code = """
 import signal, time
-from drgs.guards import interrupts
+from drgs.io import interrupts
 try:
     with interrupts.handled(lambda: None, str):
         signal.raise_signal(signal.SIGTERM)
@@ -210,7 +210,7 @@ def test_ignored_signals_stay_ignored():
 def test_pycolmap_does_not_take_sigterm(tmp_path):
     """Imported where drgs imports it, SIGTERM is still ours; by itself it prints a stack of C++ frames."""
     code = (
-        "import signal, os; from drgs.guards import interrupts\n"
+        "import signal, os; from drgs.io import interrupts\n"
         "with interrupts.between_steps() as is_interrupted:\n"
         "    from drgs.data.colmap_bindings import pycolmap\n"
         "    os.kill(os.getpid(), signal.SIGTERM); print(is_interrupted(), flush=True)\n"

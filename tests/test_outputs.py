@@ -1,4 +1,4 @@
-"""Claims of drgs.guards.outputs and drgs.guards.locks: what drgs did not make stays, and a folder has one writer."""
+"""Claims of drgs.io.outputs and drgs.io.locks: what drgs did not make stays, and a folder has one writer."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from drgs.files import atomic_write, write_json
-from drgs.guards import locks, outputs
-from drgs.guards.outputs import check_file, claim, replacing
-from drgs.guards.unfinished import temporary_folder
+from drgs.io import locks, outputs
+from drgs.io.atomic import temporary_folder
+from drgs.io.outputs import check_file, claim, replacing
 
 
 def put(path: Path, text: str) -> None:
@@ -133,7 +133,7 @@ def test_nothing_is_left_of_a_command_that_wrote_nothing(tmp_path):
 def test_sweep_takes_only_unfinished_files_of_ours(tmp_path):
     """A killed process leaves a file and a folder, which the next one removes; names like them stay."""
     code = (
-        "import os, sys; from drgs.guards.outputs import *; from drgs.guards.unfinished import *\n"
+        "import os, sys; from drgs.io.outputs import *; from drgs.io.atomic import *\n"
         "with claim(sys.argv[1], 'fit'), temporary_folder('sfm', sys.argv[1]) as folder:\n"
         "    (folder / 'database.db').write_text('x')\n"
         "    with replacing(sys.argv[1] + '/state.safetensors') as name:\n"
@@ -284,7 +284,7 @@ def test_only_one_takes_over_a_stale_lock(tmp_path):
     """Six processes find the same stale lock at once: one gets in, each of the others is told who."""
     foreign_lock(tmp_path, pid=4194305)
     code = (
-        "import sys; from pathlib import Path; from drgs.guards import locks\n"
+        "import sys; from pathlib import Path; from drgs.io import locks\n"
         "print('ready', flush=True); sys.stdin.readline()\n"
         "try: locks.acquire(Path(sys.argv[1]), 'fit'); print('in', flush=True)\n"
         "except ValueError as error: print(error, flush=True)\n"

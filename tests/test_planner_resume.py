@@ -158,7 +158,7 @@ def test_names_of_questions():
 
 def main(path: Path, kill_at_save: int) -> None:
     """A loop that goes on from a file; killed in the middle of writing one, if it is to."""
-    import drgs.guards.outputs as outputs
+    import drgs.io.outputs as outputs
 
     planner = Planner.load(path) if path.exists() else small()
     saves = 0

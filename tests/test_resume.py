@@ -16,7 +16,7 @@ from drgs import cli
 from drgs.files import Run, load_state, save_ply, save_state
 from drgs.fitting.records import load_run
 from drgs.fitting.resume import FILES, PREVIOUS, last_checkpoint
-from drgs.guards import locks
+from drgs.io import locks
 from drgs.train import Trainer, fit
 
 

@@ -165,7 +165,7 @@ _WRITERS = {
     "data/camera_lists.py": {"cameras.json"},
     "data/gathering.py": {"frames.json"},
     "data/held_out.py": {"held_out.json"},
-    "files.py": {"config.json", "env.json", "log.jsonl"},
+    "io/run.py": {"config.json", "env.json", "log.jsonl"},
     "fitting/active.py": {"selection.json"},
     "metrics.py": {"metrics.json"},
 }
@@ -177,10 +177,11 @@ _OTHERS = {
     "commands/repeat.py",  # options on a line of a report
     "data/flight_files.py",  # flight.json: docs/view.md
     "data/reader_process.py",  # between processes
-    "guards/json_files.py",  # a message
-    "guards/locks.py",  # .drgs.lock
-    "guards/outputs.py",  # .drgs.jsonl
+    "io/checkpoint.py",  # the header of a checkpoint
     "io/journal.py",  # lines of log.jsonl, rows.jsonl, .drgs.jsonl
+    "io/json_files.py",  # a message
+    "io/locks.py",  # .drgs.lock
+    "io/outputs.py",  # .drgs.jsonl
     "planner.py",  # the header of Planner.save's file: docs/planner.md
     "report/page.py",  # a cell of the report
     "sharing/page.py",  # what a page is told

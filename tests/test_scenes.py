@@ -231,7 +231,7 @@ def test_killed_while_it_is_published(tmp_path, monkeypatch):
         for name in ("a", "b", "c"):
             output.write_file(folder / name, name.encode())
 
-    from drgs.guards.outputs import Claim
+    from drgs.io.outputs import Claim
 
     put = Claim.put
     for moved in range(4):

@@ -21,7 +21,7 @@ from test_dynamic_data import cameras, coded, write_poses, write_video
 from drgs import train
 from drgs.files import Run, write_json
 from drgs.fitting.config import FitConfig
-from drgs.guards.locks import InUse
+from drgs.io.locks import InUse
 from drgs.studies import cells as engine
 from drgs.studies.cells import Metric, Study, distinct_seeds, run_cell, run_cells
 from drgs.studies.experiments import EXPERIMENTS
@@ -312,7 +312,7 @@ def test_a_cell_that_another_process_has_is_left_to_it(still, faked, tmp_path):
     cells = study.cells(units((0,)))
     folder = tmp_path / study.name / cells[0].name
     folder.mkdir(parents=True)
-    code = f"import time; from pathlib import Path; from drgs.guards.locks import acquire; " \
+    code = f"import time; from pathlib import Path; from drgs.io.locks import acquire; " \
            f"acquire(Path({str(folder)!r}), 'fit'); print('held', flush=True); time.sleep(60)"  # fmt: skip
     other = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
     try:

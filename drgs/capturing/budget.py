@@ -30,7 +30,7 @@ from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import frames_for
 from drgs.fitting.start import start
 from drgs.fitting.threads import fewer_torch_threads
-from drgs.guards.unfinished import temporary_folder
+from drgs.io.atomic import temporary_folder
 
 if TYPE_CHECKING:
     from drgs.data import Dataset, View

@@ -16,11 +16,12 @@ import numpy as np
 
 from drgs.capturing.record import FOLDER, Batch, CaptureRecord
 from drgs.data.checks import read_image
-from drgs.files import Run, state_header
 from drgs.fitting.config import FitConfig, recorded_config
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import fit_record, is_run
 from drgs.guards import memory
+from drgs.io.checkpoint import state_header
+from drgs.io.run import Run
 
 if TYPE_CHECKING:
     from drgs.data import Dataset

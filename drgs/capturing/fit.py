@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 from drgs.capturing import diagnosis
 from drgs.capturing.budget import FitPlan, Pacer, plan_fit
 from drgs.capturing.capture import config_of
-from drgs.files import save_state
 from drgs.fitting.config import FitConfig, recorded_config
 from drgs.fitting.records import fit_record, is_run
 from drgs.fitting.resume import FILES, claim_run, last_checkpoint
-from drgs.guards.outputs import claim
+from drgs.io.checkpoint import save_state
+from drgs.io.outputs import claim
 from drgs.report.write import FILE as REPORT
 from drgs.sharing.scene import FILE as PAGE
 from drgs.train import fit

@@ -14,13 +14,14 @@ from drgs.capturing.places import Place, meters_of, places_around
 from drgs.data.camera_lists import described
 from drgs.data.capture import upright
 from drgs.display.progress import Bar
-from drgs.files import SCHEMA, Run, write_json
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import fitted_views, load_run
-from drgs.guards.outputs import claim
 from drgs.information.scoring import Scoring
 from drgs.information.semantics import SemanticMetric
 from drgs.integrator import render
+from drgs.io.journal import SCHEMA
+from drgs.io.outputs import claim, write_json
+from drgs.io.run import Run
 from drgs.meshing.depths import seen_distance
 from drgs.select import select
 from drgs.selection.cache import Cache

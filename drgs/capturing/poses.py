@@ -15,7 +15,7 @@ from drgs.data.registering import register
 from drgs.data.sfm import run_sfm
 from drgs.display.progress import Bar
 from drgs.fitting.records import fit_record
-from drgs.guards.outputs import claim
+from drgs.io.outputs import claim
 
 if TYPE_CHECKING:
     from drgs.capturing.capture import Capture

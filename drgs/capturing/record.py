@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from drgs.data.shooting import Finding
-from drgs.files import SCHEMA, write_json
-from drgs.guards.json_files import check_json, read_json
-from drgs.io.journal import check_schema
+from drgs.io.journal import SCHEMA, check_schema
+from drgs.io.json_files import check_json, read_json
+from drgs.io.outputs import write_json
 
 __all__ = ["FOLDER", "Batch", "CaptureRecord", "DoneStep", "inputs_of"]
 

@@ -29,13 +29,13 @@ from drgs.capturing.record import FOLDER, CaptureRecord, DoneStep, inputs_of
 from drgs.data.checks import list_images
 from drgs.data.gathering import gather, named_files, usable_files
 from drgs.display.progress import Bar
-from drgs.files import Run
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import is_run
 from drgs.fitting.resume import claim_run
-from drgs.guards import interrupts
-from drgs.guards.outputs import claim
-from drgs.guards.writing import is_full
+from drgs.io import interrupts
+from drgs.io.atomic import is_full
+from drgs.io.outputs import claim
+from drgs.io.run import Run
 from drgs.report.write import FILE as REPORT
 from drgs.sharing.scene import FILE as PAGE
 from drgs.sharing.scene import scene_of_run

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 
 from drgs.cluster.agreement import check_agreement, statement, this_worker
 from drgs.cluster.payloads import Missing, opened_payload
-from drgs.files import atomic_write
-from drgs.guards.locks import InUse, host_of
-from drgs.guards.writing import is_full
+from drgs.io.atomic import is_full
+from drgs.io.locks import InUse, host_of
+from drgs.io.outputs import atomic_write
 from drgs.studies.cells import FAILURES, Study, out_of_race, result_line, run_cell
 from drgs.studies.rows import Cell, append_row, is_done, read_study
 

@@ -22,10 +22,11 @@ from typing import TYPE_CHECKING
 
 from drgs.codecs.codec import Codec
 from drgs.codecs.folders import file_of_folder, is_checkpoint, refuse_checkpoint
-from drgs.files import atomic_write, load_ply, save_ply
+from drgs.codecs.ply import load_ply, save_ply
 from drgs.guards.arguments import ArgumentError, check_path
-from drgs.guards.foreign import refuse_foreign
 from drgs.guards.registry import Registry
+from drgs.io.foreign import refuse_foreign
+from drgs.io.outputs import atomic_write
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

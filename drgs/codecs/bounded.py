@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.guards.foreign import is_file
+from drgs.io.foreign import is_file
 
 __all__ = ["Archive", "GzipReader", "pixels_of_webp", "unzstd", "webp_of_pixels"]
 

@@ -23,7 +23,7 @@ from drgs.codecs.codec import Codec
 from drgs.codecs.glb import BIN, JSON, glb_of
 from drgs.codecs.values import SH_COUNTS, assembled, check_count, flipped, log_of_scales, logits_of_opacities
 from drgs.ellipsoids import Y_00
-from drgs.guards.json_files import check_json, parse_json
+from drgs.io.json_files import check_json, parse_json
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians

@@ -16,14 +16,14 @@ import numpy as np
 
 from drgs.codecs.clustering import morton_order
 from drgs.codecs.codec import Codec
+from drgs.codecs.ply import note_antialiased
+from drgs.codecs.ply_headers import is_antialiased, ply_source, read_ply_header
 from drgs.codecs.values import assembled, check_count, dc_of_colors, logits_of_bytes, quats_of_smallest
 from drgs.ellipsoids import Y_00
-from drgs.files import note_antialiased
-from drgs.guards.ply_headers import is_antialiased, ply_source, read_ply_header
 
 if TYPE_CHECKING:
+    from drgs.codecs.ply_headers import PlyElement
     from drgs.ellipsoids import Gaussians
-    from drgs.guards.ply_headers import PlyElement
 
 __all__ = ["PACKED_PLY", "encode_packed_ply", "load_packed_ply"]
 

@@ -30,7 +30,7 @@ from drgs.codecs.clustering import codebook, morton_order, palette
 from drgs.codecs.codec import Codec
 from drgs.codecs.folders import is_checkpoint, names_in_archive
 from drgs.codecs.values import SH_COUNTS, assembled, check_count, logits_of_bytes, quats_of_smallest
-from drgs.guards.json_files import check_json, parse_json
+from drgs.io.json_files import check_json, parse_json
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians

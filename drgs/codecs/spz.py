@@ -28,8 +28,8 @@ import numpy as np
 
 from drgs.codecs.bounded import GzipReader, unzstd
 from drgs.codecs.codec import Codec
+from drgs.codecs.ply import note_antialiased
 from drgs.codecs.values import SH_COUNTS, assembled, check_count, flipped, logits_of_bytes, quats_of_smallest
-from drgs.files import note_antialiased
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians

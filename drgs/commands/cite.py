@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from drgs.fitting.renderers import RendererSchedule
-from drgs.guards.json_files import read_json
+from drgs.io.json_files import read_json
 from drgs.runtime import version
 
 if TYPE_CHECKING:
@@ -108,8 +108,8 @@ def cited(folder: Path | None) -> str:
 
 def _used(folder: Path) -> _Used:
     """What a run did; it need not have come to its end."""
-    from drgs.files import Run  # loads torch, which a list without a run does not need
     from drgs.fitting.records import fit_record
+    from drgs.io.run import Run  # loads torch, which a list without a run does not need
 
     run = Run(folder)
     record = fit_record(run)

@@ -14,8 +14,8 @@ from typing import Any
 from drgs.commands.overrides import override
 from drgs.fitting.config import FitConfig, recorded_config
 from drgs.fitting.renderers import AUTO
-from drgs.guards.json_files import read_json, read_toml
 from drgs.guards.records import Record, hints_of, nearest, part_of, stated
+from drgs.io.json_files import read_json, read_toml
 from drgs.settings import RenderSettings
 
 __all__ = ["config_fields", "default_of", "named_config"]

@@ -10,10 +10,10 @@ import numpy as np
 from drgs.codecs import check_suffix, load_gaussians, save_gaussians
 from drgs.commands.scene_input import SceneInput
 from drgs.display.progress import Bar
-from drgs.files import load_state
 from drgs.gain import Prior, check, variances
-from drgs.guards.outputs import claim
 from drgs.information.groups import GROUPS
+from drgs.io.checkpoint import load_state
+from drgs.io.outputs import claim
 
 if TYPE_CHECKING:
     from drgs.commands.options import Convert

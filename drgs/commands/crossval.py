@@ -9,8 +9,8 @@ from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import check_counts, seen_views
 from drgs.display import tables
 from drgs.display.progress import Bar
-from drgs.files import SCHEMA, atomic_write, write_json
-from drgs.guards.outputs import check_file, claim
+from drgs.io.journal import SCHEMA
+from drgs.io.outputs import atomic_write, check_file, claim, write_json
 from drgs.lab import ladder, rasterizers
 from drgs.lab.crossval import Result, crossval
 from drgs.lab.report import html

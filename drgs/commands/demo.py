@@ -23,12 +23,12 @@ from drgs.commands.scene import maker_of
 from drgs.data import load
 from drgs.display import pictures, tables
 from drgs.display.progress import Bar
-from drgs.files import SCHEMA, write_json
 from drgs.fitting.frames import Frame, frames_for
 from drgs.fitting.losses import psnr_of
-from drgs.guards.outputs import Claim, claim
 from drgs.information.nuisances import Nuisances
 from drgs.integrator import render
+from drgs.io.journal import SCHEMA
+from drgs.io.outputs import Claim, claim, write_json
 from drgs.report import pictures as report_pictures
 from drgs.report.write import FILE
 from drgs.settings import RenderSettings

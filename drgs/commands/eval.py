@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 from drgs.display import tables
 from drgs.evaluation import evaluate_run
-from drgs.files import Run
 from drgs.fitting.records import fit_record
 from drgs.fitting.resume import claim_run
+from drgs.io.run import Run
 from drgs.metrics import METRICS, MOVING, OBJECT, Lpips, renderers_table
 
 if TYPE_CHECKING:

@@ -30,11 +30,12 @@ from drgs.commands.viewpoints import check_counts, check_lenses, evenly, known_v
 from drgs.data.camera_lists import described
 from drgs.display import pictures, tables
 from drgs.display.progress import Bar
-from drgs.files import SCHEMA, save_state, write_json
 from drgs.gain import Information, Prior, check, information_gain, variances
-from drgs.guards.outputs import claim
 from drgs.information.blocks import MAP_PRIOR, SceneBlocks
 from drgs.information.sums import add, together
+from drgs.io.checkpoint import save_state
+from drgs.io.journal import SCHEMA
+from drgs.io.outputs import claim, write_json
 from drgs.select import Scoring
 
 if TYPE_CHECKING:

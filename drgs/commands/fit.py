@@ -9,10 +9,10 @@ from drgs.commands.clustered import workers_of
 from drgs.commands.eval import print_table
 from drgs.commands.report import report_of
 from drgs.data.backgrounds import default_background
-from drgs.files import Run
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import fit_record, is_run
 from drgs.fitting.resume import claim_run
+from drgs.io.run import Run
 from drgs.report.write import FILE
 from drgs.train import fit
 

@@ -12,8 +12,8 @@ from drgs.commands.convert import still
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import check_lenses, evenly, known_views
 from drgs.display.progress import Bar
-from drgs.files import state_header
-from drgs.guards.outputs import claim
+from drgs.io.checkpoint import state_header
+from drgs.io.outputs import claim
 from drgs.meshing.extraction import mesh_of
 from drgs.meshing.options import MeshOptions
 from drgs.meshing.writing import MESH_SUFFIXES, save_mesh

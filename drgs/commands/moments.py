@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.codecs.ply import save_ply
 from drgs.display.progress import Bar
-from drgs.files import save_ply
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

@@ -17,7 +17,7 @@ import torch
 
 from drgs.data.flight import quaternion_of
 from drgs.ellipsoids import Gaussians
-from drgs.guards.json_files import check_json, read_json
+from drgs.io.json_files import check_json, read_json
 
 __all__ = ["DATAPARSER_TRANSFORMS", "in_frame_of_data"]
 

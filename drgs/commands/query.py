@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from drgs.codecs.ply import save_ply
 from drgs.commands.painters import OPAQUE
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import check_counts, check_lenses, seen_views
@@ -20,9 +21,9 @@ from drgs.features.decoder import load_decoder
 from drgs.features.pictures import mask_picture
 from drgs.features.query import TEMPERATURE, TextQuery
 from drgs.features.teacher import read_tensor
-from drgs.files import SCHEMA, save_ply, write_json
-from drgs.guards.outputs import claim
 from drgs.integrator import render
+from drgs.io.journal import SCHEMA
+from drgs.io.outputs import claim, write_json
 from drgs.sizes import at_most
 
 if TYPE_CHECKING:

@@ -42,10 +42,10 @@ from drgs.display import pictures
 from drgs.display.mp4 import Mp4, need_mp4
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
-from drgs.files import SCHEMA, write_json
 from drgs.guards import memory
-from drgs.guards.outputs import claim
 from drgs.integrator import render
+from drgs.io.journal import SCHEMA
+from drgs.io.outputs import claim, write_json
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

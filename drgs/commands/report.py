@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drgs.commands.repeat import fit_command
-from drgs.files import Run
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import fit_record
 from drgs.fitting.resume import claim_run
-from drgs.guards.outputs import check_file
+from drgs.io.outputs import check_file
+from drgs.io.run import Run
 from drgs.report.page import GENERATOR
 from drgs.report.write import FILE, write_report
 

@@ -14,9 +14,9 @@ from drgs.commands.config_file import config_fields
 from drgs.commands.options import Fisher
 from drgs.display import tables
 from drgs.display.progress import Bar
-from drgs.files import SCHEMA, atomic_write, write_json
-from drgs.guards.json_files import check_json, read_json
-from drgs.guards.outputs import claim
+from drgs.io.journal import SCHEMA
+from drgs.io.json_files import check_json, read_json
+from drgs.io.outputs import atomic_write, claim, write_json
 from drgs.metrics import Lpips
 from drgs.runtime.machine import commit, cpu_model
 from drgs.studies.cells import run_cells

@@ -10,8 +10,8 @@ from drgs.codecs import load_gaussians, readable
 from drgs.codecs.folders import cameras_of_model, file_of_folder
 from drgs.commands.nerfstudio_frame import in_frame_of_data
 from drgs.data.camera_lists import is_camera_list
-from drgs.files import Run
 from drgs.fitting.records import FitRecord, fit_record, is_run, load_run
+from drgs.io.run import Run
 from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:

@@ -14,9 +14,9 @@ from drgs.commands.viewpoints import check_counts, check_lenses, known_views, ot
 from drgs.data.camera_lists import described
 from drgs.display import tables
 from drgs.display.progress import Bar
-from drgs.files import SCHEMA, write_json
-from drgs.guards.outputs import check_file
 from drgs.information.criteria import criterion_named
+from drgs.io.journal import SCHEMA
+from drgs.io.outputs import check_file, write_json
 from drgs.select import Refine, Selection, policy_named, select
 
 if TYPE_CHECKING:

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 from drgs.commands.orbits import scene_orbit
 from drgs.commands.scene_input import SceneInput
-from drgs.files import Run
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import is_run, load_run
 from drgs.fitting.resume import claim_run
-from drgs.guards.foreign import refuse_foreign
-from drgs.guards.outputs import check_file
+from drgs.io.foreign import refuse_foreign
+from drgs.io.outputs import check_file
+from drgs.io.run import Run
 from drgs.sharing.page import SHARED_BY
 from drgs.sharing.scene import FILE, scene_of_file, scene_of_run
 from drgs.sharing.write import Shared, write_page

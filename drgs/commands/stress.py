@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from drgs import runtime
 from drgs.display.progress import Bar
-from drgs.files import SCHEMA, atomic_write, write_json
-from drgs.guards.outputs import claim
+from drgs.io.journal import SCHEMA
+from drgs.io.outputs import atomic_write, claim, write_json
 from drgs.lab import extremes
 from drgs.lab.stress import BOUNDS, StressRow, rows
 

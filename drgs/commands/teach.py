@@ -25,10 +25,10 @@ from drgs.data.class_names import CLASS_FILES, read_class_names
 from drgs.data.sidecars import LABEL_FOLDERS, TEACHER_FOLDERS
 from drgs.display.progress import Bar
 from drgs.features.encoders import TEMPLATES, ClipEncoder
-from drgs.files import SCHEMA, atomic_write, write_json
 from drgs.fitting.config import DataConfig
-from drgs.guards.json_files import read_json
-from drgs.guards.outputs import Claim, claim
+from drgs.io.journal import SCHEMA
+from drgs.io.json_files import read_json
+from drgs.io.outputs import Claim, atomic_write, claim, write_json
 
 if TYPE_CHECKING:
     from drgs.commands.making_options import Teach

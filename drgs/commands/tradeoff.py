@@ -34,8 +34,8 @@ from drgs.commands.viewpoints import check_counts, seen_views
 from drgs.data.camera_lists import described
 from drgs.display import tables
 from drgs.display.progress import Bar
-from drgs.files import SCHEMA, atomic_write, write_json
-from drgs.guards.outputs import claim
+from drgs.io.journal import SCHEMA
+from drgs.io.outputs import atomic_write, claim, write_json
 from drgs.lab.tradeoff import (
     CLOCKS,
     TRADEOFF_VARIANTS,

@@ -15,7 +15,7 @@ from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewed import subject_of, watched_files
 from drgs.commands.viewpoints import check_counts
 from drgs.display.progress import Bar, quietly
-from drgs.guards import interrupts
+from drgs.io import interrupts
 
 if TYPE_CHECKING:
     from drgs.commands.options import View

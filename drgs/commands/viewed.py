@@ -15,11 +15,12 @@ from drgs.commands.viewpoints import Known, Source, known_views
 from drgs.data import View as DataView
 from drgs.data.capture import Focus, upright
 from drgs.ellipsoids import Gaussians
-from drgs.files import Run, state_header
 from drgs.fitting.records import fitted_views
-from drgs.guards.foreign import refuse_foreign
 from drgs.information.blocks import MAP_PRIOR
 from drgs.information.sums import together
+from drgs.io.checkpoint import state_header
+from drgs.io.foreign import refuse_foreign
+from drgs.io.run import Run
 from drgs.meshing.depths import seen_distance
 from drgs.viewing.client import pose_of
 from drgs.viewing.layers import Uncertainty, layers_of

@@ -25,10 +25,10 @@ from drgs.commands.nerfstudio_frame import DATAPARSER_TRANSFORMS
 from drgs.commands.orbit_keys import UP
 from drgs.commands.orbits import Wish, capture_orbit, dome, scene_orbit
 from drgs.data.camera_lists import is_camera_list, load_cameras_json
-from drgs.files import Run
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import FitRecord, fit_record, fitted_views, is_run
+from drgs.io.run import Run
 from drgs.meshing.depths import seen_distance
 from drgs.sizes import at_most, resized_alike
 

@@ -31,8 +31,8 @@ from drgs.data.sidecars import attach
 from drgs.data.videos import list_videos
 from drgs.data.view_checks import check_times, count_once, note_partial_masks
 from drgs.data.views import View
-from drgs.guards.foreign import refuse_foreign
 from drgs.guards.registry import Registry
+from drgs.io.foreign import refuse_foreign
 
 __all__ = [
     "LOADERS",

@@ -17,9 +17,9 @@ import numpy as np
 
 from drgs.cameras import Camera, intrinsics
 from drgs.data.checks import inverse_pose
-from drgs.files import atomic_write
 from drgs.guards.arguments import kind_of
-from drgs.guards.json_files import check_json, read_json
+from drgs.io.json_files import check_json, read_json
+from drgs.io.outputs import atomic_write
 
 __all__ = ["camera_described", "described", "is_camera_list", "load_cameras_json", "save_cameras_json"]
 

@@ -23,7 +23,7 @@ from drgs.data.heif import HEIF_SUFFIXES, heif_size, is_heif, read_heif
 from drgs.data.image_headers import can_hold, is_whole, stated_size
 from drgs.guards import memory
 from drgs.guards.camera_checks import check_distance
-from drgs.guards.foreign import is_file, refuse_foreign
+from drgs.io.foreign import is_file, refuse_foreign
 
 __all__ = [
     "IMAGE_SUFFIXES",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from drgs.data.checks import read_text
-from drgs.guards.json_files import check_json, read_json
+from drgs.io.json_files import check_json, read_json
 
 __all__ = ["CLASS_FILES", "NO_CLASS", "read_class_names"]
 

@@ -22,8 +22,8 @@ from drgs.data.points import read_point_ply
 from drgs.data.resizing import fit_to_image
 from drgs.data.view_checks import go_on_without, make_unique
 from drgs.data.views import View
-from drgs.guards.foreign import is_file, refuse_foreign
-from drgs.guards.unfinished import temporary_folder
+from drgs.io.atomic import temporary_folder
+from drgs.io.foreign import is_file, refuse_foreign
 
 __all__ = ["COLMAP", "load_colmap", "model_camera", "model_points", "read_model"]
 

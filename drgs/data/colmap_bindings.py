@@ -6,8 +6,8 @@ from typing import Any
 
 import pycolmap
 
-from drgs.guards import interrupts
-from drgs.guards.writing import check_room
+from drgs.io import interrupts
+from drgs.io.atomic import check_room
 
 __all__ = ["opened_database", "pycolmap"]
 

@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 
 from drgs.data.checks import IMAGE_SUFFIXES
-from drgs.guards.foreign import is_file
+from drgs.io.foreign import is_file
 
 __all__ = ["MODEL_FILES", "MODEL_FOLDERS", "find_model", "image_folder", "model_suffix", "point_ply"]
 

@@ -12,10 +12,10 @@ import numpy as np
 from drgs.cameras import c2w_from_opengl
 from drgs.data.checks import check_last_row, inverse_pose
 from drgs.data.flight import Flight, Keyframe, quaternion_of
-from drgs.files import SCHEMA
 from drgs.guards.camera_checks import check_handedness
-from drgs.guards.json_files import check_json, read_json
 from drgs.guards.records import nearest
+from drgs.io.journal import SCHEMA
+from drgs.io.json_files import check_json, read_json
 
 __all__ = ["flight_json", "read_flight"]
 

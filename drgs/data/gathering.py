@@ -18,11 +18,11 @@ from drgs.data.photo_files import entry_fault, leave_out, link_or_copy, usable_p
 from drgs.data.shooting import Finding
 from drgs.data.video_frames import Picked, examine
 from drgs.data.videos import VIDEO_SUFFIXES, list_videos, read_video
-from drgs.files import SCHEMA
-from drgs.guards.foreign import refuse_foreign
-from drgs.guards.json_files import check_json, read_json
-from drgs.guards.outputs import Claim
-from drgs.guards.unfinished import temporary_folder
+from drgs.io.atomic import temporary_folder
+from drgs.io.foreign import refuse_foreign
+from drgs.io.journal import SCHEMA
+from drgs.io.json_files import check_json, read_json
+from drgs.io.outputs import Claim
 
 __all__ = [
     "FRAMES",

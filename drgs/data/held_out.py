@@ -7,8 +7,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drgs.files import SCHEMA, write_json
-from drgs.guards.json_files import check_json, read_json
+from drgs.io.journal import SCHEMA
+from drgs.io.json_files import check_json, read_json
+from drgs.io.outputs import write_json
 
 if TYPE_CHECKING:
     from drgs.data.dataset import Dataset

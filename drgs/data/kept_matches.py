@@ -22,7 +22,7 @@ import numpy as np
 
 from drgs.data.checks import check_npz
 from drgs.data.views import View
-from drgs.guards.unfinished import hidden_file, is_left_over
+from drgs.io.atomic import hidden_file, is_left_over
 
 __all__ = ["found_once"]
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from drgs.data.matching import Progress
-from drgs.guards.writing import check_room
+from drgs.io.atomic import check_room
 from drgs.runtime import thread_count
 
 __all__ = ["PhotoGroups", "map_photos", "runs", "write_model"]

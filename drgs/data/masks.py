@@ -12,7 +12,7 @@ import numpy as np
 
 from drgs.data.checks import IMAGE_SUFFIXES, image_size, read_image, unit_range
 from drgs.data.resizing import nearest_resized
-from drgs.guards.foreign import is_file
+from drgs.io.foreign import is_file
 
 __all__ = ["ALPHA_MASKS", "feature_mask", "mask_file", "masked_photo", "masks_of", "read_mask"]
 

@@ -13,9 +13,8 @@ import numpy as np
 
 from drgs.data.photo_files import own_file
 from drgs.data.reader_process import Child
-from drgs.guards import interrupts
-from drgs.guards.unfinished import temporary_folder
-from drgs.guards.writing import check_room
+from drgs.io import interrupts
+from drgs.io.atomic import check_room, temporary_folder
 from drgs.runtime import thread_count
 
 __all__ = ["extract", "match", "nearby_pairs", "quiet", "sequential_pairs", "start_extraction", "state_focal_lengths"]

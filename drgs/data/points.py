@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from drgs.codecs.ply_headers import ply_source
 from drgs.data.dataset import Dataset
 from drgs.data.guesses import (
     FEWEST,
@@ -23,8 +24,7 @@ from drgs.data.kept_matches import found_once
 from drgs.data.matching import nearby_pairs
 from drgs.data.views import View
 from drgs.display.progress import Bar
-from drgs.guards.foreign import is_file, refuse_foreign
-from drgs.guards.ply_headers import ply_source
+from drgs.io.foreign import is_file, refuse_foreign
 
 __all__ = [
     "added_points",

@@ -22,12 +22,12 @@ from drgs.data.mapping import PhotoGroups, map_photos, write_model
 from drgs.data.pairing import choose_new_pairs
 from drgs.data.photo_files import link_or_copy, photo_fault, readable_photos
 from drgs.data.sfm import SfmSummary
-from drgs.guards.outputs import claim
-from drgs.guards.unfinished import temporary_folder
+from drgs.io.atomic import temporary_folder
+from drgs.io.outputs import claim
 
 if TYPE_CHECKING:
     from drgs.data.matching import Progress
-    from drgs.guards.outputs import Claim
+    from drgs.io.outputs import Claim
 
 __all__ = ["Registration", "register"]
 

@@ -13,7 +13,7 @@ import numpy as np
 from drgs.data.checks import read_image, read_npy
 from drgs.data.class_names import read_class_names
 from drgs.display.progress import Bar
-from drgs.guards.json_files import check_json, read_json
+from drgs.io.json_files import check_json, read_json
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

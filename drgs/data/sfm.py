@@ -20,13 +20,13 @@ from drgs.data.masks import ALPHA_MASKS, feature_mask, masked_photo, masks_of
 from drgs.data.pairing import choose_pairs
 from drgs.data.photo_files import check_names, readable_photos, usable_photos
 from drgs.data.videos import list_videos
-from drgs.guards.outputs import claim
-from drgs.guards.unfinished import temporary_folder
+from drgs.io.atomic import temporary_folder
+from drgs.io.outputs import claim
 
 if TYPE_CHECKING:
     from drgs.data.matching import Progress
     from drgs.data.shooting import Finding
-    from drgs.guards.outputs import Claim
+    from drgs.io.outputs import Claim
 
 __all__ = ["CAMERA_MODELS", "MATCHING", "SfmSummary", "run_sfm"]
 

@@ -15,7 +15,7 @@ from drgs.data.resizing import fit_to_image, resized_to
 from drgs.data.videos import VideoFile, VideoFrame
 from drgs.data.view_checks import go_on_without
 from drgs.data.views import View
-from drgs.guards.foreign import is_file
+from drgs.io.foreign import is_file
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -20,7 +20,7 @@ from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
 from drgs.data.synchronous import Recording, evenly_spaced, synchronous
 from drgs.guards.camera_checks import check_distance
-from drgs.guards.json_files import check_json, read_json
+from drgs.io.json_files import check_json, read_json
 
 __all__ = ["TRAIN_META", "load_train_meta"]
 

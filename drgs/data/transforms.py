@@ -30,8 +30,8 @@ from drgs.data.synchronous import CAMERA_NAME
 from drgs.data.view_checks import go_on_without, make_unique
 from drgs.data.views import View
 from drgs.guards.camera_checks import check_handedness
-from drgs.guards.foreign import is_file
-from drgs.guards.json_files import check_json, read_json
+from drgs.io.foreign import is_file
+from drgs.io.json_files import check_json, read_json
 
 __all__ = ["TRANSFORMS", "load_transforms"]
 

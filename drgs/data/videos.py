@@ -10,7 +10,7 @@ import numpy as np
 
 from drgs.data.reader_process import Child
 from drgs.display.progress import Bar
-from drgs.guards.foreign import refuse_foreign
+from drgs.io.foreign import refuse_foreign
 
 __all__ = ["VIDEO_SUFFIXES", "VideoFile", "VideoFrame", "list_videos", "read_video"]
 

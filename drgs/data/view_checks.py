@@ -15,7 +15,7 @@ import numpy as np
 from drgs.data.checks import read_image, unit_range
 from drgs.data.image_headers import png_has_alpha
 from drgs.data.resizing import resize_area
-from drgs.guards.foreign import is_file
+from drgs.io.foreign import is_file
 
 if TYPE_CHECKING:
     from drgs.data.dataset import Dataset

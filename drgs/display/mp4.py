@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from drgs.display.pictures import to_bytes
-from drgs.guards import outputs
+from drgs.io import outputs
 
 __all__ = ["Mp4", "need_mp4"]
 

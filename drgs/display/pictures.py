@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from drgs.files import atomic_write
-from drgs.guards import outputs
+from drgs.io import outputs
+from drgs.io.outputs import atomic_write
 
 __all__ = [
     "Video",

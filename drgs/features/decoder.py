@@ -15,10 +15,10 @@ from typing import Any
 
 import torch
 
-from drgs.files import atomic_write
 from drgs.guards.archives import check_archive
 from drgs.guards.arguments import check_path
-from drgs.guards.foreign import refuse_foreign
+from drgs.io.foreign import refuse_foreign
+from drgs.io.outputs import atomic_write
 
 __all__ = ["Decoder", "load_decoder", "save_decoder"]
 

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from drgs.guards.json_files import check_json, read_json
+from drgs.io.json_files import check_json, read_json
 
 __all__ = ["MAP_NORM", "SCALES", "TEMPLATES", "ClipEncoder"]
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.guards.archives import check_archive
-from drgs.guards.foreign import refuse_foreign
+from drgs.io.foreign import refuse_foreign
 
 if TYPE_CHECKING:
     import torch

@@ -26,10 +26,12 @@ from drgs.data.camera_lists import described
 from drgs.data.guided import Matches
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
-from drgs.files import SCHEMA, Run, write_json
 from drgs.fitting.config import recorded_config
 from drgs.fitting.frames import Frame, frames_for
 from drgs.fitting.timetable import Timetable
+from drgs.io.journal import SCHEMA
+from drgs.io.outputs import write_json
+from drgs.io.run import Run
 from drgs.sizes import at_most, resized_alike
 
 if TYPE_CHECKING:

@@ -33,7 +33,7 @@ from drgs.fitting.lives import Lasting, add_births, always, checked_lives, life_
 from drgs.fitting.networks import Network
 from drgs.fitting.parts import means_rate
 from drgs.fitting.stages import Stage, first_time, shows_first_time, spacing
-from drgs.guards.json_files import check_json
+from drgs.io.json_files import check_json
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from drgs.files import load_state
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import Frame
 from drgs.fitting.records import check_checkpoint
 from drgs.fitting.rows import GaussianRows
+from drgs.io.checkpoint import load_state
 
 __all__ = ["Beginning", "begin_with"]
 

@@ -26,8 +26,8 @@ from drgs.fitting.frames import Frame
 from drgs.fitting.records import check_checkpoint
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.trainer import Trainer
-from drgs.guards.json_files import check_json
 from drgs.integrator import render
+from drgs.io.json_files import check_json
 from drgs.sizes import at_most
 
 __all__ = ["OnlineFit"]

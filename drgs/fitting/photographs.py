@@ -10,7 +10,6 @@ from drgs.fitting.exposure import estimate_exposure
 if TYPE_CHECKING:
     import numpy as np
 
-    from drgs.files import Run
     from drgs.fitting.active import ActiveViews
     from drgs.fitting.config import FitConfig
     from drgs.fitting.exposure import ExposureEstimate
@@ -19,6 +18,7 @@ if TYPE_CHECKING:
     from drgs.fitting.skybox import SkyboxChoice
     from drgs.fitting.trainer import Trainer
     from drgs.information.nuisances import Nuisance
+    from drgs.io.run import Run
 
 __all__ = ["check_photographs", "estimated_of", "join", "photographs_record"]
 

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from drgs.codecs.ply import load_ply
 from drgs.data.camera_lists import load_cameras_json
-from drgs.files import CONFIG_SCHEMA, Run, load_ply, load_state
 from drgs.fitting.config import FitConfig, recorded_config
 from drgs.fitting.filter_3d import VARIANCES, filtered
 from drgs.fitting.networks import saved_networks
@@ -26,8 +26,10 @@ from drgs.fitting.poses import CAMERAS
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.semantic_record import SemanticRecord
 from drgs.fitting.transients import TENSOR as TRANSIENT
-from drgs.guards.json_files import check_json, parse_json, read_json
 from drgs.information.nuisances import NUISANCES, Nuisance
+from drgs.io.checkpoint import load_state
+from drgs.io.json_files import check_json, parse_json, read_json
+from drgs.io.run import CONFIG_SCHEMA, Run
 
 if TYPE_CHECKING:
     from drgs.data import Dataset
@@ -35,9 +37,9 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians, Scene
     from drgs.features.decoder import Decoder
     from drgs.features.segmentation import Classes
-    from drgs.files import Run
     from drgs.fitting.active import ActiveViews
     from drgs.fitting.frames import Frame
+    from drgs.io.run import Run
 
 __all__ = [
     "FitRecord",

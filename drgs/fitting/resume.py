@@ -8,17 +8,17 @@ import shutil
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from drgs.files import load_state
 from drgs.fitting.poses import CAMERAS
 from drgs.fitting.records import check_checkpoint, is_fit_config
 from drgs.fitting.semantic_record import EMBEDDINGS
-from drgs.guards.outputs import claim, replacing
+from drgs.io.checkpoint import load_state
+from drgs.io.outputs import claim, replacing
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from drgs.files import Run
-    from drgs.guards.outputs import Claim
+    from drgs.io.outputs import Claim
+    from drgs.io.run import Run
 
 __all__ = ["FILES", "claim_run", "keep_previous", "last_checkpoint"]
 
@@ -42,7 +42,7 @@ _log = logging.getLogger(__name__)
 
 
 def claim_run(run: Run, command: str, resume: bool = True, inputs: Iterable = ()) -> Claim:
-    """Claim a run folder for a command that writes into it (`drgs.guards.outputs.claim`).
+    """Claim a run folder for a command that writes into it (`drgs.io.outputs.claim`).
 
     Args:
         run: The folder.

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drgs.files import atomic_write
-from drgs.guards.json_files import check_json
+from drgs.io.json_files import check_json
+from drgs.io.outputs import atomic_write
 
 if TYPE_CHECKING:
     import torch

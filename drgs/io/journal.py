@@ -17,9 +17,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from drgs.guards.json_files import parse_json
-from drgs.guards.locks import exclusive
-from drgs.guards.writing import named
+from drgs.io.atomic import named
+from drgs.io.json_files import parse_json
+from drgs.io.locks import exclusive
 
 __all__ = ["SCHEMA", "Journal", "check_schema"]
 

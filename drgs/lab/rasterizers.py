@@ -24,10 +24,10 @@ import torch
 from drgs.cameras import Camera
 from drgs.data.checks import check_npz
 from drgs.ellipsoids import Gaussians, sh_degree_of
-from drgs.files import atomic_write
-from drgs.guards.foreign import refuse_foreign
 from drgs.guards.imports import imported_function
 from drgs.integrator import render
+from drgs.io.foreign import refuse_foreign
+from drgs.io.outputs import atomic_write
 from drgs.lab.parameters import COLORS, MOTIONS, PARAMETERS, POSE, gaussians_of, image_of, posed, raw_of, with_pose
 from drgs.oracle import float64
 from drgs.settings import PRESETS, RenderSettings

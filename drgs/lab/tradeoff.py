@@ -27,8 +27,8 @@ import numpy as np
 import torch
 
 from drgs import fisher, reference, runtime
-from drgs.guards.outputs import replacing
 from drgs.integrator import render, render_rays
+from drgs.io.outputs import replacing
 from drgs.settings import RenderSettings
 from drgs.sizes import at_most, by_share
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.codecs.glb import glb_of
-from drgs.guards.outputs import replacing
+from drgs.io.outputs import replacing
 
 if TYPE_CHECKING:
     from drgs.meshing.extraction import TriangleMesh

@@ -7,9 +7,9 @@ import datetime
 from pathlib import Path
 from typing import Any
 
-from drgs.files import Run
 from drgs.fitting.records import FitRecord, fit_record
-from drgs.guards.json_files import check_json, parse_json, read_json
+from drgs.io.json_files import check_json, parse_json, read_json
+from drgs.io.run import Run
 
 __all__ = ["Account", "account_of"]
 

@@ -11,9 +11,10 @@ import numpy as np
 
 from drgs.data.camera_lists import camera_described
 from drgs.display.progress import Bar
-from drgs.files import Run, atomic_write
 from drgs.fitting.records import load_run
 from drgs.information.nuisances import Nuisances
+from drgs.io.outputs import atomic_write
+from drgs.io.run import Run
 from drgs.report import charts, pictures
 from drgs.report.account import Account, account_of
 from drgs.report.page import Shown, page_html

@@ -19,9 +19,9 @@ import torch
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians, Scene
 from drgs.guards.arguments import must_be
-from drgs.guards.json_files import check_json
 from drgs.information.choices import GAUSSIAN_GROUPS
 from drgs.information.sums import Information
+from drgs.io.json_files import check_json
 from drgs.selection.drift import Shapes, change_of_view
 
 __all__ = ["Cache", "NotKept", "ViewKey", "camera_key", "named_by", "size_of", "view_key"]

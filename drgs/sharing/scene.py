@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.data import Dataset
     from drgs.ellipsoids import Gaussians
-    from drgs.files import Run
     from drgs.fitting.records import LoadedRun
+    from drgs.io.run import Run
     from drgs.sharing.placing import PhotoKind
 
 __all__ = ["FILE", "MOMENTS", "scene_of_file", "scene_of_run"]

@@ -12,7 +12,7 @@ import numpy as np
 from drgs.codecs.clustering import morton_order
 from drgs.data.capture import middle_camera
 from drgs.display.progress import Bar
-from drgs.files import atomic_write
+from drgs.io.outputs import atomic_write
 from drgs.sharing.gaussians import archive_of
 from drgs.sharing.layers import moments_of, uncertainty_layer
 from drgs.sharing.npm import viewer_files

@@ -13,10 +13,10 @@ import torch
 from drgs.display import pictures
 from drgs.features.pictures import FeatureColors, label_picture
 from drgs.features.segmentation import classify
-from drgs.files import Run
 from drgs.fitting.frames import frames_for, load_dataset
 from drgs.fitting.records import load_run
 from drgs.integrator import render
+from drgs.io.run import Run
 
 if TYPE_CHECKING:
     from drgs.fitting.frames import Frame

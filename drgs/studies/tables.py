@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from drgs.files import atomic_write
-from drgs.guards.outputs import replacing
+from drgs.io.outputs import atomic_write, replacing
 from drgs.studies.cells import Metric, Study
 from drgs.studies.protocols import PROTOCOLS
 from drgs.studies.statistics import (

@@ -11,7 +11,7 @@ import numpy as np
 
 from drgs.cameras import Camera
 from drgs.data.camera_lists import camera_described
-from drgs.guards.json_files import check_json, read_json
+from drgs.io.json_files import check_json, read_json
 
 if TYPE_CHECKING:
     from drgs.data import View

@@ -9,6 +9,7 @@ else's, or was edited, and stays. The same is asked again when a file is put in 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import hashlib
 import json
 import logging
@@ -17,18 +18,24 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any, BinaryIO
 
-from drgs.guards import locks, unfinished
-from drgs.guards.writing import named
+import numpy as np
+
+from drgs.io import atomic, locks
+from drgs.io.atomic import named
 from drgs.io.journal import Journal
 
 __all__ = [
     "Claim",
+    "atomic_write",
     "check_file",
     "claim",
     "clean",
+    "json_form",
     "release_all",
     "replacing",
+    "write_json",
 ]
 
 JOURNAL = ".drgs.jsonl"
@@ -167,7 +174,7 @@ class Claim:
             ValueError: If they have not.
         """
         ours = JOURNAL, locks.NAME
-        content = [x for x in self.path.iterdir() if x.name not in ours and not unfinished.PATTERN.fullmatch(x.name)]
+        content = [x for x in self.path.iterdir() if x.name not in ours and not atomic.PATTERN.fullmatch(x.name)]
         for path in content:
             if not self.is_made(path, by):
                 raise ValueError(
@@ -185,9 +192,9 @@ class Claim:
         """Delete unfinished files of processes that were killed here, in the folder and in the given ones in it."""
         for folder in (self.path, *(self.path / name for name in folders)):
             for path in folder.iterdir() if folder.is_dir() else ():
-                if unfinished.is_left_over(path):
+                if atomic.is_left_over(path):
                     _log.info("%s: removed, an interrupted command left it unfinished", path)
-                    unfinished.delete(path)
+                    atomic.delete(path)
 
     def release(self) -> None:
         """Unlock the folder; it is removed if it was made for the claim and nothing came into it."""
@@ -291,7 +298,7 @@ def release_all() -> None:
 
 def clean() -> None:
     """Remove what is unfinished, and the locks; for a process that is about to end in the middle of its work."""
-    unfinished.delete_all()
+    atomic.delete_all()
     release_all()
 
 
@@ -310,7 +317,7 @@ def replacing(path: str | os.PathLike, suffix: str = "", claimed: bool = True) -
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         parent = os.path.realpath(path.parent)
-        with unfinished.hidden_file(parent, path.name, suffix) as name:
+        with atomic.hidden_file(parent, path.name, suffix) as name:
             yield name
             umask = os.umask(0)  # hidden files are private; what we write is to be shared as any other
             os.umask(umask)
@@ -323,6 +330,36 @@ def replacing(path: str | os.PathLike, suffix: str = "", claimed: bool = True) -
             os.replace(name, path)
     except OSError as error:
         raise named(path, error) from None
+
+
+@contextlib.contextmanager
+def atomic_write(path: str | os.PathLike) -> Iterator[BinaryIO]:
+    """A binary file that appears under its name only once it is complete; missing folders are made.
+
+    A process that dies leaves the old file, or none, and at most a hidden `.drgs.NAME.*.tmp` beside it.
+    """
+    with replacing(path) as name, open(name, "wb") as file:
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def write_json(path: str | os.PathLike, value: Any) -> None:
+    """Write JSON atomically, with settings dataclasses as objects and paths as text; NaN is refused."""
+    text = json.dumps(value, indent=2, default=json_form, allow_nan=False)
+    with atomic_write(path) as file:
+        file.write(text.encode() + b"\n")
+
+
+def json_form(value: Any) -> Any:
+    """What stands for a settings dataclass, a path or a NumPy value in JSON; TypeError for anything else."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return dataclasses.asdict(value)
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise TypeError(f"no JSON form of {type(value).__name__}")
 
 
 def _locked(folder: Path, path: Path, command: str, held: Claim | None) -> Claim:

@@ -16,7 +16,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from drgs.guards.json_files import parse_json
+from drgs.io.json_files import parse_json
 
 __all__ = ["NAME", "InUse", "acquire", "exclusive", "host_of", "release"]
 

@@ -9,7 +9,7 @@ import unicodedata
 from pathlib import Path
 from typing import Any
 
-from drgs.guards.foreign import refuse_foreign
+from drgs.io.foreign import refuse_foreign
 
 __all__ = ["check_json", "parse_json", "read_json", "read_toml"]
 

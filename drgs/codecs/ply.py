@@ -1,0 +1,242 @@
+"""The PLY of 3DGS: Gaussians by columns with names. Headers are not believed: what they claim is compared with the size
+of the file before anything is allocated.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from drgs.codecs.ply_headers import EXTRA, extra_kind, is_antialiased, ply_source, read_ply_header
+from drgs.guards.arguments import ArgumentError, check_path
+from drgs.io.foreign import refuse_foreign
+from drgs.io.outputs import atomic_write
+
+if TYPE_CHECKING:
+    import torch
+
+    from drgs.ellipsoids import Gaussians
+
+__all__ = ["load_ply", "note_antialiased", "save_ply"]
+
+_log = logging.getLogger(__name__)
+
+_NORMALS = ("nx", "ny", "nz")
+_FEATURE = "semantic_"
+_HIGHER = 15  # SH coefficients a color channel above degree 0, up to degree 3
+_SHOWN = 200  # characters of a reader's own message
+
+
+def load_ply(path: str | os.PathLike) -> Gaussians:
+    """Gaussians from a 3DGS PLY; columns are found by name, in any order.
+
+        g = drgs.load_ply("point_cloud.ply")
+
+    Args:
+        path: A file with vertex columns x y z, f_dc_0..2, f_rest_* (0, 9, 24, 45 or 72 of them, channel by channel; of
+            72, SH of degree 4, those up to degree 3 are kept, with a warning), opacity (logit), scale_0..2 (log) and
+            rot_0..3 (wxyz), and semantic_0, ... (features) as Feature 3DGS writes them. Normals and features may be
+            missing. What `save_ply` added (uncertainty_*, label) is left out; any other column, too, with a warning.
+    Returns:
+        float32 `Gaussians` with the file's bits; an infinite logit becomes one of `ellipsoids.LOGIT_ENDS`, and the log
+        says how many did.
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is no PLY, shorter than its header claims, of another layout, or holds other values that are
+            not finite (the first index is named).
+    """
+    import plyfile
+    import torch
+
+    from drgs.ellipsoids import Gaussians
+
+    path = check_path("load_ply", path)
+    names = _check_ply(path)
+    rest, features = _rest_columns(path, names), _feature_columns(path, names)
+    columns = {
+        "means": ("x", "y", "z"),
+        "quats": tuple(f"rot_{i}" for i in range(4)),
+        "log_scales": tuple(f"scale_{i}" for i in range(3)),
+        "logit_opacities": ("opacity",),
+        "dc": tuple(f"f_dc_{i}" for i in range(3)),
+    }
+    missing = [name for group in columns.values() for name in group if name not in names]
+    if missing:
+        raise ValueError(
+            f"{path}: a 3DGS PLY must have the vertex columns x y z f_dc_* opacity scale_* rot_*, "
+            f"{', '.join(missing[:4])}{' ...' if len(missing) > 4 else ''} missing; "
+            f"{_layout_hint(names)}"
+        )
+    known = {name for group in columns.values() for name in group} | {*rest, *features, *_NORMALS}
+    extra = [name for name in names if name not in known and not name.startswith(EXTRA)]
+    if extra:
+        shown = ", ".join(extra[:4]) + (" ..." if len(extra) > 4 else "")
+        _log.warning("%s: left out %d columns that are not 3DGS: %s", path, len(extra), shown)
+    if is_antialiased(path):
+        note_antialiased(path)
+    try:
+        vertex = plyfile.PlyData.read(ply_source(path))["vertex"].data
+        arrays: dict[str, Any] = {name: _columns(vertex, group) for name, group in columns.items()}
+        higher, described = _columns(vertex, rest), _columns(vertex, features)
+    except MemoryError:
+        raise
+    except Exception as error:  # of a damaged file, whatever its words make plyfile and NumPy raise
+        text = " ".join(str(error).split())[:_SHOWN]
+        raise ValueError(f"{path}: must be a readable PLY, got {text}; export it again") from None
+    sh = arrays.pop("dc")[:, None, :]
+    if rest:
+        # f_rest is stored channel by channel; ours are coefficient by coefficient.
+        higher = higher.reshape(len(vertex), 3, len(rest) // 3)[..., :_HIGHER].transpose(1, 2)
+        sh = torch.cat([sh, higher], dim=1)
+    if features:
+        arrays["features"] = described
+    arrays["logit_opacities"] = _finite_logits(path, arrays["logit_opacities"][:, 0])
+    made = Gaussians(**arrays, sh=sh.contiguous())
+    made.validate(str(path))
+    return made
+
+
+def note_antialiased(path: Path) -> None:
+    """Say in the log that a file is meant for antialiased rasterization, which `Gaussians` have no room for."""
+    _log.warning(
+        "%s: was fitted by antialiased rasterization, which no preset is: what is below a pixel is too opaque in "
+        "gsplat and inria; files that are written of it do not say what it was",
+        path,
+    )
+
+
+def _finite_logits(path: Path, logits: torch.Tensor) -> torch.Tensor:
+    """Logits of which the infinite ones, of opacities 0 and 1, have become `LOGIT_ENDS`; the log says how many."""
+    from drgs.ellipsoids import LOGIT_ENDS
+
+    infinite = logits.isinf()
+    if not infinite.any():
+        return logits
+    _log.warning(
+        "%s: %d of %d opacities are 0 or 1 (infinite logits), read as logits of %.1f and %.1f",
+        path,
+        int(infinite.sum()),
+        len(logits),
+        *LOGIT_ENDS,
+    )
+    return logits.where(~infinite, logits.clamp(*LOGIT_ENDS))
+
+
+def _columns(vertex: np.ndarray, names: tuple[str, ...]) -> torch.Tensor:
+    """(N, columns) float32."""
+    import torch
+
+    out = np.empty((len(vertex), len(names)), np.float32)
+    for i, name in enumerate(names):
+        out[:, i] = vertex[name]
+    return torch.from_numpy(out)
+
+
+def save_ply(
+    g: Gaussians,
+    path: str | os.PathLike,
+    *,
+    extra: Mapping[str, np.ndarray] | None = None,
+    comments: tuple[str, ...] = (),
+) -> None:
+    """Write Gaussians as INRIA's trainer does: binary little-endian float32, normals 0, the same order of columns.
+
+        drgs.save_ply(g, "out.ply", comments=("made by hand",))
+
+    `load_ply` gives the same bits back. Means are stored as `origin + means` rounded to float32. Features, where there
+    are any, follow as semantic_0, ..., as Feature 3DGS writes them; other viewers leave them out.
+
+    Args:
+        g: The Gaussians.
+        path: The file.
+        extra: More columns, which viewers and `load_ply` leave out: (N,) floats named uncertainty_*, and whole numbers
+            named label*, which are written as uchar, or as ushort where one is above 255.
+        comments: Lines of the header.
+    Raises:
+        ValueError: If a parameter or an extra number is not finite (the first index is named), or an extra column has
+            another name or length.
+    """
+    import plyfile
+
+    from drgs.ellipsoids import check_gaussians
+
+    if isinstance(g, str | os.PathLike):
+        raise ArgumentError("save_ply: gaussians must come first and the path second, got a path first; swap them")
+    check_gaussians("save_ply", g)
+    path = check_path("save_ply", path)
+    g.validate("save_ply")
+    # A file holds values.
+    fields = {name: x.detach().cpu().numpy() for name, x in g.parameters().items()}
+    means = fields["means"]
+    if np.any(g.origin):
+        # In float64 before it is rounded once: float32 offsets would lose their digits to an origin far away.
+        means = means.astype(np.float64) + g.origin
+    rest = fields["sh"][:, 1:].transpose(0, 2, 1).reshape(len(g), 3 * (g.sh.shape[1] - 1))  # channel by channel
+    columns = {
+        **{name: means[:, i] for i, name in enumerate("xyz")},
+        **dict.fromkeys(_NORMALS, np.float32(0)),
+        **{f"f_dc_{i}": fields["sh"][:, 0, i] for i in range(3)},
+        **{f"f_rest_{i}": rest[:, i] for i in range(rest.shape[1])},
+        "opacity": fields["logit_opacities"],
+        **{f"scale_{i}": fields["log_scales"][:, i] for i in range(3)},
+        **{f"rot_{i}": fields["quats"][:, i] for i in range(4)},
+        **{f"{_FEATURE}{i}": x for i, x in enumerate(fields["features"].T if "features" in fields else ())},
+    }
+    kinds = {name: extra_kind(name, x, len(g)) for name, x in (extra or {}).items()}
+    vertex = np.empty(len(g), [*((name, "<f4") for name in columns), *kinds.items()])
+    for name, values in {**columns, **(extra or {})}.items():
+        vertex[name] = values
+    lines = [" ".join(text.split()) for text in comments]
+    ply = plyfile.PlyData([plyfile.PlyElement.describe(vertex, "vertex")], byte_order="<", comments=lines)
+    with atomic_write(path) as file:
+        ply.write(file)
+
+
+def _check_ply(path: Path) -> list[str]:
+    """Columns of the vertex element, once the file is known to be as long as its header claims."""
+    if path.is_file():
+        refuse_foreign(path, "a 3DGS PLY file")
+    elements = read_ply_header(path)
+    vertex = next((element.columns for element in elements if element.name == "vertex"), None)
+    if vertex is None:
+        raise ValueError(f"{path}: a 3DGS PLY must have an element `vertex`, found none; export it again")
+    return list(vertex)
+
+
+def _rest_columns(path: Path, names: list[str]) -> tuple[str, ...]:
+    count = sum(name.startswith("f_rest_") for name in names)
+    rest = tuple(f"f_rest_{i}" for i in range(count))
+    if count not in (0, 9, 24, 45, 72) or not set(rest) <= set(names):
+        raise ValueError(
+            f"{path}: must have 0, 9, 24, 45 or 72 columns f_rest_0, f_rest_1, ... (SH degree 0 to 4), got {count}; "
+            "export it again"
+        )
+    if count // 3 > _HIGHER:
+        _log.warning("%s: left out the SH coefficients of degree 4, there is no such color here", path)
+    return rest
+
+
+def _feature_columns(path: Path, names: list[str]) -> tuple[str, ...]:
+    """Columns of features, none missing; a label or the like of the same prefix is no feature."""
+    held = [name for name in names if name.startswith(_FEATURE) and name.removeprefix(_FEATURE).isdecimal()]
+    wanted = tuple(f"{_FEATURE}{i}" for i in range(len(held)))
+    if set(held) != set(wanted):
+        odd = next(name for name in wanted if name not in held)
+        raise ValueError(
+            f"{path}: features must be columns {_FEATURE}0, {_FEATURE}1, ... without a gap, got {len(held)} without "
+            f"{odd}; export it again"
+        )
+    return wanted
+
+
+def _layout_hint(names: list[str]) -> str:
+    if {"red", "green", "blue", "opacity", "scale_0"} <= set(names):
+        return "its colors are RGB: export it with `ns-export gaussian-splat --ply-color-mode sh_coeffs`"
+    if {"red", "green", "blue"} & set(names):
+        return "this is a plain point cloud, fit Gaussians with `drgs fit`"
+    return "export it as a 3DGS point_cloud.ply"
