@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from drgs.fitting.frames import Frame
     from drgs.fitting.records import LoadedRun
     from drgs.fitting.segments import Segmentation
-    from drgs.io.outputs import Claim
+    from drgs.io.outputs import LockedFolder
     from drgs.io.run import Run
 
 __all__ = ["evaluate_run"]
@@ -28,7 +28,7 @@ __all__ = ["evaluate_run"]
 
 def evaluate_run(
     run: Run,
-    claimed: Claim,
+    output: LockedFolder,
     split: str = "test",
     lpips: Lpips | None = None,
     strict: bool = False,
@@ -39,7 +39,7 @@ def evaluate_run(
 
     Args:
         run: What to measure.
-        claimed: Its folder, as `drgs.fitting.resume.claim_run` returns it.
+        output: Its folder, as `drgs.fitting.resume.lock_run` returns it.
         split: `test`, `train` (of an active fit the views that it saw) or `all`.
         lpips: LPIPS for `drgs.metrics.evaluate`.
         strict: Refuse a data set some of whose images are missing.
@@ -77,7 +77,7 @@ def evaluate_run(
     frames = frames_for(views, config.data, _most_pixels(views, config.data.max_pixels, scale))
     names = file_names([frame.name for frame in frames])
     kinds = VIEW_PICTURES if recorded.semantics else VIEW_PICTURES[:1]
-    claimed.check(f"renders/{split}/{name}.{kind}" for name in names for kind in kinds)
+    output.check(f"renders/{split}/{name}.{kind}" for name in names for kind in kinds)
     segmentation = _segmentation(loaded, dataset, frames)
     result = evaluate(
         scene,

@@ -47,7 +47,7 @@ from drgs.fitting.photographs import check_photographs, estimated_of, join, phot
 from drgs.fitting.poses import CAMERAS, POSE_NETWORK
 from drgs.fitting.records import config_record, pick_seconds, seconds_of
 from drgs.fitting.renderers import renderers_to_measure
-from drgs.fitting.resume import claim_run, keep_previous, last_checkpoint
+from drgs.fitting.resume import keep_previous, last_checkpoint, lock_run
 from drgs.fitting.semantic_record import SemanticRecord, check_same_teacher
 from drgs.fitting.skybox import visible_share
 from drgs.fitting.stages import moving_labels
@@ -59,7 +59,7 @@ from drgs.guards.memory import is_out_of_memory
 from drgs.integrator import render
 from drgs.io import interrupts
 from drgs.io.checkpoint import save_state
-from drgs.io.outputs import claim
+from drgs.io.outputs import lock_folder
 from drgs.io.run import Run
 from drgs.runtime.machine import peak_memory
 
@@ -161,7 +161,7 @@ def fit(
         config = config.replace(selection=active)
     runtime.backend()  # sets torch's threads too, at first use
     threads = one_thread() if config.deterministic else contextlib.nullcontext()
-    with claim_run(Run(out_dir), "fit", resume, [dataset.path]), threads, Bar("fit", show=progress):
+    with lock_run(Run(out_dir), "fit", resume, [dataset.path]), threads, Bar("fit", show=progress):
         try:
             return _fit(dataset, out_dir, config, parts, resume, workers, pace, None if begin is None else Path(begin))
         except (MemoryError, RuntimeError) as error:
@@ -365,7 +365,7 @@ def _check_pictures(out_dir: str | Path, max_steps: int, held_out: list[Frame], 
     names = [_preview_name(step) for step in range(every, max_steps + 1, every)]
     kinds = metrics.VIEW_PICTURES if semantics else metrics.VIEW_PICTURES[:1]
     names += [f"test/{name}.{kind}" for name in file_names([frame.name for frame in held_out]) for kind in kinds]
-    with claim(out_dir, "fit", [f"renders/{name}" for name in names]):
+    with lock_folder(out_dir, "fit", [f"renders/{name}" for name in names]):
         pass
 
 

@@ -9,7 +9,7 @@ import os
 import numpy as np
 
 from drgs.io import atomic
-from drgs.io.outputs import claim
+from drgs.io.outputs import lock_folder
 
 __all__ = ["DEPTH_UNIT", "check_numbers", "publish", "write_depth", "write_file", "write_png"]
 
@@ -56,9 +56,9 @@ def publish(out_dir, parameters, fill, where):
     stamp = out_dir / "params.json"
     if stamp.is_file() and digest in stamp.read_text():
         return out_dir
-    with claim(out_dir, where) as output:
+    with lock_folder(out_dir, where) as output:
         for path in _content(output):
-            if not output.is_made(path, (where,)):
+            if not output.is_ours(path, (where,)):
                 raise ValueError(
                     f"{where}: the output must be a new folder or as it was made here, {path} is not; "
                     "name another or move it away"

@@ -596,7 +596,7 @@ def test_cells_that_fail_or_are_taken(cluster, still_folder, tmp_path, monkeypat
     this process.
     """
     from drgs.files import Run
-    from drgs.fitting.resume import claim_run
+    from drgs.fitting.resume import lock_run
 
     place = still_folder / "data"
     study = study_of(place)
@@ -609,7 +609,7 @@ def test_cells_that_fail_or_are_taken(cluster, still_folder, tmp_path, monkeypat
     study = dataclasses.replace(study, folder=folder)
     cells = [Cell(scene, (4, 1), "first", "random", "blind", 0) for scene in ("gone", "still", "huge")]
     said: list[str] = []
-    with claim_run(Run(tmp_path / study.name / cells[1].name), "fit", resume=True):
+    with lock_run(Run(tmp_path / study.name / cells[1].name), "fit", resume=True):
         taken, failed = run_cells_on(cluster, study, cells, tmp_path, tmp_path / "rows.jsonl", said.append)
     assert (taken, set(failed)) == ([cells[1]], {cells[0], cells[2]})
     assert failed[cells[2]] == "huge: there must be more memory"

@@ -18,7 +18,7 @@ from drgs import cli
 from drgs.data import load
 from drgs.data.checks import list_images
 from drgs.data.gathering import FRAMES, gather, joined_frames, named_files, recorded_frames, usable_files
-from drgs.io.outputs import claim
+from drgs.io.outputs import lock_folder
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +78,7 @@ def test_one_folder(shoot, walk, tmp_path):
     photos, other = shoot
     files = named_files([photos, other])
     told = []
-    with claim(tmp_path / "out", "sfm") as held:
+    with lock_folder(tmp_path / "out", "sfm") as held:
         found = gather(*files, held, "pictures", 10, lambda *step: told.append(step))
     folder = tmp_path / "out" / "pictures"
     assert found.folder == folder
@@ -113,7 +113,7 @@ def test_one_folder(shoot, walk, tmp_path):
 def test_what_was_recorded_goes_on(shoot, tmp_path):
     """Pictures with a frames.json of ours join others; one that is not ours says nothing, a damaged one is told."""
     photos, _ = shoot
-    with claim(tmp_path / "out", "sfm") as held:
+    with lock_folder(tmp_path / "out", "sfm") as held:
         gather([], [photos / "clip.mp4"], held, "first", 5)
         files = list_images(tmp_path / "out" / "first")
         gather(files, [], held, "second")
@@ -149,7 +149,7 @@ def test_too_few_frames_for_the_videos(shoot, tmp_path):
     """One of each at least, and nothing is left behind."""
     photos, other = shoot
     with (
-        claim(tmp_path / "out", "sfm") as held,
+        lock_folder(tmp_path / "out", "sfm") as held,
         pytest.raises(ValueError, match="frames: must be at least one of each video, 2, got 1"),
     ):
         gather([], [photos / "clip.mp4", other / "clip.mp4"], held, "pictures", 1)

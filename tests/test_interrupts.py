@@ -37,7 +37,7 @@ def wait(kind):
 try:
     say = lambda error: type(error).__name__ + "\\n"
     with interrupts.handled(outputs.clean, say):
-        with outputs.claim(sys.argv[1], "fit"), atomic.temporary_folder("sfm", sys.argv[1]) as folder:
+        with outputs.lock_folder(sys.argv[1], "fit"), atomic.temporary_folder("sfm", sys.argv[1]) as folder:
             (folder / "a").write_text("b")
             if sys.argv[2] == "callback":
                 with interrupts.in_native_code():

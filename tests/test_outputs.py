@@ -13,7 +13,7 @@ import pytest
 from drgs.files import atomic_write, write_json
 from drgs.io import locks, outputs
 from drgs.io.atomic import temporary_folder
-from drgs.io.outputs import check_file, claim, replacing
+from drgs.io.outputs import check_file, lock_folder, replacing
 
 
 def put(path: Path, text: str) -> None:
@@ -26,11 +26,11 @@ def visible(folder: Path) -> list[str]:
 
 
 def test_what_is_somebody_elses_stays(tmp_path):
-    """Found out by `claim` before any work, and again when the file is put in its place."""
+    """Found out by `lock_folder` before any work, and again when the file is put in its place."""
     (tmp_path / "a.png").write_text("mine")
     with pytest.raises(ValueError, match=r"a.png: must not be replaced, .* move it away or choose another output"):
-        claim(tmp_path, "render", ["a.png"])
-    with claim(tmp_path, "render"), pytest.raises(ValueError, match="must not be replaced"):
+        lock_folder(tmp_path, "render", ["a.png"])
+    with lock_folder(tmp_path, "render"), pytest.raises(ValueError, match="must not be replaced"):
         put(tmp_path / "a.png", "ours")
     assert (tmp_path / "a.png").read_text() == "mine"
     assert visible(tmp_path) == ["a.png"]
@@ -39,48 +39,48 @@ def test_what_is_somebody_elses_stays(tmp_path):
 def test_what_drgs_made_is_replaced(tmp_path):
     """Again and again, also in a copy of the folder; the record says which command made it."""
     for text in ("one", "two", "two"):
-        with claim(tmp_path / "out", "render", ["a.png", "b/c.png"]):
+        with lock_folder(tmp_path / "out", "render", ["a.png", "b/c.png"]):
             put(tmp_path / "out" / "a.png", text)
             put(tmp_path / "out" / "b" / "c.png", text)
     assert (tmp_path / "out" / "b" / "c.png").read_text() == "two"
     subprocess.run(["cp", "-r", tmp_path / "out", tmp_path / "copy"], check=True)
-    with claim(tmp_path / "copy", "render", ["a.png"]) as held:
-        assert held.is_made(tmp_path / "copy" / "b", by=("render",))
-        assert not held.is_made(tmp_path / "copy" / "b", by=("fit",))
+    with lock_folder(tmp_path / "copy", "render", ["a.png"]) as held:
+        assert held.is_ours(tmp_path / "copy" / "b", by=("render",))
+        assert not held.is_ours(tmp_path / "copy" / "b", by=("fit",))
 
 
 def test_what_was_edited_stays(tmp_path):
     """A file of ours with another content, or a link in its place, is the user's."""
-    with claim(tmp_path, "render"):
+    with lock_folder(tmp_path, "render"):
         put(tmp_path / "a.png", "ours")
         put(tmp_path / "b.png", "ours")
     (tmp_path / "a.png").write_text("edited")
     with pytest.raises(ValueError, match="a.png: must not be replaced"):
-        claim(tmp_path, "render", ["a.png"])
+        lock_folder(tmp_path, "render", ["a.png"])
     (tmp_path / "b.png").unlink()
     (tmp_path / "b.png").symlink_to("a.png")
     with pytest.raises(ValueError, match="b.png: must not be replaced"):
-        claim(tmp_path, "render", ["b.png"])
+        lock_folder(tmp_path, "render", ["b.png"])
 
 
 def test_killed_between_record_and_file(tmp_path):
     """The record comes first: a file that appears is known, and the one that it would have replaced still is."""
-    with claim(tmp_path, "render") as held:
+    with lock_folder(tmp_path, "render") as held:
         put(tmp_path / "a.png", "old")
         (tmp_path / "new").write_text("new")
         held.record("a.png", tmp_path / "new")  # killed here
     with (tmp_path / outputs.JOURNAL).open("ab") as file:
         file.write(b'{"file": "a.p')
-    with claim(tmp_path, "render", ["a.png"]):
+    with lock_folder(tmp_path, "render", ["a.png"]):
         put(tmp_path / "a.png", "new")
-    with claim(tmp_path, "render", ["a.png"]):
+    with lock_folder(tmp_path, "render", ["a.png"]):
         pass
 
 
 @pytest.mark.parametrize("link", [None, os.symlink, os.link])
 def test_inputs_are_never_outputs(tmp_path, link):
     """By what a path leads to, through links of both kinds, also where drgs made the file."""
-    with claim(tmp_path / "out", "render"):
+    with lock_folder(tmp_path / "out", "render"):
         put(tmp_path / "out" / "cameras.json", "[]")
     source = tmp_path / "out" / "cameras.json"
     if link:
@@ -88,7 +88,7 @@ def test_inputs_are_never_outputs(tmp_path, link):
         source = tmp_path / "linked.json"
     os.chdir(tmp_path / "out")
     with pytest.raises(ValueError, match="cameras.json: must not be read and replaced, it is an input"):
-        claim(".", "render", ["cameras.json"], inputs=[source])
+        lock_folder(".", "render", ["cameras.json"], inputs=[source])
     with pytest.raises(ValueError, match="must not be read and replaced"):
         check_file("cameras.json", "select", [source])
 
@@ -115,17 +115,17 @@ def test_folders_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("")
     for path in (tmp_path / "file", tmp_path / "file" / "out", Path("/proc/out")):
         with pytest.raises(ValueError, match=r"-o must be a folder that can be written, got: .*; choose another"):
-            claim(path, "fit")
+            lock_folder(path, "fit")
     assert visible(tmp_path) == ["file"]
 
 
 def test_nothing_is_left_of_a_command_that_wrote_nothing(tmp_path):
     """Folders that were made for it go, those that were there stay."""
-    with claim(tmp_path / "a" / "b", "fit"):
+    with lock_folder(tmp_path / "a" / "b", "fit"):
         assert (tmp_path / "a" / "b" / locks.NAME).is_file()
     assert not list(tmp_path.iterdir())
     (tmp_path / "a").mkdir()
-    with claim(tmp_path / "a" / "b", "fit"):
+    with lock_folder(tmp_path / "a" / "b", "fit"):
         pass
     assert visible(tmp_path) == ["a"]
 
@@ -134,7 +134,7 @@ def test_sweep_takes_only_unfinished_files_of_ours(tmp_path):
     """A killed process leaves a file and a folder, which the next one removes; names like them stay."""
     code = (
         "import os, sys; from drgs.io.outputs import *; from drgs.io.atomic import *\n"
-        "with claim(sys.argv[1], 'fit'), temporary_folder('sfm', sys.argv[1]) as folder:\n"
+        "with lock_folder(sys.argv[1], 'fit'), temporary_folder('sfm', sys.argv[1]) as folder:\n"
         "    (folder / 'database.db').write_text('x')\n"
         "    with replacing(sys.argv[1] + '/state.safetensors') as name:\n"
         "        open(name, 'w').write('half'); os._exit(9)\n"
@@ -144,7 +144,7 @@ def test_sweep_takes_only_unfinished_files_of_ours(tmp_path):
         (tmp_path / name).write_text("mine")
     assert subprocess.run([sys.executable, "-c", code, tmp_path], check=False).returncode == 9
     assert len(list(tmp_path.iterdir())) == len(mine) + 3  # a folder, a file, the lock
-    with claim(tmp_path, "fit"):
+    with lock_folder(tmp_path, "fit"):
         assert sorted(x.name for x in tmp_path.iterdir()) == sorted([*mine, locks.NAME])
 
 
@@ -162,12 +162,12 @@ def test_temporary_things_go(tmp_path):
 
 def test_removal_spares_what_was_added(tmp_path):
     """A folder of ours with a file of the user's in it is refused as a whole."""
-    with claim(tmp_path, "sfm") as held, temporary_folder("sfm", tmp_path) as made:
+    with lock_folder(tmp_path, "sfm") as held, temporary_folder("sfm", tmp_path) as made:
         (made / "sparse" / "0").mkdir(parents=True)
         (made / "sparse" / "0" / "cameras.bin").write_text("ours")
         held.put(made / "sparse", "sparse")
     (tmp_path / "sparse" / "0" / "notes.txt").write_text("mine")
-    with claim(tmp_path, "sfm") as held:
+    with lock_folder(tmp_path, "sfm") as held:
         with pytest.raises(ValueError, match="sparse: must not be replaced"):
             held.remove(tmp_path / "sparse")
         assert (tmp_path / "sparse" / "0" / "cameras.bin").exists()
@@ -178,12 +178,12 @@ def test_removal_spares_what_was_added(tmp_path):
 
 def test_record_stays_short(tmp_path, monkeypatch):
     """A thousand checkpoints do not make a thousand lines for good, and the last one is still known."""
-    with claim(tmp_path, "fit"):
+    with lock_folder(tmp_path, "fit"):
         for i in range(250):
             monkeypatch.setattr(os, "fsync", lambda _: None)
             put(tmp_path / "state", str(i))
     assert len((tmp_path / outputs.JOURNAL).read_bytes().splitlines()) == 250
-    with claim(tmp_path, "fit", ["state"]):
+    with lock_folder(tmp_path, "fit", ["state"]):
         assert len((tmp_path / outputs.JOURNAL).read_bytes().splitlines()) == 1
 
 
@@ -192,7 +192,7 @@ def test_a_damaged_journal_is_read_as_far_as_it_goes(tmp_path):
     rows = [b"[" * 100_000, b"5", b"[]", b'{"file": 5, "sha256": "a", "command": "fit"}']
     rows += [b'{"file": "a", "sha256": ["a"], "command": "fit"}', b'{"file": "\\u0000", "sha256": "a", "command": "x"}']
     (tmp_path / outputs.JOURNAL).write_bytes(b"\n".join(rows * 60) + b"\n")
-    with outputs.claim(tmp_path, "fit", ["x"]), replacing(tmp_path / "x") as name:
+    with outputs.lock_folder(tmp_path, "fit", ["x"]), replacing(tmp_path / "x") as name:
         Path(name).write_text("whole")
     assert (tmp_path / "x").read_text() == "whole"
 
@@ -212,7 +212,7 @@ def test_a_lock_that_is_nested_too_deeply_says_nothing(tmp_path):
     """It is one that cannot be read, as an empty one: old, it is removed."""
     (tmp_path / locks.NAME).write_bytes(b"[" * 60_000)
     os.utime(tmp_path / locks.NAME, (0, 0))
-    with outputs.claim(tmp_path, "fit"):
+    with outputs.lock_folder(tmp_path, "fit"):
         pass
 
 
@@ -220,7 +220,7 @@ def test_living_process_is_not_disturbed(tmp_path):
     """Named with command, process and machine; the folder stays as it is."""
     foreign_lock(tmp_path)
     with pytest.raises(ValueError, match=rf"`drgs fit` \(process {os.getppid()} on .*writes there; wait for it"):
-        claim(tmp_path, "eval")
+        lock_folder(tmp_path, "eval")
     assert [path.name for path in tmp_path.iterdir()] == [locks.NAME]
 
 
@@ -229,9 +229,9 @@ def test_other_machines_are_believed(tmp_path):
     for fields in ({"host": "elsewhere", "pid": 1}, {"space": "pid:[1]"}):
         foreign_lock(tmp_path, **fields)
         with pytest.raises(ValueError, match=r"delete .*\.drgs\.lock if that process no longer runs"):
-            claim(tmp_path, "fit")
+            lock_folder(tmp_path, "fit")
     (tmp_path / locks.NAME).unlink()
-    with claim(tmp_path, "fit"):
+    with lock_folder(tmp_path, "fit"):
         pass
 
 
@@ -239,7 +239,7 @@ def test_other_machines_are_believed(tmp_path):
 def test_stale_lock_is_named_and_taken_over(tmp_path, caplog, fields):
     """Of a process that is gone, or whose number another one has now."""
     foreign_lock(tmp_path, **fields)
-    with claim(tmp_path, "fit"):
+    with lock_folder(tmp_path, "fit"):
         assert "ended without unlocking it, goes on here" in caplog.text
         assert str(fields.get("pid", os.getppid())) in caplog.text
         assert json.loads((tmp_path / locks.NAME).read_text())["pid"] == os.getpid()
@@ -250,9 +250,9 @@ def test_half_written_lock(tmp_path):
     """Just now: somebody begins. Old: of a process that was killed while it wrote it."""
     (tmp_path / locks.NAME).write_text("")
     with pytest.raises(ValueError, match="another one begins"):
-        claim(tmp_path, "fit")
+        lock_folder(tmp_path, "fit")
     os.utime(tmp_path / locks.NAME, (0, 0))
-    with claim(tmp_path, "fit"):
+    with lock_folder(tmp_path, "fit"):
         pass
 
 
@@ -264,18 +264,18 @@ def test_lock_of_another_thread(tmp_path):
 
     def other():
         try:
-            claim(tmp_path, "fit")
+            lock_folder(tmp_path, "fit")
         except ValueError as error:
             said.append(str(error))
 
-    with claim(tmp_path, "demo"), claim(tmp_path, "fit") as inner:
+    with lock_folder(tmp_path, "demo"), lock_folder(tmp_path, "fit") as inner:
         assert inner.command == "demo"
         inner.release()
         thread = threading.Thread(target=other)
         thread.start()
         thread.join()
         assert (tmp_path / locks.NAME).exists()
-        claim(tmp_path, "fit")
+        lock_folder(tmp_path, "fit")
     assert "two threads" in said[0]
     assert not (tmp_path / locks.NAME).exists()
 

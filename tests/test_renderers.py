@@ -17,7 +17,7 @@ from drgs.files import load_state, save_state
 from drgs.fitting.config import FitConfig, recorded_config
 from drgs.fitting.frames import load_frames
 from drgs.fitting.renderers import ANY, RendererSchedule, renderers_to_measure
-from drgs.fitting.resume import claim_run
+from drgs.fitting.resume import lock_run
 from drgs.metrics import renderers_table
 from drgs.settings import RenderSettings
 from drgs.train import Trainer, fit
@@ -217,7 +217,7 @@ def test_a_fit_is_measured_in_what_it_is_for(dataset, tmp_path, capsys, monkeypa
     assert f"gsplat  {found['rows'][2]['mean']['psnr']:.2f}" in " ".join(said.split(" ")).replace("    ", "  ")
     monkeypatch.setattr("drgs.data.load", lambda path, **_: dataset)
     for asked, names in {"all": list(ANY), "inria": ["fast", "inria"], None: ["exact", "fast", "gsplat"]}.items():
-        with claim_run(result.run, "eval") as claimed:
+        with lock_run(result.run, "eval") as claimed:
             again = evaluate_run(result.run, claimed, "train", renderer=asked)["renderers"]
         assert [row["name"] for row in again["rows"]] == names
         assert [len(row["views"]) for row in again["rows"]] == [7] * len(names)

@@ -231,9 +231,9 @@ def test_killed_while_it_is_published(tmp_path, monkeypatch):
         for name in ("a", "b", "c"):
             output.write_file(folder / name, name.encode())
 
-    from drgs.io.outputs import Claim
+    from drgs.io.outputs import LockedFolder
 
-    put = Claim.put
+    put = LockedFolder.put
     for moved in range(4):
         left = [moved]
 
@@ -243,10 +243,10 @@ def test_killed_while_it_is_published(tmp_path, monkeypatch):
             left[0] -= 1
             put(claim, path, name)
 
-        monkeypatch.setattr(Claim, "put", stop)
+        monkeypatch.setattr(LockedFolder, "put", stop)
         with pytest.raises(KeyboardInterrupt):
             output.publish(tmp_path / str(moved), {"n": 1}, fill, "test")
-        monkeypatch.setattr(Claim, "put", put)
+        monkeypatch.setattr(LockedFolder, "put", put)
         output.publish(tmp_path / str(moved), {"n": 1}, fill, "test")
         names = sorted(path.name for path in (tmp_path / str(moved)).iterdir())
         assert names == [".drgs.jsonl", "a", "b", "c", "params.json"]

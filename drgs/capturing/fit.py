@@ -11,9 +11,9 @@ from drgs.capturing.budget import FitPlan, Pacer, plan_fit
 from drgs.capturing.capture import config_of
 from drgs.fitting.config import FitConfig, recorded_config
 from drgs.fitting.records import fit_record, is_run
-from drgs.fitting.resume import FILES, claim_run, last_checkpoint
+from drgs.fitting.resume import FILES, last_checkpoint, lock_run
 from drgs.io.checkpoint import save_state
-from drgs.io.outputs import claim
+from drgs.io.outputs import lock_folder
 from drgs.report.write import FILE as REPORT
 from drgs.sharing.scene import FILE as PAGE
 from drgs.train import fit
@@ -65,7 +65,7 @@ def fit_photographs(capture: Capture) -> Outcome:
     )
     quality = _quality(capture, result, config.data.max_pixels)
     if before is not None:
-        with claim(capture.folder, "capture") as held:
+        with lock_folder(capture.folder, "capture") as held:
             held.remove(before)
     line = f"{len(result.gaussians)} Gaussians after {result.metrics['step']} steps{quality}"
     is_test = result.metrics["split"] == "test"
@@ -114,7 +114,7 @@ def _make_room(capture: Capture) -> Path:
         batch.handover = "kept"
         capture.record.write()
     if batch.handover == "kept":
-        with claim_run(run, "capture") as held:
+        with lock_run(run, "capture") as held:
             for name in (*FILES, "renders", NEXT, REPORT, PAGE):
                 held.remove(run.path / name)
         batch.handover = "cleared"

@@ -20,7 +20,7 @@ from drgs.information.scoring import Scoring
 from drgs.information.semantics import SemanticMetric
 from drgs.integrator import render
 from drgs.io.journal import SCHEMA
-from drgs.io.outputs import claim, write_json
+from drgs.io.outputs import lock_folder, write_json
 from drgs.io.run import Run
 from drgs.meshing.depths import seen_distance
 from drgs.select import select
@@ -61,7 +61,7 @@ def rank_next(run: Path, k: int, length: str | None, show: bool = True) -> list[
         ValueError: If things move, the photographs say nothing of where one can stand, or `length` is wrong.
     """
     folder = Run(run)
-    with claim(run, "capture", [NEXT]), Bar("next photographs", show=show) as bar:
+    with lock_folder(run, "capture", [NEXT]), Bar("next photographs", show=show) as bar:
         loaded = load_run(folder)
         record = loaded.record
         if loaded.moving is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from drgs.capturing import diagnosis
 from drgs.capturing.budget import plan_poses, planned_poses
@@ -15,7 +15,7 @@ from drgs.data.registering import register
 from drgs.data.sfm import run_sfm
 from drgs.display.progress import Bar
 from drgs.fitting.records import fit_record
-from drgs.io.outputs import claim
+from drgs.io.outputs import lock_folder
 
 if TYPE_CHECKING:
     from drgs.capturing.capture import Capture
@@ -34,7 +34,8 @@ def find_poses(capture: Capture) -> Outcome:
         ValueError: If too few photographs can be connected; the message has what is wrong with them.
     """
     names = [path.name for path in list_images(capture.photos)]
-    budget, size = capture.clock.budget, {}
+    budget = capture.clock.budget
+    size: dict[str, Any] = {}
     if budget is not None:
         plan = plan_poses(capture.photos, names, budget, capture.photographs.decode)
         capture.plan("poses", plan)
@@ -71,7 +72,7 @@ def add_poses(capture: Capture) -> Outcome:
         write_held_out(scene, fit_record(capture.run).test, "capture")
     posed, summary = _posed(capture, files), None
     if not posed:
-        with claim(scene, "capture") as held:
+        with lock_folder(scene, "capture") as held:
             for link in _links_to(scene / "images", files):  # of a command that ended before it had poses
                 held.remove(link)
         before = capture.record.batches[0].plan.get("poses", {})

@@ -31,10 +31,10 @@ from drgs.data.gathering import gather, named_files, usable_files
 from drgs.display.progress import Bar
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import is_run
-from drgs.fitting.resume import claim_run
+from drgs.fitting.resume import lock_run
 from drgs.io import interrupts
 from drgs.io.atomic import is_full
-from drgs.io.outputs import claim
+from drgs.io.outputs import lock_folder
 from drgs.io.run import Run
 from drgs.report.write import FILE as REPORT
 from drgs.sharing.scene import FILE as PAGE
@@ -87,8 +87,8 @@ def run_capture(options: CaptureOptions, config: FitConfig, say: Callable[[str],
         # Not the files: links to them in the folder of the capture may be made anew.
         folders = {path if path.is_dir() else path.parent for path in options.paths}
         with (
-            claim_run(Run(options.output), "capture", True, folders),
-            claim(options.output / FOLDER, "capture", inputs=folders),
+            lock_run(Run(options.output), "capture", True, folders),
+            lock_folder(options.output / FOLDER, "capture", inputs=folders),
             _resumable(),
         ):
             if options.add and given:
@@ -185,7 +185,7 @@ def _gather(capture: Capture, photographs: list[Path], videos: list[Path]) -> Ou
         frames = plan_frames(videos[0], len(photographs), frames, budget)
         if frames < options.frames:
             capture.say(f"plan for {duration(budget)}: at most {frames} frames of videos, for their poses")
-    with claim(capture.folder, "capture") as held, Bar("photos") as bar:
+    with lock_folder(capture.folder, "capture") as held, Bar("photos") as bar:
         held.remove(capture.photos)  # of a command that ended before it could say so
         gathered = gather(photographs, videos, held, capture.photos.name, frames, bar.stage)
     names = [path.name for path in list_images(gathered.folder)]
@@ -199,7 +199,7 @@ def _gather(capture: Capture, photographs: list[Path], videos: list[Path]) -> Ou
 
 def _page(capture: Capture, file: str, write: Callable[[Path], object]) -> Outcome:
     """A page of the run."""
-    with claim_run(capture.run, "capture") as held:
+    with lock_run(capture.run, "capture") as held:
         held.check([file])
         write(capture.run.path / file)
     return str(capture.run.path / file), []

@@ -13,7 +13,7 @@ from drgs.display.progress import Bar
 from drgs.gain import Prior, check, variances
 from drgs.information.groups import GROUPS
 from drgs.io.checkpoint import load_state
-from drgs.io.outputs import claim
+from drgs.io.outputs import lock_folder
 
 if TYPE_CHECKING:
     from drgs.commands.options import Convert
@@ -31,7 +31,7 @@ def run(args: Convert) -> None:
             f"{wanted[0]} must have a .ply to write to, {suffix} has no room for columns; convert to a .ply"
         )
     prior = Prior(args.prior)
-    with claim(args.out.parent, "convert", [args.out.name], [args.scene, args.uncertainty or ""]):
+    with lock_folder(args.out.parent, "convert", [args.out.name], [args.scene, args.uncertainty or ""]):
         with Bar("reading", show=not args.quiet):
             given = _given(args)
         g = still(args, given)

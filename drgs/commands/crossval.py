@@ -10,7 +10,7 @@ from drgs.commands.viewpoints import check_counts, seen_views
 from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.io.journal import SCHEMA
-from drgs.io.outputs import atomic_write, check_file, claim, write_json
+from drgs.io.outputs import atomic_write, check_file, lock_folder, write_json
 from drgs.lab import ladder, rasterizers
 from drgs.lab.crossval import Result, crossval
 from drgs.lab.report import html
@@ -28,7 +28,7 @@ def run(args: Crossval) -> int:
     check_counts(args)
     inputs = [args.scene, args.cameras or "", args.rasterizer]
     if args.export is None:
-        claim(args.output, "crossval", ["report.html", "crossval.json"], inputs)
+        lock_folder(args.output, "crossval", ["report.html", "crossval.json"], inputs)
     elif args.export.suffix != ".npz":
         raise ValueError(f"--export {args.export}: must end with .npz, got {args.export.suffix or 'no suffix'}")
     else:

@@ -28,7 +28,7 @@ from drgs.fitting.losses import psnr_of
 from drgs.information.nuisances import Nuisances
 from drgs.integrator import render
 from drgs.io.journal import SCHEMA
-from drgs.io.outputs import Claim, claim, write_json
+from drgs.io.outputs import LockedFolder, lock_folder, write_json
 from drgs.report import pictures as report_pictures
 from drgs.report.write import FILE
 from drgs.settings import RenderSettings
@@ -130,13 +130,13 @@ def make_demo(out_dir: Path, plan: Plan, progress: bool = False) -> dict:
         ValueError: If something is in the way that an earlier demo did not make.
     """
     with (
-        claim(out_dir, "demo", ["overview.png", "comparison.png", "turntable.webm", "demo.json"]),
-        claim(Path(out_dir) / "run", "demo") as run_folder,
+        lock_folder(out_dir, "demo", ["overview.png", "comparison.png", "turntable.webm", "demo.json"]),
+        lock_folder(Path(out_dir) / "run", "demo") as run_folder,
     ):
         return _make_demo(Path(out_dir), run_folder, plan, progress)
 
 
-def _make_demo(out_dir: Path, run_folder: Claim, plan: Plan, progress: bool) -> dict:
+def _make_demo(out_dir: Path, run_folder: LockedFolder, plan: Plan, progress: bool) -> dict:
     """The tour, in folders that belong to it: six stages, each timed, and demo.json at the end."""
     run_folder.check_all(_OWN)
     began = time.perf_counter()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from drgs.display import tables
 from drgs.evaluation import evaluate_run
 from drgs.fitting.records import fit_record
-from drgs.fitting.resume import claim_run
+from drgs.fitting.resume import lock_run
 from drgs.io.run import Run
 from drgs.metrics import METRICS, MOVING, OBJECT, Lpips, renderers_table
 
@@ -23,7 +23,7 @@ def run(args: Eval) -> None:
     recorded = fit_record(run)
     recorded.check_data(run.path)
     lpips = Lpips(args.lpips_weights) if args.lpips_weights else None
-    written = evaluate_run(run, claim_run(run, "eval"), args.split, lpips, args.strict, args.preset, args.scale)
+    written = evaluate_run(run, lock_run(run, "eval"), args.split, lpips, args.strict, args.preset, args.scale)
     if not args.quiet:
         print_table(written, lpips=lpips is not None)
 

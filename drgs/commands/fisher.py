@@ -35,7 +35,7 @@ from drgs.information.blocks import MAP_PRIOR, SceneBlocks
 from drgs.information.sums import add, together
 from drgs.io.checkpoint import save_state
 from drgs.io.journal import SCHEMA
-from drgs.io.outputs import claim, write_json
+from drgs.io.outputs import lock_folder, write_json
 from drgs.select import Scoring
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def run(args: Fisher) -> None:
     settings = args.settings()  # refuses what cannot be, before anything is read
     prior = args.given_prior() or MAP_PRIOR
     inputs = [args.scene, args.train or "", args.cameras or ""]
-    output = claim(args.output, "fisher", ["information.safetensors", "fisher.json"], inputs)
+    output = lock_folder(args.output, "fisher", ["information.safetensors", "fisher.json"], inputs)
     given = SceneInput.of(args)
     settings = given.over_background(settings)
     text = args.train

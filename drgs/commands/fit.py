@@ -11,7 +11,7 @@ from drgs.commands.report import report_of
 from drgs.data.backgrounds import default_background
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import fit_record, is_run
-from drgs.fitting.resume import claim_run
+from drgs.fitting.resume import lock_run
 from drgs.io.run import Run
 from drgs.report.write import FILE
 from drgs.train import fit
@@ -31,7 +31,7 @@ def run(args: Fit) -> None:
     config = args.fit_config()
     is_active = config.selection is not None
     # Before minutes of reading images and triangulating points.
-    claim_run(Run(args.output), "fit", args.resume, [args.data])
+    lock_run(Run(args.output), "fit", args.resume, [args.data])
     dataset = load_dataset(
         args.data,
         config,

@@ -13,7 +13,7 @@ from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import check_lenses, evenly, known_views
 from drgs.display.progress import Bar
 from drgs.io.checkpoint import state_header
-from drgs.io.outputs import claim
+from drgs.io.outputs import lock_folder
 from drgs.meshing.extraction import mesh_of
 from drgs.meshing.options import MeshOptions
 from drgs.meshing.writing import MESH_SUFFIXES, save_mesh
@@ -40,7 +40,7 @@ def run(args: Mesh) -> None:
             raise ValueError(f"{option} must be at least 1, got {value}; correct it")
     if importlib.util.find_spec("skimage") is None:
         raise ValueError("marching cubes need the package scikit-image, which is missing; pip install 'drgs[mesh]'")
-    with claim(args.output.parent, "mesh", [args.output.name], [args.scene, args.cameras or ""]):
+    with lock_folder(args.output.parent, "mesh", [args.output.name], [args.scene, args.cameras or ""]):
         with Bar("reading", show=not args.quiet):
             given = SceneInput.of(args)
             gaussians = _without_skybox(still(args, given), given)

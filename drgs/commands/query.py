@@ -23,7 +23,7 @@ from drgs.features.query import TEMPERATURE, TextQuery
 from drgs.features.teacher import read_tensor
 from drgs.integrator import render
 from drgs.io.journal import SCHEMA
-from drgs.io.outputs import claim, write_json
+from drgs.io.outputs import lock_folder, write_json
 from drgs.sizes import at_most
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def run(args: Query) -> None:
         raise ValueError(f"one of --class and --text-embedding must be given, got {got}; say what to look for")
     ply = "rest.ply" if args.remove else "selected.ply"
     inputs = [args.scene, args.text_embedding or "", args.decoder or "", args.cameras or ""]
-    output = claim(args.output, "query", ["query.json", ply], inputs)
+    output = lock_folder(args.output, "query", ["query.json", ply], inputs)
     given = SceneInput.of(args)
     settings = given.over_background(settings)
     g = given.gaussians

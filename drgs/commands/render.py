@@ -45,7 +45,7 @@ from drgs.ellipsoids import colors_only
 from drgs.guards import memory
 from drgs.integrator import render
 from drgs.io.journal import SCHEMA
-from drgs.io.outputs import claim, write_json
+from drgs.io.outputs import lock_folder, write_json
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -86,7 +86,7 @@ def run(args: Render) -> None:
     kinds = [kind for kind in PAINTINGS if getattr(args, kind)]
     movies = [_movie_of(movie, kind, end) for end in _FILMS if end in formats for kind in ("", *kinds)]
     fixed = ["render.json", "cameras.json", *movies] if alone is None else [alone.name]
-    output = claim(args.output, "render", fixed, inputs=[args.scene, views, *([args.path] if args.path else [])])
+    output = lock_folder(args.output, "render", fixed, inputs=[args.scene, views, *([args.path] if args.path else [])])
     given = SceneInput.of(args)
     paint = painters(kinds, given, args.scene)
     gaussians = given.gaussians if paint else given.colors

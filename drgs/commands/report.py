@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from drgs.commands.repeat import fit_command
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import fit_record
-from drgs.fitting.resume import claim_run
+from drgs.fitting.resume import lock_run
 from drgs.io.outputs import check_file
 from drgs.io.run import Run
 from drgs.report.page import GENERATOR
@@ -31,7 +31,7 @@ def run(args: Report) -> None:
     path = args.output
     if path is None:
         path = folder.path / FILE
-        claim_run(folder, "report").check([FILE])
+        lock_run(folder, "report").check([FILE])
     else:
         if path.suffix.lower() not in (".html", ".htm"):
             raise ValueError(f"{path}: must be named *.html, which is what is written; choose another (-o)")

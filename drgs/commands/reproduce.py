@@ -16,7 +16,7 @@ from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.io.journal import SCHEMA
 from drgs.io.json_files import check_json, read_json
-from drgs.io.outputs import atomic_write, claim, write_json
+from drgs.io.outputs import atomic_write, lock_folder, write_json
 from drgs.metrics import Lpips
 from drgs.runtime.machine import commit, cpu_model
 from drgs.studies.cells import run_cells
@@ -40,7 +40,7 @@ _FIGURE = "all views"  # is given what the others choose from: no row of the she
 def run(args: Reproduce) -> None:
     """`drgs reproduce static -o OUT`."""
     out: Path = args.output
-    claim(out, "reproduce", [_GIVEN, *(f"{args.what}.{kind}" for kind in ("md", "json", "png"))], args.data)
+    lock_folder(out, "reproduce", [_GIVEN, *(f"{args.what}.{kind}" for kind in ("md", "json", "png"))], args.data)
     known = _same_data(out, args.data)
     weights = args.lpips_weights and args.lpips_weights.resolve()
     if weights:

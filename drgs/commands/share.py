@@ -11,7 +11,7 @@ from drgs.commands.orbits import scene_orbit
 from drgs.commands.scene_input import SceneInput
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import is_run, load_run
-from drgs.fitting.resume import claim_run
+from drgs.fitting.resume import lock_run
 from drgs.io.foreign import refuse_foreign
 from drgs.io.outputs import check_file
 from drgs.io.run import Run
@@ -41,7 +41,7 @@ def run(args: Share) -> None:
         raise ValueError(f"share: --moments must be in [2, {_MOST_MOMENTS}], got {args.moments}; correct it")
     path = _output(args)
     is_inside = args.output is None and is_run(args.scene)
-    with claim_run(Run(args.scene), "share") if is_inside else contextlib.nullcontext() as held:
+    with lock_run(Run(args.scene), "share") if is_inside else contextlib.nullcontext() as held:
         if held is not None:
             held.check([FILE])
         shared = shared_of(args)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from drgs import runtime
 from drgs.display.progress import Bar
 from drgs.io.journal import SCHEMA
-from drgs.io.outputs import atomic_write, claim, write_json
+from drgs.io.outputs import atomic_write, lock_folder, write_json
 from drgs.lab import extremes
 from drgs.lab.stress import BOUNDS, StressRow, rows
 
@@ -36,7 +36,7 @@ def run(args: Stress) -> int:
     if not chosen:
         raise ValueError(f"stress: --match must be part of a case's name, got {args.match!r}; drgs stress lists all")
     if args.output is not None:
-        claim(args.output, "stress", ["stress.json", "stress.md"])
+        lock_folder(args.output, "stress", ["stress.json", "stress.md"])
     start = time.perf_counter()
     found = []
     if not args.quiet:

@@ -28,7 +28,7 @@ from drgs.features.encoders import TEMPLATES, ClipEncoder
 from drgs.fitting.config import DataConfig
 from drgs.io.journal import SCHEMA
 from drgs.io.json_files import read_json
-from drgs.io.outputs import Claim, atomic_write, claim, write_json
+from drgs.io.outputs import LockedFolder, atomic_write, lock_folder, write_json
 
 if TYPE_CHECKING:
     from drgs.commands.making_options import Teach
@@ -53,8 +53,8 @@ def run(args: Teach) -> None:
     if not args.data.exists():
         raise FileNotFoundError(f"{args.data}: must be a data set, found no such file or folder; check the path")
     folder = args.data if args.data.is_dir() else args.data.parent
-    output = claim(folder, "teach", inputs=[args.model])
-    output.sweep(_FOLDER)
+    output = lock_folder(folder, "teach", inputs=[args.model])
+    output.remove_unfinished(_FOLDER)
     _refuse_others(output)
     names = _names(args, output)
     times = DataConfig.times if args.times is None else args.times
@@ -80,7 +80,7 @@ def run(args: Teach) -> None:
     if texts is not None:
         _write_texts(output, texts, names)
     with Bar("maps that are there", show=not args.quiet):  # each of them is hashed
-        left = [(name, view) for name, view in files.items() if not output.is_made(output.path / name)]
+        left = [(name, view) for name, view in files.items() if not output.is_ours(output.path / name)]
     with Bar("teach", len(files), not args.quiet, done=len(files) - len(left)) as bar:
         for name, view in left:
             made = encoder.dense(_photograph(view), size or _size(view), scales, args.flip)
@@ -103,13 +103,13 @@ def _scales(text: str) -> list[float]:
     return scales
 
 
-def _refuse_others(output: Claim) -> None:
+def _refuse_others(output: LockedFolder) -> None:
     """Raise ValueError where a teacher's files are there that this command did not write."""
     folder = output.path / _FOLDER
     if not folder.is_dir() or folder.is_symlink():
         output.check([_FOLDER])
     paths = [*sorted(folder.rglob("*")), output.path / _EMBEDDINGS]
-    other = next((path for path in paths if path.is_file() and not output.is_made(path, ("teach",))), None)
+    other = next((path for path in paths if path.is_file() and not output.is_ours(path, ("teach",))), None)
     if other is not None:
         raise ValueError(
             f"{other}: must not be replaced, `drgs teach` did not make it; the data set has a teacher, move its files "
@@ -117,10 +117,10 @@ def _refuse_others(output: Claim) -> None:
         )
 
 
-def _names(args: Teach, output: Claim) -> list[str]:
+def _names(args: Teach, output: LockedFolder) -> list[str]:
     """The classes that texts are made of: those of --classes, else those that the data set names, if any."""
     held = next((output.path / name for name in CLASS_FILES if (output.path / name).is_file()), None)
-    if held is not None and output.is_made(held, ("teach",)):
+    if held is not None and output.is_ours(held, ("teach",)):
         held = None if args.classes is not None else held
     known = [] if held is None else list(read_class_names(held)[0].values())
     if args.classes is None:
@@ -171,7 +171,7 @@ def _files(views: list[View]) -> dict[str, View]:
     return files
 
 
-def _start(output: Claim, record: dict) -> None:
+def _start(output: LockedFolder, record: dict) -> None:
     """Write what is about to be made; what was made otherwise before is deleted first."""
     path = output.path / _RECORD
     held = read_json(path) if path.is_file() else {}
@@ -185,10 +185,10 @@ def _start(output: Claim, record: dict) -> None:
         write_json(path, record)
 
 
-def _write_texts(output: Claim, texts: torch.Tensor, names: list[str]) -> None:
+def _write_texts(output: LockedFolder, texts: torch.Tensor, names: list[str]) -> None:
     """text_embeddings.npy, and classes.json where there is no file of classes but ours."""
     held = next((output.path / name for name in CLASS_FILES if (output.path / name).is_file()), None)
-    if held is None or output.is_made(held, ("teach",)):
+    if held is None or output.is_ours(held, ("teach",)):
         classes = [{"id": number, "name": name} for number, name in enumerate(names, 1)]
         write_json(output.path / _CLASSES, {"schema": SCHEMA, "command": "teach", "unlabelled": 0, "classes": classes})
     with atomic_write(output.path / _EMBEDDINGS) as file:

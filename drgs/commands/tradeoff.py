@@ -35,7 +35,7 @@ from drgs.data.camera_lists import described
 from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.io.journal import SCHEMA
-from drgs.io.outputs import atomic_write, claim, write_json
+from drgs.io.outputs import atomic_write, lock_folder, write_json
 from drgs.lab.tradeoff import (
     CLOCKS,
     TRADEOFF_VARIANTS,
@@ -72,7 +72,7 @@ def run(args: Tradeoff) -> None:
         raise ValueError(f"--repeats must be in [1, 1000], got {args.repeats}; correct it")
     check_counts(args)
     names = ["tradeoff.json", "tradeoff.md", "tradeoff.png"]
-    claim(args.output, "tradeoff", names, inputs=[args.scene, args.cameras or ""])
+    lock_folder(args.output, "tradeoff", names, inputs=[args.scene, args.cameras or ""])
     given = SceneInput.of(args)
     gaussians, fields = given.colors, given.fields
     if not len(gaussians):

@@ -22,7 +22,7 @@ from drgs.io.atomic import temporary_folder
 from drgs.io.foreign import refuse_foreign
 from drgs.io.journal import SCHEMA
 from drgs.io.json_files import check_json, read_json
-from drgs.io.outputs import Claim
+from drgs.io.outputs import LockedFolder
 
 __all__ = [
     "FRAMES",
@@ -152,7 +152,7 @@ def _is_moment(video: Path, photographs: Sequence[Path]) -> bool:
 def gather(
     photographs: Sequence[Path],
     videos: Sequence[Path],
-    claimed: Claim,
+    output: LockedFolder,
     name: str = "photos",
     most: int = 150,
     progress: Callable[[str, int, int], None] | None = None,
@@ -164,18 +164,18 @@ def gather(
 
     Args:
         photographs, videos: Files, as `named_files` lists them.
-        claimed: The folder in which the new one is made; it is held by the command.
+        output: The folder in which the new one is made; it is held by the command.
         name: Name of the new folder; there must be none.
         most: Largest number of frames of all videos together, shared out by their lengths in frames that are wanted.
         progress: Called with (what is done, done, total).
     Raises:
         FileNotFoundError, ValueError: A video that cannot be decoded.
     """
-    with temporary_folder("photos", claimed.path) as unfinished:
+    with temporary_folder("photos", output.path) as unfinished:
         made = unfinished / name
-        gathered = fill(made, photographs, videos, claimed.command, most, progress)
-        claimed.put(made, name)
-    return dataclasses.replace(gathered, folder=claimed.path / name)
+        gathered = fill(made, photographs, videos, output.command, most, progress)
+        output.put(made, name)
+    return dataclasses.replace(gathered, folder=output.path / name)
 
 
 def fill(

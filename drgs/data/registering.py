@@ -23,11 +23,11 @@ from drgs.data.pairing import choose_new_pairs
 from drgs.data.photo_files import link_or_copy, photo_fault, readable_photos
 from drgs.data.sfm import SfmSummary
 from drgs.io.atomic import temporary_folder
-from drgs.io.outputs import claim
+from drgs.io.outputs import lock_folder
 
 if TYPE_CHECKING:
     from drgs.data.matching import Progress
-    from drgs.io.outputs import Claim
+    from drgs.io.outputs import LockedFolder
 
 __all__ = ["Registration", "register"]
 
@@ -82,7 +82,7 @@ def register(
     """
     scene, files = Path(scene), [Path(path) for path in photographs]
     _check(scene, files, max_image_size)
-    with claim(scene, "sfm", inputs=files) as output:
+    with lock_folder(scene, "sfm", inputs=files) as output:
         output.check(["sparse", "database.db"])
         names = _new_names(output.path / "images", files)
         with temporary_folder("register", output.path) as partial:
@@ -269,7 +269,7 @@ def _moved(before: Any, after: Any) -> float:
     return float(np.linalg.norm(new - old, axis=1).max() / max(spread, 1e-12))
 
 
-def _install(output: Claim, partial: Path, files: list[Path], names: list[str]) -> None:
+def _install(output: LockedFolder, partial: Path, files: list[Path], names: list[str]) -> None:
     """Add the photographs, then put the new database and the new model in the place of the old ones."""
     images = output.path / "images"
     frames = joined_frames(recorded_frames(images), files, names, output.command)
@@ -284,9 +284,9 @@ def _install(output: Claim, partial: Path, files: list[Path], names: list[str]) 
         new[f"images/{FRAMES}"] = partial / FRAMES
     new |= {file.name: file for file in partial.glob("database.db*")} | {"sparse": partial / "sparse"}
     for name, path in new.items():
-        output.announce(path, name)
+        output.record_planned(path, name)
     if images.is_symlink():
-        output.announce(partial / "images", "images")
+        output.record_planned(partial / "images", "images")
         output.remove(images)
         output.put(partial / "images", "images")
     for name in names:

@@ -21,12 +21,12 @@ from drgs.data.pairing import choose_pairs
 from drgs.data.photo_files import check_names, readable_photos, usable_photos
 from drgs.data.videos import list_videos
 from drgs.io.atomic import temporary_folder
-from drgs.io.outputs import claim
+from drgs.io.outputs import lock_folder
 
 if TYPE_CHECKING:
     from drgs.data.matching import Progress
     from drgs.data.shooting import Finding
-    from drgs.io.outputs import Claim
+    from drgs.io.outputs import LockedFolder
 
 __all__ = ["CAMERA_MODELS", "MATCHING", "SfmSummary", "run_sfm"]
 
@@ -134,7 +134,7 @@ def run_sfm(
     linked |= {} if masks in (None, ALPHA_MASKS) else {"masks": Path(masks)}
     made = [name for name, is_made in (("images", not image_dir), ("masks", masks == ALPHA_MASKS)) if is_made]
     marks = [time.perf_counter()]
-    with claim(out_dir, "sfm", inputs=[*paths, *linked.values()]) as output:
+    with lock_folder(out_dir, "sfm", inputs=[*paths, *linked.values()]) as output:
         _check_output(output, linked, made)
         with temporary_folder("sfm", output.path) as partial:
             (partial / "models").mkdir()
@@ -222,7 +222,7 @@ def _write_masked(image_dir: Path, names: list[str], masks: list[Path], partial:
     report("masks", len(names), len(names))
 
 
-def _check_output(output: Claim, linked: dict[str, Path], made: list[str]) -> None:
+def _check_output(output: LockedFolder, linked: dict[str, Path], made: list[str]) -> None:
     """Find out that what is to be replaced is an earlier result, before minutes of work.
 
     Args:
@@ -370,7 +370,7 @@ def _extract(
         before += len(names)
 
 
-def _install(partial: Path, output: Claim, linked: dict[str, Path], made: list[str]) -> None:
+def _install(partial: Path, output: LockedFolder, linked: dict[str, Path], made: list[str]) -> None:
     """Move the finished result to its place; the model, which makes the folder a data set, comes
     last.
     """
@@ -387,11 +387,11 @@ def _install(partial: Path, output: Claim, linked: dict[str, Path], made: list[s
     # SQLite may have left side files; they belong to the database.
     new |= {file.name: file for file in partial.glob("database.db*")} | {"sparse": partial / "sparse"}
     for name, path in new.items():
-        output.announce(path, name)
+        output.record_planned(path, name)
     output.remove(output.path / "sparse")
     masks = output.path / "masks"
     # Those of an earlier result; an empty folder is nobody's.
-    is_stale = output.is_made(masks, ("sfm",)) and (masks.is_symlink() or any(masks.iterdir()))
+    is_stale = output.is_ours(masks, ("sfm",)) and (masks.is_symlink() or any(masks.iterdir()))
     if is_stale and "masks" not in linked:
         output.remove(masks)
     for stale in output.path.glob("database.db*"):

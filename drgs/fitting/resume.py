@@ -12,15 +12,15 @@ from drgs.fitting.poses import CAMERAS
 from drgs.fitting.records import check_checkpoint, is_fit_config
 from drgs.fitting.semantic_record import EMBEDDINGS
 from drgs.io.checkpoint import load_state
-from drgs.io.outputs import claim, replacing
+from drgs.io.outputs import lock_folder, replacing
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from drgs.io.outputs import Claim
+    from drgs.io.outputs import LockedFolder
     from drgs.io.run import Run
 
-__all__ = ["FILES", "claim_run", "keep_previous", "last_checkpoint"]
+__all__ = ["FILES", "lock_run", "keep_previous", "last_checkpoint"]
 
 PREVIOUS = "state.previous.safetensors"
 _CHECKPOINTS = ("state.safetensors", PREVIOUS)
@@ -41,8 +41,8 @@ FILES = (
 _log = logging.getLogger(__name__)
 
 
-def claim_run(run: Run, command: str, resume: bool = True, inputs: Iterable = ()) -> Claim:
-    """Claim a run folder for a command that writes into it (`drgs.io.outputs.claim`).
+def lock_run(run: Run, command: str, resume: bool = True, inputs: Iterable = ()) -> LockedFolder:
+    """Claim a run folder for a command that writes into it (`drgs.io.outputs.lock_folder`).
 
     Args:
         run: The folder.
@@ -53,13 +53,13 @@ def claim_run(run: Run, command: str, resume: bool = True, inputs: Iterable = ()
         ValueError: If another process writes there, there is a run and `resume` is False, or one of `FILES` is not
             what drgs wrote.
     """
-    held = claim(run.path, command, inputs=inputs)
+    held = lock_folder(run.path, command, inputs=inputs)
     try:
         is_fit = is_fit_config(run.path / "config.json")
         if is_fit and resume:
             pictures = ("preview_*.png", "test/*.png", "train/*.png", "all/*.png")
             drawn = [str(path.relative_to(run.path)) for kind in pictures for path in run.renders.glob(kind)]
-            held.adopt([*FILES, *drawn], "fit")  # a copy without hidden files
+            held.record_existing([*FILES, *drawn], "fit")  # a copy without hidden files
         if is_fit and not resume:
             raise ValueError(
                 f"{run.path}: must be a new run folder, holds a run already; add --resume or choose another"
@@ -75,7 +75,7 @@ def claim_run(run: Run, command: str, resume: bool = True, inputs: Iterable = ()
                 f"{run.path}: must hold a checkpoint to go on from, holds none; choose another run folder (-o), "
                 "this one keeps its point_cloud.ply"
             )
-        held.sweep("renders", *(f"renders/{split}" for split in ("test", "train", "all")))
+        held.remove_unfinished("renders", *(f"renders/{split}" for split in ("test", "train", "all")))
     except BaseException:
         held.release()
         raise
@@ -100,7 +100,7 @@ def last_checkpoint(run: Run) -> tuple[dict, dict] | tuple[None, None]:
         except ValueError as error:
             problem = problem or str(error).partition(";")[0]
             continue
-        with claim(run.path, "fit") as held:
+        with lock_folder(run.path, "fit") as held:
             held.record(path.name, path)  # it says itself that it is of drgs, wherever it was copied from
             for other in {run.state, run.path / PREVIOUS} - {path}:
                 _put_aside(other, held, problem is not None)
@@ -128,9 +128,9 @@ def keep_previous(run: Run) -> None:
             shutil.copyfile(run.state, name)
 
 
-def _put_aside(path: Path, held: Claim, is_damaged: bool) -> None:
+def _put_aside(path: Path, held: LockedFolder, is_damaged: bool) -> None:
     """Rename a checkpoint that is not as drgs wrote it, so that the next one does not replace it."""
-    if path.is_file() and (is_damaged or not held.is_made(path)):
+    if path.is_file() and (is_damaged or not held.is_ours(path)):
         names = ("state.damaged.safetensors", *(f"state.damaged.{i}.safetensors" for i in range(2, 1000)))
         name = next(name for name in names if not os.path.lexists(path.with_name(name)))
         os.rename(path, path.with_name(name))

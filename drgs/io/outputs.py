@@ -1,6 +1,6 @@
 """What a command may write: never over an input, never over a file that drgs did not make, alone in its folder.
 
-A folder that a command writes into is claimed first, before anything is loaded: `claim` finds out that it can be
+A folder that a command writes into is locked first, before anything is loaded: `lock_folder` finds out that it can be
 written, locks it, and compares what is there with what will be written. `.drgs.jsonl` in it records every file that we
 put there with its SHA-256 hash, before the file appears: what is there under its name with another hash is somebody
 else's, or was edited, and stays. The same is asked again when a file is put in its place.
@@ -27,10 +27,10 @@ from drgs.io.atomic import named
 from drgs.io.journal import Journal
 
 __all__ = [
-    "Claim",
+    "LockedFolder",
     "atomic_write",
     "check_file",
-    "claim",
+    "lock_folder",
     "clean",
     "json_form",
     "release_all",
@@ -43,11 +43,11 @@ _MAX_JSON = 64 << 20  # bytes; a longer file is none that a command wrote as its
 _LARGE = 1 << 20  # bytes that take long enough to hash that the result is kept
 
 _log = logging.getLogger(__name__)
-_claims: dict[Path, Claim] = {}
+_held: dict[Path, LockedFolder] = {}
 _hashes: dict[tuple, str] = {}  # of checkpoints, which are moved and linked
 
 
-class Claim:
+class LockedFolder:
     """A folder that this process alone writes into, until `release`; also a `with` block.
 
     Attributes:
@@ -64,7 +64,7 @@ class Claim:
         self._new: list[Path] = []  # folders that were made for it, from the outside in
         self._made: dict[str, dict[str, str]] = {}  # name -> hash -> command
 
-    def __enter__(self) -> Claim:
+    def __enter__(self) -> LockedFolder:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -83,13 +83,13 @@ class Claim:
             if not os.path.lexists(target):
                 continue
             _refuse_inputs(target, self._inputs)
-            if not self.is_made(target):
+            if not self.is_ours(target):
                 raise ValueError(
                     f"{target}: must not be replaced, it is not as `drgs {self.command}` left it or is somebody "
                     "else's; move it away or choose another output (-o)"
                 )
 
-    def is_made(self, path: Path, by: tuple[str, ...] | None = None) -> bool:
+    def is_ours(self, path: Path, by: tuple[str, ...] | None = None) -> bool:
         """Whether a file, a link or everything in a folder is as drgs wrote it.
 
         Args:
@@ -97,7 +97,7 @@ class Claim:
             by: Commands that may have made it; default any.
         """
         if path.is_dir() and not path.is_symlink():
-            return all(self.is_made(child, by) for child in path.iterdir())
+            return all(self.is_ours(child, by) for child in path.iterdir())
         if not path.is_symlink() and not path.is_file():
             return False
         made = self._made.get(self._name_of(path))
@@ -128,14 +128,14 @@ class Claim:
         known[row["sha256"]] = row["command"]
         Journal(self.path / JOURNAL).append(row)
 
-    def adopt(self, names: Iterable[str], command: str) -> None:
+    def record_existing(self, names: Iterable[str], command: str) -> None:
         """Take what is there for a command's own, where there is no record: a copy without hidden files."""
         if not (self.path / JOURNAL).exists():
             for name in names:
                 if (self.path / name).is_file():
                     self.record(name, self.path / name, command)
 
-    def announce(self, path: Path, name: str) -> None:
+    def record_planned(self, path: Path, name: str) -> None:
         """Record what `put` will move, for which there may be no room: before what it replaces is removed."""
         for part in (path, *(path.rglob("*") if path.is_dir() and not path.is_symlink() else ())):
             if part.is_symlink() or part.is_file():
@@ -143,7 +143,7 @@ class Claim:
 
     def put(self, path: Path, name: str) -> None:
         """Move a finished file, link or folder into the folder, where nothing must be of that name."""
-        self.announce(path, name)
+        self.record_planned(path, name)
         if os.path.lexists(self.path / name):
             raise ValueError(f"{self.path / name}: must not be replaced, it has appeared meanwhile; move it away")
         os.rename(path, self.path / name)
@@ -176,7 +176,7 @@ class Claim:
         ours = JOURNAL, locks.NAME
         content = [x for x in self.path.iterdir() if x.name not in ours and not atomic.PATTERN.fullmatch(x.name)]
         for path in content:
-            if not self.is_made(path, by):
+            if not self.is_ours(path, by):
                 raise ValueError(
                     f"{path}: must not be deleted, `drgs {self.command}` did not make it or it was changed; "
                     "move it away or choose another output (-o)"
@@ -188,7 +188,7 @@ class Claim:
         for path in self.check_all(by):
             self.remove(path)
 
-    def sweep(self, *folders: str) -> None:
+    def remove_unfinished(self, *folders: str) -> None:
         """Delete unfinished files of processes that were killed here, in the folder and in the given ones in it."""
         for folder in (self.path, *(self.path / name for name in folders)):
             for path in folder.iterdir() if folder.is_dir() else ():
@@ -197,11 +197,11 @@ class Claim:
                     atomic.delete(path)
 
     def release(self) -> None:
-        """Unlock the folder; it is removed if it was made for the claim and nothing came into it."""
+        """Unlock the folder; it is removed if it was made for it and nothing came into it."""
         self._depth -= 1
         if self._depth:
             return
-        _claims.pop(self.path, None)
+        _held.pop(self.path, None)
         locks.release(self.path)
         with contextlib.suppress(OSError):
             if self._new and {path.name for path in self.path.iterdir()} <= {JOURNAL}:
@@ -218,28 +218,28 @@ class Claim:
             self._made.setdefault(row["file"], {})[row["sha256"]] = row["command"]
         if len(rows) > 2 * len(self._made) + 100:
             kept = [row for row in rows if _is_there(self.path / row["file"], row["sha256"])]
-            with replacing(path, claimed=False) as name:
+            with replacing(path, checked=False) as name:
                 Path(name).write_text("".join(json.dumps(row) + "\n" for row in kept))
 
 
-def claim(
+def lock_folder(
     folder: str | os.PathLike, command: str, names: Iterable[str] = (), inputs: Iterable[str | os.PathLike] = ()
-) -> Claim:
+) -> LockedFolder:
     """Make a folder if it is missing, lock it, and see to it that it can be written; before anything is loaded.
 
-    Within one thread a claimed folder can be claimed again; the first command's name stays.
+    Within one thread a locked folder can be locked again; the first command's name stays.
 
     Args:
         folder: What -o says.
         command: Name of the command, for people and for the record of what it made.
-        names: Files that will be written; more may be checked later (`Claim.check`).
+        names: Files that will be written; more may be checked later (`LockedFolder.check`).
         inputs: Files and folders that are read; those that do not exist are left out.
     Raises:
         ValueError: If it is no folder that can be written, another process writes there, or a name is taken by an
             input or a file that drgs did not make.
     """
     path = Path(os.path.realpath(folder))
-    held = _claims.get(path)
+    held = _held.get(path)
     if held is not None and held._thread == threading.get_ident():
         held._depth += 1
     else:
@@ -264,7 +264,7 @@ def check_file(
     Args:
         path: The file.
         command: Name of the command.
-        inputs: Files and folders that are read, as `claim` takes them.
+        inputs: Files and folders that are read, as `lock_folder` takes them.
         is_made: Whether a file is one that the command wrote; default: a JSON file that says so.
     Raises:
         ValueError: If it cannot be written, is an input, or is there and was not made by this command.
@@ -290,8 +290,8 @@ def check_file(
 
 
 def release_all() -> None:
-    """Release what a command has claimed, at its end."""
-    for held in reversed(list(_claims.values())):
+    """Unlock what a command has locked, at its end."""
+    for held in reversed(list(_held.values())):
         held._depth = 1
         held.release()
 
@@ -303,7 +303,7 @@ def clean() -> None:
 
 
 @contextlib.contextmanager
-def replacing(path: str | os.PathLike, suffix: str = "", claimed: bool = True) -> Iterator[str]:
+def replacing(path: str | os.PathLike, suffix: str = "", checked: bool = True) -> Iterator[str]:
     """The name of a hidden file beside `path`, which it becomes once the block ends; missing folders are made.
 
     A process that dies leaves the old file, or none, and at most the hidden one.
@@ -311,7 +311,7 @@ def replacing(path: str | os.PathLike, suffix: str = "", claimed: bool = True) -
     Args:
         path: The file.
         suffix: That the hidden name must end with, for a library that goes by it.
-        claimed: Refuse, in a claimed folder, to replace what drgs did not make, and record what it made.
+        checked: Refuse, in a locked folder, to replace what drgs did not make, and record what it made.
     """
     path = Path(path)
     try:
@@ -322,7 +322,7 @@ def replacing(path: str | os.PathLike, suffix: str = "", claimed: bool = True) -
             umask = os.umask(0)  # hidden files are private; what we write is to be shared as any other
             os.umask(umask)
             os.chmod(name, 0o666 & ~umask)
-            held = _claim_of(Path(parent)) if claimed else None
+            held = _holder_of(Path(parent)) if checked else None
             if held is not None:
                 inside = (Path(parent) / path.name).relative_to(held.path).as_posix()
                 held.check([inside])
@@ -362,21 +362,21 @@ def json_form(value: Any) -> Any:
     raise TypeError(f"no JSON form of {type(value).__name__}")
 
 
-def _locked(folder: Path, path: Path, command: str, held: Claim | None) -> Claim:
-    """A new claim: the folder made and locked, its journal read; all undone if that fails."""
+def _locked(folder: Path, path: Path, command: str, held: LockedFolder | None) -> LockedFolder:
+    """A folder made and locked, its journal read; all undone if that fails."""
     if held is not None:
         raise ValueError(f"{folder}: must not be written by two threads at once; choose another folder")
-    made, new = Claim(path, command), _make(folder, path)
+    made, new = LockedFolder(path, command), _make(folder, path)
     made._new = new
     try:
         stale = locks.acquire(path, command)
         if stale is not None:
             _log.warning("%s: %s ended without unlocking it, goes on here", folder, stale)
-        _claims[path] = made
+        _held[path] = made
         made._read()
-        made.sweep()
+        made.remove_unfinished()
     except BaseException as error:
-        if path in _claims:
+        if path in _held:
             made.release()
         for x in reversed(new):
             with contextlib.suppress(OSError):
@@ -388,7 +388,7 @@ def _locked(folder: Path, path: Path, command: str, held: Claim | None) -> Claim
 
 
 def _check_row(row: dict) -> None:
-    """Raise unless it is a row that `Claim.record` wrote."""
+    """Raise unless it is a row that `LockedFolder.record` wrote."""
     for key in ("file", "sha256", "command"):
         if not isinstance(row[key], str) or "\0" in row[key]:
             raise ValueError(f"{key} must be a text")
@@ -416,9 +416,9 @@ def _refuse_inputs(target: Path, inputs: list[Path]) -> None:
                 raise ValueError(f"{target}: must not be read and replaced, it is an input; choose another output (-o)")
 
 
-def _claim_of(folder: Path) -> Claim | None:
-    """The innermost claim that a folder is in."""
-    return next((_claims[x] for x in (folder, *folder.parents) if x in _claims), None)
+def _holder_of(folder: Path) -> LockedFolder | None:
+    """The innermost locked folder that a folder is in."""
+    return next((_held[x] for x in (folder, *folder.parents) if x in _held), None)
 
 
 def _fingerprint(path: Path) -> str:

@@ -22,7 +22,7 @@ from drgs.fitting.active import SELECTION, ActiveViews
 from drgs.fitting.config import FitConfig, SelectionConfig, Start
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import fit_record
-from drgs.fitting.resume import claim_run
+from drgs.fitting.resume import lock_run
 from drgs.fitting.timetable import VIEWS_TO_ADD
 from drgs.io.atomic import is_full
 from drgs.io.json_files import read_json
@@ -228,14 +228,14 @@ def run_cell(study: Study, cell: Cell, runs: Path, progress: bool = False) -> di
     """
     run = Run(runs / study.name / cell.name)
     config = study.config_of(cell)
-    with claim_run(run, "fit", resume=True) as claimed:
+    with lock_run(run, "fit", resume=True) as output:
         if (run.path / "config.json").is_file():
             _check_same(run, config)
         if not (run.path / "metrics.json").is_file():
             forget_peak_memory()  # of the cell before
             fit(study.dataset(cell), run.path, config, resume=True, progress=progress)
         if study.lpips is not None and _metrics(run)["mean"].get("lpips") is None:
-            evaluate_run(run, claimed, lpips=Lpips(study.lpips))
+            evaluate_run(run, output, lpips=Lpips(study.lpips))
         return _row(study, cell, run)
 
 
