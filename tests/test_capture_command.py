@@ -20,10 +20,13 @@ import numpy as np
 import pytest
 import torch
 
+import drgs.data
 from drgs import cli
 from drgs.capturing import budget, diagnosis
+from drgs.capturing import capture as capture_object
 from drgs.capturing import fit as capture_fit
 from drgs.capturing.budget import FEWEST_STEPS, Pacer
+from drgs.capturing.capture import Photographs
 from drgs.capturing.record import CaptureRecord
 from drgs.commands.capture import capture_photographs, run
 from drgs.commands.making_options import Capture
@@ -174,6 +177,51 @@ def test_every_step_goes_on(captured, photographs, tmp_path):
     assert "IMG_0" in (captured / "report.html").read_text()
     record = json.loads((captured / "capture/capture.json").read_text())
     assert record["batches"][0]["inputs"][0][0] == str((photographs / "first/IMG_0.png").resolve())
+
+
+def test_each_photograph_is_decoded_once(tmp_path, monkeypatch):
+    """And the data set is loaded once, from the first look at the photographs to the page."""
+    walls = corner_walls(np.random.default_rng(5))
+    (tmp_path / "photos").mkdir()
+    for index in range(3):
+        write_photo(tmp_path / f"photos/IMG_{index}.png", corner_photo(corner_camera(index), walls)[0])
+    decoded, loaded, read, load_data = [], [], cv2.imread, drgs.data.load
+
+    def counted(path, *flags):
+        decoded.append(os.path.basename(path))
+        return read(path, *flags)
+
+    def counted_load(path, **options):
+        dataset = load_data(path, **options)
+        loaded.append(dataset)
+        return dataset
+
+    monkeypatch.setattr(cv2, "imread", counted)
+    monkeypatch.setattr(drgs.data, "load", counted_load)
+    capture_photographs(Capture(paths=(tmp_path / "photos",), output=tmp_path / "run", quiet=True), CONFIG)
+    assert steps_of(tmp_path / "run")[-1] == "share"
+    assert sorted(name for name in decoded if name.startswith("IMG_")) == ["IMG_0.png", "IMG_1.png", "IMG_2.png"]
+    assert len(loaded) == 1
+
+
+def test_photographs_are_kept_while_there_is_room(tmp_path, monkeypatch):
+    """The first ones, until their files change or they are given back; they cannot be written to."""
+    paths = [tmp_path / f"{index}.png" for index in range(3)]
+    for path in paths:
+        cv2.imwrite(str(path), np.full((10, 10, 3), 7, np.uint8))
+    monkeypatch.setattr(capture_object, "_KEPT_BYTES", 700)
+    photographs = Photographs()
+    first = [photographs.decode(path) for path in paths]
+    again = [photographs.decode(path) for path in paths]
+    assert [a is b for a, b in zip(first, again, strict=True)] == [True, True, False]
+    with pytest.raises(ValueError, match="read-only"):
+        first[0][0] = 1
+    cv2.imwrite(str(paths[0]), np.full((12, 10, 3), 7, np.uint8))
+    assert photographs.decode(paths[0]).shape == (12, 10, 3)
+    photographs.forget()
+    assert photographs.decode(paths[1]) is not first[1]
+    with pytest.raises(FileNotFoundError, match="must be an image, found none"):
+        photographs.decode(tmp_path / "none.png")
 
 
 def test_the_page_to_send_may_be_out_of_reach(captured, tmp_path, monkeypatch, capsys):
