@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import statistics
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.data import View
     from drgs.ellipsoids import Gaussians
+    from drgs.fitting.records import LoadedRun
 
 __all__ = ["rank_next"]
 
@@ -88,11 +90,7 @@ def rank_next(run: Path, k: int, length: str | None, show: bool = True) -> list[
             cache=cache,
             progress=bar.update,
         )
-        # What one of the photographs that are there adds to all others, on average.
-        usual = statistics.mean(
-            select(loaded.scene, [one], [x for x in train if x is not one], 1, scoring=scoring, cache=cache).scores[0]
-            for one in train[:: -(-len(train) // _COMPARED_PHOTOGRAPHS)]
-        )
+        usual = statistics.mean(_own_gains(loaded, train, scoring, cache))
         rows = [{"index": i, "name": place.camera.name} for i, place in enumerate(places)]
         after = [_place_json(place, meters) for place in places]
         picks = [
@@ -114,6 +112,13 @@ def rank_next(run: Path, k: int, length: str | None, show: bool = True) -> list[
             },
         )
     return picks
+
+
+def _own_gains(loaded: LoadedRun, train: list[Camera], scoring: Scoring, cache: Cache) -> Iterator[float]:
+    """What each of a few photographs that are there adds to all others."""
+    for one in train[:: -(-len(train) // _COMPARED_PHOTOGRAPHS)]:
+        others = [camera for camera in train if camera is not one]
+        yield select(loaded.scene, [one], others, 1, scoring=scoring, cache=cache).scores[0]
 
 
 def _places(gaussians: Gaussians, cameras: list[Camera], train: list[Camera], settings: RenderSettings) -> list[Place]:

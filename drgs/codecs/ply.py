@@ -26,6 +26,13 @@ __all__ = ["load_ply", "note_antialiased", "save_ply"]
 
 _log = logging.getLogger(__name__)
 
+_COLUMNS = {
+    "means": ("x", "y", "z"),
+    "quats": tuple(f"rot_{i}" for i in range(4)),
+    "log_scales": tuple(f"scale_{i}" for i in range(3)),
+    "logit_opacities": ("opacity",),
+    "dc": tuple(f"f_dc_{i}" for i in range(3)),
+}
 _NORMALS = ("nx", "ny", "nz")
 _FEATURE = "semantic_"
 _HIGHER = 15  # SH coefficients a color channel above degree 0, up to degree 3
@@ -58,30 +65,12 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
     path = check_path("load_ply", path)
     names = _check_ply(path)
     rest, features = _rest_columns(path, names), _feature_columns(path, names)
-    columns = {
-        "means": ("x", "y", "z"),
-        "quats": tuple(f"rot_{i}" for i in range(4)),
-        "log_scales": tuple(f"scale_{i}" for i in range(3)),
-        "logit_opacities": ("opacity",),
-        "dc": tuple(f"f_dc_{i}" for i in range(3)),
-    }
-    missing = [name for group in columns.values() for name in group if name not in names]
-    if missing:
-        raise ValueError(
-            f"{path}: a 3DGS PLY must have the vertex columns x y z f_dc_* opacity scale_* rot_*, "
-            f"{', '.join(missing[:4])}{' ...' if len(missing) > 4 else ''} missing; "
-            f"{_layout_hint(names)}"
-        )
-    known = {name for group in columns.values() for name in group} | {*rest, *features, *_NORMALS}
-    extra = [name for name in names if name not in known and not name.startswith(EXTRA)]
-    if extra:
-        shown = ", ".join(extra[:4]) + (" ..." if len(extra) > 4 else "")
-        _log.warning("%s: left out %d columns that are not 3DGS: %s", path, len(extra), shown)
+    _check_columns(path, names, {*rest, *features})
     if is_antialiased(path):
         note_antialiased(path)
     try:
         vertex = plyfile.PlyData.read(ply_source(path))["vertex"].data
-        arrays: dict[str, Any] = {name: _columns(vertex, group) for name, group in columns.items()}
+        arrays: dict[str, Any] = {name: _columns(vertex, group) for name, group in _COLUMNS.items()}
         higher, described = _columns(vertex, rest), _columns(vertex, features)
     except MemoryError:
         raise
@@ -96,9 +85,9 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
     if features:
         arrays["features"] = described
     arrays["logit_opacities"] = _finite_logits(path, arrays["logit_opacities"][:, 0])
-    made = Gaussians(**arrays, sh=sh.contiguous())
-    made.validate(str(path))
-    return made
+    gaussians = Gaussians(**arrays, sh=sh.contiguous())
+    gaussians.validate(str(path))
+    return gaussians
 
 
 def note_antialiased(path: Path) -> None:
@@ -206,6 +195,29 @@ def _check_ply(path: Path) -> list[str]:
     if vertex is None:
         raise ValueError(f"{path}: a 3DGS PLY must have an element `vertex`, found none; export it again")
     return list(vertex)
+
+
+def _check_columns(path: Path, names: list[str], optional: set[str]) -> None:
+    """Refuse a file without the columns that Gaussians have; the log says which others are left out.
+
+    Args:
+        path: The file.
+        names: Its columns.
+        optional: Those of its higher SH and features.
+    """
+    needed = [name for group in _COLUMNS.values() for name in group]
+    missing = [name for name in needed if name not in names]
+    if missing:
+        raise ValueError(
+            f"{path}: a 3DGS PLY must have the vertex columns x y z f_dc_* opacity scale_* rot_*, "
+            f"{', '.join(missing[:4])}{' ...' if len(missing) > 4 else ''} missing; "
+            f"{_layout_hint(names)}"
+        )
+    known = {*needed, *optional, *_NORMALS}
+    extra = [name for name in names if name not in known and not name.startswith(EXTRA)]
+    if extra:
+        shown = ", ".join(extra[:4]) + (" ..." if len(extra) > 4 else "")
+        _log.warning("%s: left out %d columns that are not 3DGS: %s", path, len(extra), shown)
 
 
 def _rest_columns(path: Path, names: list[str]) -> tuple[str, ...]:

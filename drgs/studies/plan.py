@@ -82,16 +82,12 @@ def plan_of(
         study, policies={label: study.policies[label] for label in wanted}, fit=study.fit.replace(**own)
     )
     study.fit.replace(test_every=split[0], test_offset=split[1])  # refuses numbers that cannot be
-    splits = [split]
-    if experiment.race and split[0]:
-        splits.append((split[0], (split[1] + split[0] // 2) % split[0]))
-    turns = list[list]()
-    notes = list[str]()
-    lacking = set[tuple[str, str]]()
+    turns, notes, lacking = list[list](), list[str](), set[tuple[str, str]]()
     for scene, path in scenes.items():
         dataset = data.load(
             path, test_every=split[0], test_offset=split[1], lazy=True, points=False, times=study.fit.data.times
         )
+        splits = _splits(split) if experiment.race else [split]
         turns.append(_units_of(study, scene, dataset, moves, splits, seeds, protocol))
         sentences, missing = _missing(study, scene, dataset)
         notes += sentences
@@ -101,6 +97,12 @@ def plan_of(
         units = _made_units(study, scale, moves, seeds, protocol)
     cells = [cell for cell in study.cells(units) if (cell.scene, cell.policy) not in lacking]
     return StudyPlan(experiment, study, tuple(cells), tuple(notes))
+
+
+def _splits(split: tuple[int, int]) -> list[tuple[int, int]]:
+    """A split and, where it holds anything out, one whose held-out views lie half-way between."""
+    every, offset = split
+    return [split, (every, (offset + every // 2) % every)] if every else [split]
 
 
 def _check_options(
