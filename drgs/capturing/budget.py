@@ -268,15 +268,15 @@ def plan_frames(video: Path, photographs: int, most: int, budget: float) -> int:
 
 def _timed_pair(images: Sequence[np.ndarray]) -> tuple[float, float]:
     """Seconds that features of a photograph take, and to match two of them, at `_MEASURED_SIZE` pixels."""
-    with temporary_folder("plan") as made:
-        database = made / "database.db"
+    with temporary_folder("plan") as folder:
+        database = folder / "database.db"
         names = [f"{number}.png" for number in range(len(images))]
         for name, image in zip(names, images, strict=True):
-            _write_small(image, made / name)
+            _write_small(image, folder / name)
         start_extraction()
         began = time.perf_counter()
         with quiet():
-            extract(database, made, names, camera_model="SIMPLE_RADIAL", shared_camera=False, wide_baseline=True)
+            extract(database, folder, names, camera_model="SIMPLE_RADIAL", shared_camera=False, wide_baseline=True)
             features = (time.perf_counter() - began) / len(names)
             began = time.perf_counter()
             match(database, [(names[0], names[1])])

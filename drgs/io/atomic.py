@@ -33,7 +33,7 @@ _FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 _CLOSED = (errno.EACCES, errno.EPERM, errno.EROFS)
 _LEAST_ROOM = 1e6  # bytes that a library's database or log takes before it holds anything
 
-_made: set[str] = set()  # by this process, and not finished
+_unfinished: set[str] = set()  # paths of what this process is writing
 
 
 @contextlib.contextmanager
@@ -47,7 +47,7 @@ def hidden_file(folder: str, name: str, suffix: str = "") -> Iterator[str]:
     """
     handle, hidden = tempfile.mkstemp(prefix=f".drgs.{name}.", suffix=f".tmp{suffix}", dir=folder)
     os.close(handle)
-    _made.add(hidden)
+    _unfinished.add(hidden)
     try:
         yield hidden
     except BaseException:
@@ -55,7 +55,7 @@ def hidden_file(folder: str, name: str, suffix: str = "") -> Iterator[str]:
             os.unlink(hidden)
         raise
     finally:
-        _made.discard(hidden)
+        _unfinished.discard(hidden)
 
 
 @contextlib.contextmanager
@@ -64,7 +64,7 @@ def temporary_folder(kind: str, parent: str | os.PathLike | None = None) -> Iter
 
     Args:
         kind: Part of its name.
-        parent: Folder that it is made in; default the system's place for such.
+        parent: Folder that it is put into; default the system's place for such.
     Raises:
         OSError: Of the block: where there is no room left, in a sentence that names `parent`.
     """
@@ -73,7 +73,7 @@ def temporary_folder(kind: str, parent: str | os.PathLike | None = None) -> Iter
         name = tempfile.mkdtemp(prefix=f".drgs.{kind}.", suffix=".tmp", dir=os.path.realpath(shown))
     except OSError as error:
         raise named(shown, error) from None
-    _made.add(name)
+    _unfinished.add(name)
     try:
         yield Path(name)
     except OSError as error:
@@ -83,17 +83,17 @@ def temporary_folder(kind: str, parent: str | os.PathLike | None = None) -> Iter
         raise
     finally:
         delete(Path(name))
-        _made.discard(name)
+        _unfinished.discard(name)
 
 
 def is_left_over(path: Path) -> bool:
     """Whether another process left it, in a folder that this one alone writes into."""
-    return PATTERN.fullmatch(path.name) is not None and str(path) not in _made
+    return PATTERN.fullmatch(path.name) is not None and str(path) not in _unfinished
 
 
 def delete_all() -> None:
     """Remove everything that this process has not finished."""
-    for name in list(_made):
+    for name in list(_unfinished):
         delete(Path(name))
 
 

@@ -56,11 +56,11 @@ def _conversion(path: Path, suffix: str) -> str:
     if target == path:
         target = path.with_name(f"{name}_3dgs.ply")
     source = shlex.quote(str(path.parent if path.name == "meta.json" else path))
-    made = shlex.quote(str(target))
+    ply = shlex.quote(str(target))
     if suffix != ".lcc":
-        return f"convert it with `drgs convert {source} {made}`, or read it with drgs.load_gaussians"
+        return f"convert it with `drgs convert {source} {ply}`, or read it with drgs.load_gaussians"
     return (
-        f"convert it with `npx @playcanvas/splat-transform {source} {made}`, "
+        f"convert it with `npx @playcanvas/splat-transform {source} {ply}`, "
         "or open it in SuperSplat (superspl.at/editor) and export a PLY that is not compressed"
     )
 

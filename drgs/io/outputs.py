@@ -61,8 +61,8 @@ class LockedFolder:
         self._thread = threading.get_ident()
         self._depth = 1
         self._inputs: list[Path] = []
-        self._new: list[Path] = []  # folders that were made for it, from the outside in
-        self._made: dict[str, dict[str, str]] = {}  # name -> hash -> command
+        self._new: list[Path] = []  # folders that were created for it, from the outside in
+        self._written: dict[str, dict[str, str]] = {}  # name -> hash -> command
 
     def __enter__(self) -> LockedFolder:
         return self
@@ -94,14 +94,14 @@ class LockedFolder:
 
         Args:
             path: Path of a file in the folder.
-            by: Commands that may have made it; default any.
+            by: Commands that may have written it; default any.
         """
         if path.is_dir() and not path.is_symlink():
             return all(self.is_ours(child, by) for child in path.iterdir())
         if not path.is_symlink() and not path.is_file():
             return False
-        made = self._made.get(self._name_of(path))
-        command = made.get(_fingerprint(path)) if made else None
+        written = self._written.get(self._name_of(path))
+        command = written.get(_fingerprint(path)) if written else None
         if command is None and path.suffix == ".json":
             command = _author_of(path)
             command = command if command == self.command else None
@@ -122,7 +122,7 @@ class LockedFolder:
             command: Default the one that holds the folder.
         """
         row = {"file": name, "sha256": _fingerprint(Path(content)), "command": command or self.command}
-        known = self._made.setdefault(name, {})
+        known = self._written.setdefault(name, {})
         if known.get(row["sha256"]) == row["command"]:
             return
         known[row["sha256"]] = row["command"]
@@ -149,7 +149,7 @@ class LockedFolder:
         os.rename(path, self.path / name)
 
     def remove(self, path: Path) -> None:
-        """Delete a file, a link or a folder of files, each of which drgs has made.
+        """Delete a file, a link or a folder of files, each of which drgs has written.
 
         Raises:
             ValueError: If one is not, or if an input is among them; then nothing is deleted.
@@ -168,7 +168,7 @@ class LockedFolder:
             path.unlink()
 
     def check_all(self, by: tuple[str, ...]) -> list[Path]:
-        """What is in the folder, all of which the given commands must have made.
+        """What is in the folder, all of which the given commands must have written.
 
         Raises:
             ValueError: If they have not.
@@ -197,7 +197,7 @@ class LockedFolder:
                     atomic.delete(path)
 
     def release(self) -> None:
-        """Unlock the folder; it is removed if it was made for it and nothing came into it."""
+        """Unlock the folder; it is removed if it was created for the command and nothing came into it."""
         self._depth -= 1
         if self._depth:
             return
@@ -215,8 +215,8 @@ class LockedFolder:
         path = self.path / JOURNAL
         rows = Journal(path).rows(_check_row, skip_damaged=True)  # an edited row is none of ours
         for row in rows:
-            self._made.setdefault(row["file"], {})[row["sha256"]] = row["command"]
-        if len(rows) > 2 * len(self._made) + 100:
+            self._written.setdefault(row["file"], {})[row["sha256"]] = row["command"]
+        if len(rows) > 2 * len(self._written) + 100:
             kept = [row for row in rows if _is_there(self.path / row["file"], row["sha256"])]
             with replacing(path, checked=False) as name:
                 Path(name).write_text("".join(json.dumps(row) + "\n" for row in kept))
@@ -231,7 +231,7 @@ def lock_folder(
 
     Args:
         folder: What -o says.
-        command: Name of the command, for people and for the record of what it made.
+        command: Name of the command, for people and for the record of what it wrote.
         names: Files that will be written; more may be checked later (`LockedFolder.check`).
         inputs: Files and folders that are read; those that do not exist are left out.
     Raises:
@@ -257,7 +257,7 @@ def check_file(
     path: str | os.PathLike,
     command: str,
     inputs: Iterable[str | os.PathLike] = (),
-    is_made: Callable[[Path], bool] | None = None,
+    is_ours: Callable[[Path], bool] | None = None,
 ) -> None:
     """The same for a command that writes one file.
 
@@ -265,7 +265,7 @@ def check_file(
         path: The file.
         command: Name of the command.
         inputs: Files and folders that are read, as `lock_folder` takes them.
-        is_made: Whether a file is one that the command wrote; default: a JSON file that says so.
+        is_ours: Whether a file is one that the command wrote; default: a JSON file that says so.
     Raises:
         ValueError: If it cannot be written, is an input, or is there and was not made by this command.
     """
@@ -274,7 +274,7 @@ def check_file(
         raise ValueError(f"{path}: must be a file, is a folder; name a file in it")
     if os.path.lexists(path):
         _refuse_inputs(path, [Path(os.path.realpath(x)) for x in inputs if os.path.exists(x)])
-        if path.is_symlink() or not (is_made(path) if is_made else _author_of(path) == command):
+        if path.is_symlink() or not (is_ours(path) if is_ours else _author_of(path) == command):
             raise ValueError(
                 f"{path}: must not be replaced, `drgs {command}` did not make it; move it away or choose another output"
             )
@@ -285,8 +285,8 @@ def check_file(
     except OSError as error:
         raise _unwritable(path.parent, error) from None
     finally:
-        for made in reversed(new):  # as long as nothing has been computed, nothing is left
-            made.rmdir()
+        for folder in reversed(new):  # as long as nothing has been computed, nothing is left
+            folder.rmdir()
 
 
 def release_all() -> None:
@@ -363,28 +363,28 @@ def json_form(value: Any) -> Any:
 
 
 def _locked(folder: Path, path: Path, command: str, held: LockedFolder | None) -> LockedFolder:
-    """A folder made and locked, its journal read; all undone if that fails."""
+    """A folder, created and locked, with its journal read; all undone if that fails."""
     if held is not None:
         raise ValueError(f"{folder}: must not be written by two threads at once; choose another folder")
-    made, new = LockedFolder(path, command), _make(folder, path)
-    made._new = new
+    locked, new = LockedFolder(path, command), _make(folder, path)
+    locked._new = new
     try:
         stale = locks.acquire(path, command)
         if stale is not None:
             _log.warning("%s: %s ended without unlocking it, goes on here", folder, stale)
-        _held[path] = made
-        made._read()
-        made.remove_unfinished()
+        _held[path] = locked
+        locked._read()
+        locked.remove_unfinished()
     except BaseException as error:
         if path in _held:
-            made.release()
+            locked.release()
         for x in reversed(new):
             with contextlib.suppress(OSError):
                 x.rmdir()
         if isinstance(error, OSError):
             raise _unwritable(folder, error) from None
         raise
-    return made
+    return locked
 
 
 def _check_row(row: dict) -> None:
