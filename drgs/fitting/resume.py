@@ -42,7 +42,7 @@ _log = logging.getLogger(__name__)
 
 
 def lock_run(run: Run, command: str, resume: bool = True, inputs: Iterable = ()) -> LockedFolder:
-    """Claim a run folder for a command that writes into it (`drgs.io.outputs.lock_folder`).
+    """Lock a run folder for a command that writes into it (`drgs.io.outputs.lock_folder`).
 
     Args:
         run: The folder.
