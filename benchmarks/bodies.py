@@ -54,7 +54,7 @@ STILL = ("background", "wall", "cube")
 GROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 SEEDS = (0, 1, 2)
 CHANGES = 0.05  # mean difference of the colors of a pixel from what its camera sees at most times
-CONFIG = FitConfig.of(
+CONFIG = FitConfig().replace(
     max_steps=3000, max_pixels=150 * 150, max_gaussians=8000, field_preset="dnerf", renderers=("fast",)
 )
 

@@ -48,7 +48,7 @@ def key_of(scene: str, trained: str, num_downscales: int, steps: int, size: dict
 def measured(scene: str, trained: str, num_downscales: int, steps: int, size: dict[str, int]) -> dict:
     """One fit, and its held-out views at the full size, in the renderer that stands for those it was fitted with."""
     own = own_preset((trained,))
-    config = FitConfig.of(
+    config = FitConfig().replace(
         settings=RenderSettings.preset(own),
         renderers=(trained,),
         num_downscales=num_downscales,

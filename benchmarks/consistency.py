@@ -86,7 +86,7 @@ def between(first: Camera, second: Camera, share: float) -> Camera:
 
 def measured(scene: str, weight: float, seed: int, offset: int) -> dict:
     """One fit: its held-out views in each renderer, and how alike two renderers' images of them are."""
-    config = FitConfig.of(renderers=("any",), seed=seed, test_offset=offset, skybox="off", **SIZE)
+    config = FitConfig().replace(renderers=("any",), seed=seed, test_offset=offset, skybox="off", **SIZE)
     fit = fitted(scene, config, lambda frames: [Consistency(frames, weight, seed)] if weight else [])
     chosen = np.unique(np.linspace(0, len(fit.test) - 1, MOST).round().astype(int))
     held_out = frames_for([fit.test[i] for i in chosen], config.data)

@@ -87,7 +87,7 @@ def of_run(path: Path, size: tuple[int, int], count: int) -> tuple[Gaussians, to
 
 def trainer(g: Gaussians, shown: list[Frame], gates: torch.Tensor | None) -> Trainer:
     """A fit at the first step of its dynamic stage; of what stands still where there are no gates."""
-    config = FitConfig.of(
+    config = FitConfig().replace(
         renderers=("fast",), max_steps=10**6, static_share=0.0
     )  # so long that neither rates nor density control begin
     tensors = g.parameters()

@@ -65,7 +65,7 @@ def fitted(name: str, folder: Path) -> tuple[drgs.Gaussians, drgs.Camera] | None
         fit(
             dataset,
             run,
-            FitConfig.of(
+            FitConfig().replace(
                 renderers=("fast",), max_pixels=10_800, max_gaussians=20_000, max_steps=1000, semantics="ignore"
             ),
         )

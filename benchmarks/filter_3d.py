@@ -43,7 +43,7 @@ KEY = ("scene", "trained", "filter", "seed", "max_pixels")
 def measured(scene: str, trained: str, filter_3d: str, seed: int) -> dict:
     """One fit, and its held-out views in each renderer at each size."""
     pixels = PIXELS.get(scene, 12_000)
-    config = FitConfig.of(
+    config = FitConfig().replace(
         settings=RenderSettings.preset(own_preset((trained,))),
         renderers=(trained,),
         filter_3d=filter_3d,

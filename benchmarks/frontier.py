@@ -40,7 +40,7 @@ def measured(scene: str, eighths: int, steps: int) -> dict:
     renderers = {name: RenderSettings.preset(name) for name in PAIR}
     # Spread evenly: of 8 steps in a row, those at which the multiples of the share pass a whole number.
     turns = [(k + 1) * eighths // 8 > k * eighths // 8 for k in range(8)]
-    config = FitConfig.of(settings=renderers["fast"], renderers=("fast",), max_steps=steps, **SIZE)
+    config = FitConfig().replace(settings=renderers["fast"], renderers=("fast",), max_steps=steps, **SIZE)
     fit = fitted(scene, config, cycle=[renderers[PAIR[turn]] for turn in turns])
     psnr = psnr_by_renderer(fit.gaussians, frames_for(fit.test, config.data), renderers)
     return {"scene": Path(scene).name, "eighths": eighths, "max_steps": steps, **SIZE, "psnr": psnr, **ran()}

@@ -63,7 +63,7 @@ def gain_errors(folder: Path, gains: dict[str, list[float]]) -> dict[str, float]
 def measured(scene: str, policy: str, term: str, seed: int, offset: int) -> dict:
     """One active fit: its held-out views, what it picked, and what it found of its photographs."""
     selection = SelectionConfig(policy=policy, initial=3, add=8, every=40, start="seed")
-    config = FitConfig.of(
+    config = FitConfig().replace(
         settings=RenderSettings.preset("fast"),
         renderers=("fast",),
         selection=selection,

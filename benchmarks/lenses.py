@@ -95,7 +95,7 @@ def made_fisheye(folder: Path) -> Path:
 def measured(scene: str, undistort: str, seed: int, offset: int) -> dict:
     """One fit for `fast`, and its held-out photographs, undistorted (on) and as they were taken (off)."""
     fast = RenderSettings.preset("fast")
-    config = FitConfig.of(
+    config = FitConfig().replace(
         settings=fast,
         renderers=("fast",),
         undistort=undistort,

@@ -249,7 +249,7 @@ def measure(scene: str, count: int, steps: int, ways: list[str], folder: Path) -
     ways = [way for way in ways if way not in there]
     if not ways:
         return
-    fit = fitted(str(data_of(scene, count, folder)), FitConfig.of(max_steps=steps, **SIZE))
+    fit = fitted(str(data_of(scene, count, folder)), FitConfig().replace(max_steps=steps, **SIZE))
     truth = Truth(scene, fit)
     views = Views(fit)
     for way in ways:

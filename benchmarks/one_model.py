@@ -49,7 +49,7 @@ def measured(scene: str, trained: str, seed: int, offset: int, size: dict) -> di
     """One fit, and its held-out views in each renderer."""
     names = tuple(trained.split(","))
     settings = RenderSettings.preset(trained if trained in PRESETS else "fast")
-    config = FitConfig.of(settings=settings, renderers=names, seed=seed, test_offset=offset, **size)
+    config = FitConfig().replace(settings=settings, renderers=names, seed=seed, test_offset=offset, **size)
     fit = fitted(scene, config)
     schedule = RendererSchedule.of(config.renderers, config.settings, config.max_steps)
     took: dict[RenderSettings, list[float]] = {}

@@ -49,7 +49,7 @@ def measured(scene: str, term: str, seed: int, offset: int, size: dict) -> dict:
     """One fit: its held-out views, and what it found of its photographs."""
     name, _, value = term.partition("=")
     options = {"skybox": "off"} | ({name: value} if term else {})
-    config = FitConfig.of(seed=seed, test_offset=offset, **size, **options)
+    config = FitConfig().replace(seed=seed, test_offset=offset, **size, **options)
     with tempfile.TemporaryDirectory() as folder:
         result = fit(load(DATA / scene), Path(folder) / "run", config, progress=False)
         recorded = result.run.config()

@@ -75,7 +75,7 @@ def measured(scene: str, rates: str, steps: int) -> dict:
     dataset = load(DATA / scene)
     if dataset.is_dynamic or dataset.semantics is not None:
         return measured_whole(scene, rates, steps)
-    config = FitConfig.of(renderers=("any",), max_steps=steps, **SIZE, **options_of(rates))
+    config = FitConfig().replace(renderers=("any",), max_steps=steps, **SIZE, **options_of(rates))
     done = fitted(scene, config)
     renderers = renderers_to_measure(config.renderers, config.settings, "all")
     return {
@@ -88,7 +88,7 @@ def measured(scene: str, rates: str, steps: int) -> dict:
 
 def measured_whole(scene: str, rates: str, steps: int) -> dict:
     """A fit of what moves or has a teacher, with the defaults of `drgs fit` but for its size, and its scores."""
-    config = FitConfig.of(max_steps=steps, **SIZE, **options_of(rates))
+    config = FitConfig().replace(max_steps=steps, **SIZE, **options_of(rates))
     with tempfile.TemporaryDirectory() as folder:
         metrics = fit(load(DATA / scene), Path(folder) / "run", config, progress=False).metrics
     scores = metrics["scores"] | {"worst": min(view["psnr"] for view in metrics["views"])}

@@ -70,7 +70,7 @@ def measured(name: str, runs: Path) -> dict:
             command = ["sfm", str(DATA / capture / "images"), "-o", str(source)]
             subprocess.run([sys.executable, "-m", "drgs", *command], check=True, cwd=ROOT)
     folder = runs / name
-    metrics, processor_seconds = _fitted(source, folder, FitConfig.of(**options))
+    metrics, processor_seconds = _fitted(source, folder, FitConfig().replace(**options))
     events = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
     config = json.loads((folder / "config.json").read_text())
     if name == capture:

@@ -84,7 +84,7 @@ def base(name: str, runs: Path, views: int, steps: int) -> tuple:
     The first training view and those farthest from it; kept as a checkpoint for the next call.
     """
     train, test = dataset(name, runs).split(8)
-    config = FitConfig.of(**BASE, max_steps=steps)
+    config = FitConfig().replace(**BASE, max_steps=steps)
     chosen = initial_views([view.camera for view in train], views)
     pool = load_frames(train, config.data.max_pixels)
     held_out = load_frames(test, config.data.max_pixels)

@@ -106,7 +106,7 @@ _HEADER = {
 
 def default_config() -> FitConfig:
     """What a planner's own model is fitted by: colors, small photographs, one renderer, seconds of steps."""
-    return FitConfig.of(
+    return FitConfig().replace(
         renderers=("fast",),
         semantics="ignore",
         exposure="off",

@@ -120,7 +120,7 @@ def lazily(folder, **options):
 
 
 def config(**fields):
-    return FitConfig.of(
+    return FitConfig().replace(
         **{
             "renderers": ("fast",),
             "max_steps": 16,
@@ -134,7 +134,7 @@ def config(**fields):
 
 
 def plan(**fields):
-    return SelectionConfig.of(**{"policy": "farthest", "initial": 2, "add": 2, "every": 4, **fields})
+    return SelectionConfig().replace(**{"policy": "farthest", "initial": 2, "add": 2, "every": 4, **fields})
 
 
 def test_renderers_are_taken_in_turn_while_views_are_picked(still, tmp_path, rendered):
@@ -647,7 +647,7 @@ def test_unknown_names_are_refused(still):
     """In Python, too; a policy of one's own that is not there before the first step, not at the first pick."""
     for field in ("policy", "criterion", "method"):
         with pytest.raises(ValueError, match=f"active: {field} must be one of .*, got 'best'"):
-            SelectionConfig.of(**{field: "best"})
+            SelectionConfig().replace(**{field: "best"})
     with pytest.raises(ValueError, match="at least one training view, got none"):
         ActiveViews([], config(selection=plan()))
     with pytest.raises(ValueError, match="--policy nosuch.module:fn: must be importable"):

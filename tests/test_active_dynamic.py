@@ -73,7 +73,7 @@ def lazily(folder: Path):
 
 def config(**fields) -> FitConfig:
     """8 steps of the static stage and 16 of the dynamic one."""
-    return FitConfig.of(
+    return FitConfig().replace(
         **{
             "renderers": ("fast",),
             "max_steps": 24,
@@ -87,7 +87,7 @@ def config(**fields) -> FitConfig:
 
 
 def plan(**fields) -> SelectionConfig:
-    return SelectionConfig.of(**{"policy": "random", "schedule": "times", "every": 4, **fields})
+    return SelectionConfig().replace(**{"policy": "random", "schedule": "times", "every": 4, **fields})
 
 
 def selection_of(run: Path) -> dict:
@@ -118,14 +118,14 @@ def test_numbers_are_those_of_the_paper(swing):
     for number in range(39):
         there = [views[i] for i in table.left(number, table.start)]
         assert [view.name for view in there] == [f"{c}/{number + 1}" for c in range(3)]
-    frequent = Timetable.of(views, FitConfig.of(max_steps=1700, every=3), moves=True)
+    frequent = Timetable.of(views, FitConfig().replace(max_steps=1700, every=3), moves=True)
     assert frequent.first == 320, "the first pick waits for 200 of 17,000 steps, however often there is one"
 
 
 def test_a_schedule_follows_from_what_is_fitted(swing):
     """`auto` is `times` where a deformation is fitted and `views` where none is."""
     views = lazily(swing).split()[0]
-    assert [Timetable.of(views, FitConfig.of(add=2), moves).schedule for moves in (True, False)] == [
+    assert [Timetable.of(views, FitConfig().replace(add=2), moves).schedule for moves in (True, False)] == [
         "times",
         "views",
     ]

@@ -78,7 +78,7 @@ def test_scalars_of_arrays_are_numbers():
 def test_every_field_of_a_fit_is_checked(field, value):
     """What a hand-edited config.json may say is refused before anything is read."""
     with pytest.raises(ValueError, match=f"fit: {field} must be") as error:
-        FitConfig.of(**{field: value})
+        FitConfig().replace(**{field: value})
     assert "\n" not in str(error.value)
 
 

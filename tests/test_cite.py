@@ -86,14 +86,14 @@ def test_what_a_fit_used(run, asked, more):
     ("active", "more"),
     [
         (SelectionConfig(), {"ash2021bait"}),
-        (SelectionConfig.of(criterion="eig"), {"jiang2024fisherrf"}),
-        (SelectionConfig.of(criterion="logdet"), {"wilson2025popgs"}),
-        (SelectionConfig.of(criterion="block_logdet"), {"wilson2025popgs"}),
-        (SelectionConfig.of(policy="fisherrf"), {"jiang2024fisherrf"}),
-        (SelectionConfig.of(method="fisherrf"), {"ash2021bait", "jiang2024fisherrf"}),
-        (SelectionConfig.of(policy="moments"), {"ewen2025moments"}),
-        (SelectionConfig.of(policy="farthest"), set()),
-        (SelectionConfig.of(policy="random", method="fisherrf"), set()),
+        (SelectionConfig().replace(criterion="eig"), {"jiang2024fisherrf"}),
+        (SelectionConfig().replace(criterion="logdet"), {"wilson2025popgs"}),
+        (SelectionConfig().replace(criterion="block_logdet"), {"wilson2025popgs"}),
+        (SelectionConfig().replace(policy="fisherrf"), {"jiang2024fisherrf"}),
+        (SelectionConfig().replace(method="fisherrf"), {"ash2021bait", "jiang2024fisherrf"}),
+        (SelectionConfig().replace(policy="moments"), {"ewen2025moments"}),
+        (SelectionConfig().replace(policy="farthest"), set()),
+        (SelectionConfig().replace(policy="random", method="fisherrf"), set()),
     ],
 )
 def test_how_views_were_chosen(run, active, more):

@@ -531,7 +531,7 @@ def study_of(folder: Path, **fields) -> Study:
         name="tiny",
         folder=functools.partial(folder_of, folder),
         policies={name: {"policy": name} for name in ("farthest", "random", "uniform")},
-        fit=FitConfig.of(
+        fit=FitConfig().replace(
             **{
                 "renderers": ("fast",),
                 "max_steps": 12,

@@ -285,7 +285,7 @@ def test_picked_views_bring_triangulated_points(tmp_path, rng):
     """
     views = plane_views(tmp_path, rng, count=5)
     views[1].image_path.unlink()
-    config = FitConfig.of(max_pixels=10**6, max_gaussians=600, max_steps=10)
+    config = FitConfig().replace(max_pixels=10**6, max_gaussians=600, max_steps=10)
     plan = ActiveViews(views, config.replace(initial=2, add=1, every=1))
     plan.chosen.append(2)
     wall = drgs.Gaussians.from_arrays([[0.0, 0, 1.5]], [[1.0, 0, 0, 0]], [[9, 9, 0.1]], [0.99], np.zeros((1, 1, 3)))
@@ -305,7 +305,7 @@ def test_fits_begin_again_where_views_show_more(tmp_path, rng):
         assert cv2.imwrite(str(view.image_path), np.full((HEIGHT, WIDTH, 3), 128, np.uint8))
 
     def starts(restart, init_points="views"):
-        config = FitConfig.of(max_pixels=10**6, max_gaussians=3000, max_steps=10, init_points=init_points)
+        config = FitConfig().replace(max_pixels=10**6, max_gaussians=3000, max_steps=10, init_points=init_points)
         plan = ActiveViews(views, config.replace(initial=2, add=3, every=1, restart=restart))
         plan.chosen, found = [0, 1], []
         for index in (2, 3, 4):
@@ -331,7 +331,7 @@ def test_a_sure_start_asks_for_no_guesses(tmp_path, rng, monkeypatch):
     """Where the answer is to go on, only the count that is recorded is found, the same as ever."""
     views, config = (
         plane_views(tmp_path, rng, count=4),
-        FitConfig.of(max_pixels=10**6, max_gaussians=3000, max_steps=10),
+        FitConfig().replace(max_pixels=10**6, max_gaussians=3000, max_steps=10),
     )
 
     def told(restart, began):

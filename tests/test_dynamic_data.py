@@ -148,7 +148,7 @@ def test_which_cameras_are_held_out(neu3d):
     assert {view.camera_name for view in data.split(test_cameras=("cam02",))[1]} == {"cam02"}
     none = load(neu3d, test_cameras=(), test_every=8)
     assert [view.name for view in none.split()[1]] == ["cam00/0000", "cam01/0002", "cam02/0004"]
-    config = FitConfig.of(test_cameras=("cam02",), times=3)
+    config = FitConfig().replace(test_cameras=("cam02",), times=3)
     assert FitConfig.from_json(config.to_json()) == config
     for cameras, text in ((("cam9",), "among cam00"), (("cam00", "cam01", "cam02", "cam03"), "must leave a camera")):
         with pytest.raises(ValueError, match=text):
@@ -807,7 +807,7 @@ def test_a_number_of_times_that_cannot_be(neu3d, times):
     """In one line, before anything is read."""
     assert "times must be a whole number >= 1" in refused(neu3d, times=times)
     with pytest.raises(ValueError, match="fit: times must be a whole number"):
-        FitConfig.of(times=times)
+        FitConfig().replace(times=times)
 
 
 def test_frames_that_are_missing(tmp_path, caplog):

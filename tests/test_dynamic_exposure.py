@@ -121,7 +121,7 @@ def test_frames_that_join_get_their_gains(dataset, tmp_path):
     """An active fit at later times: a frame that is picked has its gain beside the others', and exposure is eliminated
     from what all of them tell about the field; killed and resumed it ends in the same bits.
     """
-    active = SelectionConfig.of(policy="fisher", schedule="times", every=2, probes=4)
+    active = SelectionConfig().replace(policy="fisher", schedule="times", every=2, probes=4)
     how = settings(exposure="points", init_points="all", deterministic=True, selection=active, save_every=1000)
     fit(dataset, tmp_path / "a", how, progress=False)
     gains = Run(tmp_path / "a").config()["exposure"]["gains"]

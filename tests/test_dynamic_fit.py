@@ -92,7 +92,7 @@ def config(**fields) -> FitConfig:
         "means_rate": (1e-3, 1e-4),
     }
     rates = {"dc_rate": 0.03, "field_rate": (3e-3, 3e-4), "grid_rate": (3e-2, 3e-3), "static_share": 1 / 3}
-    return FitConfig.of(**{**short, **rates, **fields})
+    return FitConfig().replace(**{**short, **rates, **fields})
 
 
 @pytest.mark.slow

@@ -392,7 +392,7 @@ def test_a_policy_that_is_none(tmp_path):
             drgs.select.select(g, views[1:], views[:1], 1, name)
         assert "\n" not in str(error.value)
     with pytest.raises(ValueError, match="active: policy must be one of fisher"):
-        SelectionConfig.of(policy="best")
+        SelectionConfig().replace(policy="best")
 
 
 def test_a_fit_with_their_selector(tmp_path):

@@ -289,7 +289,7 @@ def test_a_moving_fit_is_looked_at_as_it_moves(tmp_path, monkeypatch):
         networks=[Network("wind", wind, 1e-3)],
         scene=lambda rows: Drift(rows.gaussians(), wind.velocity),
     )
-    active, chosen_of = SelectionConfig.of(initial=3, add=1, every=3, pick_points="uncovered"), []
+    active, chosen_of = SelectionConfig().replace(initial=3, add=1, every=3, pick_points="uncovered"), []
 
     def choose(scene, *arguments, **options):
         chosen_of.append(scene)

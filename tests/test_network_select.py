@@ -296,7 +296,7 @@ def test_refusals(fields, message):
     with pytest.raises(ValueError, match=f"^select: .*{message}"):
         Scoring(**fields)
     with pytest.raises(ValueError, match=rf"^active: .*{message.split(', got')[0].replace('>= 1', '.*')}"):
-        SelectionConfig.of(**fields)
+        SelectionConfig().replace(**fields)
 
 
 def test_still_scenes_have_no_such_block(views):

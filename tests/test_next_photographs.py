@@ -80,7 +80,7 @@ def half_seen(tmp_path_factory):
     )
     dataset.points = means[faces.max(axis=0) > 0.2]
     dataset.colors = np.full((len(dataset.points), 3), 0.5)
-    config = FitConfig.of(max_steps=60, max_gaussians=n, test_every=0, renderers=("fast",), skybox="off")
+    config = FitConfig().replace(max_steps=60, max_gaussians=n, test_every=0, renderers=("fast",), skybox="off")
     fit(dataset, folder / "run", config, progress=False)
     return folder / "run"
 

@@ -185,7 +185,7 @@ def test_classes_of_a_run(files, monkeypatch, capsys):
 def test_a_short_fit_is_told_how_many_steps_it_needs(files, monkeypatch, capsys, step, max_steps, rate, needed):
     """Where nothing is found: features that move by their rate a step are about 1 after 1 / rate steps."""
     g = scene().replace(features=torch.eye(WIDTH)[[0] * 10])  # all of them wall
-    config = FitConfig.of(max_steps=max_steps, feature_rate=rate)
+    config = FitConfig().replace(max_steps=max_steps, feature_rate=rate)
     record = FitRecord(data=files, train=(), test=(), config=config)
     given = SceneInput(g, record=record, step=step, decoder=decoder(), classes=Classes(NAMES, embeddings()))
     monkeypatch.setattr("drgs.commands.query.SceneInput.of", lambda args: given)

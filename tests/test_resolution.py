@@ -273,5 +273,5 @@ def test_another_number_is_another_fit(dataset, tmp_path):  # noqa: F811
         fit(dataset, tmp_path / "run", config(max_steps=2, num_downscales=2), resume=True, progress=False)
     for wrong in (-1, 17, 0.5):
         with pytest.raises(ValueError, match="fit: num_downscales must be"):
-            FitConfig.of(num_downscales=wrong)
+            FitConfig().replace(num_downscales=wrong)
     assert Run(tmp_path / "run").config()["fit"]["data"]["num_downscales"] == 1

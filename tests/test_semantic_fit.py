@@ -365,7 +365,7 @@ def test_an_active_fit_reads_no_map_that_was_not_picked(taught, tmp_path, monkey
 
     monkeypatch.setattr(torch, "load", load)
     data = dataclasses.replace(taught, semantics=dataclasses.replace(taught.semantics))  # nothing cached
-    active = SelectionConfig.of(policy="random", add=2, every=2)
+    active = SelectionConfig().replace(policy="random", add=2, every=2)
     done = fit(data, tmp_path / "run", config(**FIT, test_every=0, selection=active), progress=False)
     plan = ActiveViews(data.split(0)[0], config(**FIT, selection=active))
     assert len(plan.views) == 9
@@ -399,7 +399,7 @@ def test_views_are_chosen_in_the_metric_of_the_decoder_as_it_is(taught, tmp_path
         return real(*rest, scoring=scoring, **options)
 
     monkeypatch.setattr(drgs.select, "select", watched)
-    active = SelectionConfig.of(policy="fisher", add=2, every=2, info_pixels=100)
+    active = SelectionConfig().replace(policy="fisher", add=2, every=2, info_pixels=100)
     done = fit(taught, tmp_path / "run", config(**FIT, selection=active), progress=False)
     assert len(metrics_of) == 2
     last = load_run(done.run).decoder.metric()
@@ -416,7 +416,7 @@ def test_views_are_chosen_in_the_metric_of_the_decoder_as_it_is(taught, tmp_path
 def test_blocks_that_the_fit_does_not_have(taught, tmp_path, monkeypatch):
     """Semantic information of a fit without features is refused before the first step, not at the first pick."""
     monkeypatch.setattr("drgs.train.Trainer", lambda *arguments: pytest.fail("it began"))
-    active = SelectionConfig.of(policy="fisher", add=2, every=2, blocks=("geometry", "semantic"))
+    active = SelectionConfig().replace(policy="fisher", add=2, every=2, blocks=("geometry", "semantic"))
     with pytest.raises(ValueError, match="active: blocks must be of what is fitted, got semantic for a fit without"):
         fit(taught, tmp_path / "run", config(semantics="ignore", **FIT, selection=active), progress=False)
 

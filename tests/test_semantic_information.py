@@ -282,7 +282,7 @@ def test_the_cache_knows_the_metric(world):
         (lambda g, c: select(g, c, c, blocks=("semantic",), groups=["sh"]), "groups must have one that blocks"),
         (lambda g, c: select(g, c, c, blocks=("semantic",), method="fisherrf"), "select: blocks must be geometry with"),
         (
-            lambda g, c: SelectionConfig.of(blocks=("semantic",), method="fisherrf"),
+            lambda g, c: SelectionConfig().replace(blocks=("semantic",), method="fisherrf"),
             "active: blocks must be geometry with m",
         ),
         (lambda g, c: select(g, c, c, semantics=metric(4)), "must be of the width of the features, 3, got 4"),

@@ -163,7 +163,7 @@ def test_none_where_the_data_say_what_is_behind(tmp_path, data, background, said
     dataset = dataset_of(photographs(), tmp_path, **data)
     assert why_not(load_frames(dataset.views, 10**6), background).startswith(said)
     settings = FAST if background == (0.0, 0.0, 0.0) else drgs.RenderSettings.preset("fast", background=background)
-    config = FitConfig.of(**SETTINGS, skybox="auto", settings=settings).replace(max_steps=2)
+    config = FitConfig().replace(**SETTINGS, skybox="auto", settings=settings).replace(max_steps=2)
     result = fit(dataset, tmp_path / "run", config, progress=False)
     assert "skybox" not in result.metrics
     recorded = result.run.config()["skybox"]
@@ -189,7 +189,7 @@ def test_held_out_views_are_better_and_the_file_has_it(tmp_path):
     dataset = dataset_of(photographs(), tmp_path)
     shown = {}
     for use in ("off", "auto"):
-        result = fit(dataset, tmp_path / use, FitConfig.of(**SETTINGS, skybox=use), progress=False)
+        result = fit(dataset, tmp_path / use, FitConfig().replace(**SETTINGS, skybox=use), progress=False)
         shown[use] = {row["name"]: row["mean"]["psnr"] for row in result.metrics["renderers"]["rows"]}
     for name in ("fast", "gsplat"):
         assert shown["auto"][name] > shown["off"][name] + 2
@@ -210,7 +210,7 @@ def test_held_out_views_are_better_and_the_file_has_it(tmp_path):
 def test_a_near_scene_has_the_bits_of_a_fit_without(tmp_path):
     """Nothing is far away: `auto` changes nothing."""
     dataset = dataset_of(photographs(NEAR), tmp_path)
-    config = FitConfig.of(**SETTINGS, deterministic=True).replace(max_steps=12)
+    config = FitConfig().replace(**SETTINGS, deterministic=True).replace(max_steps=12)
     ends = [fit(dataset, tmp_path / use, config.replace(skybox=use), progress=False) for use in ("off", "auto")]
     off, auto = (end.run.config()["skybox"] for end in ends)
     assert off == {"gaussians": 0, "reason": "skybox is off"}
@@ -225,7 +225,7 @@ def test_a_near_scene_has_the_bits_of_a_fit_without(tmp_path):
 def test_resumed_fit_has_the_same_bits(tmp_path):
     """A checkpoint knows which Gaussians are far away, and says so if it cannot be."""
     frames = photographs()
-    config = FitConfig.of(**SETTINGS, skybox="on", deterministic=True).replace(max_steps=30)
+    config = FitConfig().replace(**SETTINGS, skybox="on", deterministic=True).replace(max_steps=30)
     rows = rows_with_skybox()
     whole = Trainer(config, frames, rows, 3.3, with_skybox(parts_of(config, 3.3), rows.skybox))
     while whole.step_index < 12:
@@ -265,7 +265,7 @@ def test_density_control_leaves_it_alone():
 def test_terms_leave_it_out():
     """Means of opacity and scale are those of the other Gaussians, and no gradient reaches it."""
     rows = rows_with_skybox()
-    config = FitConfig.of(**SETTINGS)
+    config = FitConfig().replace(**SETTINGS)
     gaussians = rows.gaussians()
     others = gaussians.take(slice(rows.skybox, None))
     output = Output(torch.zeros(HEIGHT, WIDTH, 3), torch.zeros(HEIGHT, WIDTH))
@@ -301,7 +301,7 @@ def test_what_shows_of_it():
 def test_it_comes_before_the_first_step():
     """Moments of an optimizer would be lost."""
     frames = photographs()
-    config = FitConfig.of(**SETTINGS)
+    config = FitConfig().replace(**SETTINGS)
     trainer = Trainer(config, frames, GaussianRows.from_points(ball().means[:60], torch.full((60, 3), 0.5)), 3.3)
     trainer.step()
     with pytest.raises(ValueError, match="a skybox must be there before the first step"):
@@ -310,7 +310,7 @@ def test_it_comes_before_the_first_step():
 
 def test_refused_where_views_are_chosen(tmp_path):
     """In one line, before anything is fitted."""
-    config = FitConfig.of(**SETTINGS, skybox="on").replace(selection=SelectionConfig())
+    config = FitConfig().replace(**SETTINGS, skybox="on").replace(selection=SelectionConfig())
     with pytest.raises(NotImplementedError, match="skybox must be off or auto where views are chosen on the way or"):
         fit(dataset_of(photographs(), tmp_path), tmp_path / "run", config, progress=False)
 
@@ -321,15 +321,15 @@ def test_refused_where_things_move(tmp_path):
     for i, view in enumerate(dataset.views):
         view.camera = dataclasses.replace(view.camera, time=float(i % 2))
     with pytest.raises(NotImplementedError, match="skybox must be off or auto where views are chosen on the way or"):
-        fit(dataset, tmp_path / "run", FitConfig.of(**SETTINGS, skybox="on"), progress=False)
-    result = fit(dataset, tmp_path / "run", FitConfig.of(**SETTINGS).replace(max_steps=4), progress=False)
+        fit(dataset, tmp_path / "run", FitConfig().replace(**SETTINGS, skybox="on"), progress=False)
+    result = fit(dataset, tmp_path / "run", FitConfig().replace(**SETTINGS).replace(max_steps=4), progress=False)
     assert result.run.config()["skybox"] == {"gaussians": 0, "reason": "things move"}
 
 
 def test_a_run_that_goes_on_keeps_the_reason(tmp_path):
     """And one of before, whose config.json has none, is read as it was."""
     dataset = dataset_of(photographs(NEAR), tmp_path)
-    config = FitConfig.of(**SETTINGS).replace(max_steps=4, save_every=2)
+    config = FitConfig().replace(**SETTINGS).replace(max_steps=4, save_every=2)
     run = fit(dataset, tmp_path / "run", config, progress=False).run
     recorded = run.config()
     assert recorded["skybox"]["reason"] == "photographs do not clearly agree on what is far away"

@@ -51,7 +51,7 @@ def small(folder: Path, **fields) -> Study:
         name="tiny",
         folder=lambda scene, split: folder,
         policies={"farthest": {"policy": "farthest"}, "Random, 1": {"policy": "random"}},
-        fit=FitConfig.of(**{"initial": 2, "add": 2, "every": 3, **config}),
+        fit=FitConfig().replace(**{"initial": 2, "add": 2, "every": 3, **config}),
         metrics=METRICS,
         reference="Random, 1",
     )
@@ -757,8 +757,8 @@ def test_the_kitchen_study_is_whole_units(monkeypatch, tmp_path):
 def test_auto_of_lenses_is_what_the_run_has_made_of_it(tmp_path):
     """A cell that leaves it to the photographs goes on with its run, whose config.json says what that was."""
     run = Run(tmp_path / "run")
-    done = FitConfig.of(renderers=("fast",), undistort="off")
+    done = FitConfig().replace(renderers=("fast",), undistort="off")
     run.start({"schema": 1, "command": "fit", "data": str(tmp_path), "train": ["a"], "test": [], "fit": done.to_json()})
-    engine._check_same(run, FitConfig.of(renderers=("fast",)))
+    engine._check_same(run, FitConfig().replace(renderers=("fast",)))
     with pytest.raises(ValueError, match="must be the run of this cell, undistort was 'off' and is 'on'"):
-        engine._check_same(run, FitConfig.of(renderers=("fast",), undistort="on"))
+        engine._check_same(run, FitConfig().replace(renderers=("fast",), undistort="on"))

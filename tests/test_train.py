@@ -69,7 +69,7 @@ def config(**fields):
         "save_every": 25,
         "dc_rate": 0.03,
     }
-    return FitConfig.of(**{**short, "means_rate": (1e-3, 1e-4), **fields})
+    return FitConfig().replace(**{**short, "means_rate": (1e-3, 1e-4), **fields})
 
 
 def trainer_of(dataset, cfg):
@@ -193,7 +193,7 @@ def test_bad_configs_are_refused(dataset, tmp_path):
     """Options out of range, unknown fields of a config.json, and data without views or points."""
     for field, value in {"max_steps": 0, "mask": "soft", "init_points": "x", "sh_degree": 4, "seed": -1}.items():
         with pytest.raises(ValueError, match=f"fit: {field} must be"):
-            FitConfig.of(**{field: value})
+            FitConfig().replace(**{field: value})
     with pytest.raises(ValueError, match="config must hold known fields, got 'foo'"):
         FitConfig.from_json({"foo": 1})
     assert FitConfig.from_json(config().to_json()) == config()

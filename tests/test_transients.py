@@ -62,7 +62,7 @@ def trainer_of(frames: list[Frame], **fields) -> Trainer:
     short["transients"] = "auto"
     points = wall().means
     rows = GaussianRows.from_points(points, torch.full((len(points), 3), 0.5), 0.8)
-    return Trainer(FitConfig.of(**short | fields), frames, rows, 3.0)
+    return Trainer(FitConfig().replace(**short | fields), frames, rows, 3.0)
 
 
 def run_to(trainer: Trainer, step: int) -> list[dict]:
@@ -202,7 +202,7 @@ def test_a_run_says_what_was_left_out(tmp_path):
         "test_every": 0,
         "transients": "auto",
     }
-    result = fit(data, tmp_path / "run", FitConfig.of(**fields, initial_opacity=0.8), progress=False)
+    result = fit(data, tmp_path / "run", FitConfig().replace(**fields, initial_opacity=0.8), progress=False)
     looks = [event for event in result.run.events() if event["event"] == "transients"]
     assert [look["step"] for look in looks] == [33, 44, 55, 66, 77]
     assert looks[0]["found"]

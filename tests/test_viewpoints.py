@@ -28,7 +28,7 @@ def place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("given")
     gaussians = write_still(folder / "data")
     run = Run(folder / "run")
-    config = FitConfig.of(settings=RenderSettings.preset("fast", background=SKY), test_every=3, max_pixels=100)
+    config = FitConfig().replace(settings=RenderSettings.preset("fast", background=SKY), test_every=3, max_pixels=100)
     train = [name for i, name in enumerate(NAMES) if i % 3]
     recorded = {"data": str(folder / "data"), "train": train, "test": ["0", "3", "6"], "fit": config.to_json()}
     run.start({"command": "fit", **recorded})

@@ -248,7 +248,7 @@ their distances), and of every lambda."""
 
 
 def _fit(**fields: Any) -> FitConfig:
-    return FitConfig.of(**{"renderers": ("fast",), "feature_rate": 5e-3, "decoder_rate": 5e-4, **fields})
+    return FitConfig().replace(**{"renderers": ("fast",), "feature_rate": 5e-3, "decoder_rate": 5e-4, **fields})
 
 
 _TINY: Mapping[str, Any] = {"max_gaussians": 500, "feature_width": 8, "feature_rate": 5e-2, "decoder_rate": 1e-2}
@@ -292,7 +292,7 @@ SIZES: Mapping[tuple[str, StudyScale], Sizes] = {
         views=84,
     ),
     ("captures", "paper"): Sizes(
-        FitConfig.of(renderers=("fast",), max_steps=7000, semantics="ignore"),
+        FitConfig().replace(renderers=("fast",), max_steps=7000, semantics="ignore"),
         (320, 240),
         (80, 60),
         every=200,
