@@ -32,11 +32,11 @@ from where import DATA, add_row, ran, read_rows  # noqa: E402
 
 from drgs.capturing import fit as capture_fit  # noqa: E402
 from drgs.commands.capture import capture_photographs  # noqa: E402
-from drgs.commands.making_options import Capture  # noqa: E402
+from drgs.commands.options import Capture  # noqa: E402
 from drgs.data import load  # noqa: E402
 from drgs.data.checks import list_images  # noqa: E402
 from drgs.files import Run  # noqa: E402
-from drgs.fitting.config import FitConfig, recorded_config  # noqa: E402
+from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.train import fit  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "batches.jsonl"
@@ -44,7 +44,7 @@ TABLE = ROOT / "docs" / "data" / "batches.csv"
 JOINING = {6: (1, 3, 6, 9, 11, 15), 2: (3, 11)}
 """Number of photographs that join -> which of the sixteen, in the order of their names."""
 ANEW = (200, 400, 600)
-CONFIG = FitConfig.of(max_steps=400, max_pixels=12_000, max_gaussians=8_000, exposure="auto")
+CONFIG = FitConfig().replace(max_steps=400, max_pixels=12_000, max_gaussians=8_000, exposure="auto")
 
 
 def measure(count: int, folder: Path) -> None:
@@ -78,7 +78,7 @@ def measure(count: int, folder: Path) -> None:
     began = time.process_time()
     capture_photographs(Capture(paths=more, output=run, add=True, quiet=True), CONFIG)
     added("joined", run, began)
-    config = recorded_config(Run(run).config()["fit"])
+    config = FitConfig.from_json(Run(run).config()["fit"])
     for steps in ANEW:
         began = time.process_time()
         fit(load(run / "capture/scene"), folder / f"anew{steps}", config.replace(max_steps=steps), progress=False)

@@ -11,7 +11,6 @@ import dataclasses
 import logging
 import math
 import time
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,7 +27,6 @@ from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
 from drgs.fitting.active import ActiveViews
 from drgs.fitting.config import (
-    ActiveConfig,
     DataConfig,
     DensityConfig,
     FeatureConfig,
@@ -70,7 +68,6 @@ if TYPE_CHECKING:
     from drgs.selection.pool import Workers
 
 __all__ = [
-    "ActiveConfig",
     "DataConfig",
     "DensityConfig",
     "FeatureConfig",
@@ -121,7 +118,6 @@ def fit(
     resume: bool = False,
     progress: bool = True,
     workers: Workers | None = None,
-    active: SelectionConfig | None = None,
     pace: Pace | None = None,
     begin: str | Path | None = None,
 ) -> FitResult:
@@ -141,7 +137,6 @@ def fit(
         resume: Continue from the last checkpoint, or from the start if there is none yet.
         progress: Show it on stderr: a bar on a terminal, lines elsewhere.
         workers: Processes that compute what candidates of an active fit tell, as `drgs.select` takes them.
-        active: The config's `selection`, where it stood before; for one release.
         pace: Called after every step with the steps done and those of the whole fit; returns how many the whole fit is
             to have. Where that is another number, schedules go on from the share that is then done, and config.json
             says so. Only where nothing moves and all views are fitted to.
@@ -155,10 +150,6 @@ def fit(
         KeyboardInterrupt: On Ctrl-C, SIGTERM and SIGHUP, after a checkpoint and the PLY have been written.
     """
     config = config or FitConfig()
-    if active is not None:
-        text = "fit(active=...) is written fit(config=FitConfig(selection=...)); the old way ends with the next release"
-        warnings.warn(text, DeprecationWarning, stacklevel=2)
-        config = config.replace(selection=active)
     runtime.backend()  # sets torch's threads too, at first use
     threads = one_thread() if config.deterministic else contextlib.nullcontext()
     with lock_run(Run(out_dir), "fit", resume, [dataset.path]), threads, Bar("fit", show=progress):

@@ -21,13 +21,15 @@ FLOORS: list[tuple[set[str], str]] = [
         {
             "lenses",
             "shutters",
-            "information.prior",
             "information.sums",
         },
         "know nothing of the rest: plain data, or math",
     ),
     ({"guards", "io", "display.progress", "display.tables"}, "refuse bad input, show progress: needed from everywhere"),
-    ({"information.criteria", "information.choices"}, "what views can be judged and chosen by, by name"),
+    (
+        {"information.criteria", "information.choices", "information.prior"},
+        "what views can be judged and chosen by, by name",
+    ),
     ({"settings", "runtime"}, "what a render can be asked for, and the machine it runs on"),
     ({"guards.memory", "guards.camera_checks"}, "guards that know the machine or the settings"),
     ({"cameras", "ellipsoids", "sizes"}, "the two things that a view is made of, and how large it is looked at"),

@@ -29,7 +29,7 @@ from drgs.capturing.budget import FEWEST_STEPS, Pacer
 from drgs.capturing.capture import Photographs
 from drgs.capturing.record import CaptureRecord
 from drgs.commands.capture import capture_photographs, run
-from drgs.commands.making_options import Capture
+from drgs.commands.options import Capture
 from drgs.data import load
 from drgs.data.held_out import HELD_OUT, write_held_out
 from drgs.display.progress import Bar
@@ -45,7 +45,7 @@ from test_sfm import add_bad_entries, corner_camera, corner_photo, corner_walls,
 from test_share import write_viewer  # noqa: E402
 
 STEPS = 40
-CONFIG = FitConfig.of(max_steps=STEPS, max_pixels=2000, max_gaussians=400, renderers=("fast",), skybox="off")
+CONFIG = FitConfig().replace(max_steps=STEPS, max_pixels=2000, max_gaussians=400, renderers=("fast",), skybox="off")
 
 
 @pytest.fixture(scope="module", autouse=True)

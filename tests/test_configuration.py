@@ -6,21 +6,18 @@ import dataclasses
 import json
 import subprocess
 import sys
-import warnings
 
 import pytest
 
 from drgs import cli
-from drgs.commands.config_file import config_fields
-from drgs.commands.option_help import EVERYDAY, HEADINGS, help_page, options_in, written
-from drgs.commands.orbit_keys import ORBIT_KEYS, parsed_orbit
-from drgs.commands.renamed import RENAMED, as_written_now
-from drgs.fitting.config import ActiveConfig, FitConfig, SelectionConfig, recorded_config
-from drgs.guards.records import part_of, texts_of, ways_of
+from drgs.commands.command_line import HEADINGS, config_fields, help_page, written
+from drgs.commands.values import ORBIT_KEYS, parsed_orbit
+from drgs.fitting.config import FitConfig, SelectionConfig
+from drgs.guards.records import options_in, part_of
 from drgs.information.prior import Prior
 from drgs.settings import RenderSettings
 
-FULL = FitConfig.of(
+FULL = FitConfig().replace(
     settings=RenderSettings.preset("gsplat", background=(1.0, 0.5, 0.0)),
     max_steps=12,
     max_gaussians=50,
@@ -41,25 +38,15 @@ FULL = FitConfig.of(
 
 def test_any_field_is_named_alone():
     """`of` and `replace` put a field where it belongs, however deep, and leave the others as they are."""
-    config = FitConfig.of(max_gaussians=7, criterion="eig", save_every=5)
+    config = FitConfig().replace(max_gaussians=7, criterion="eig", save_every=5)
     assert config.density.max_gaussians == 7
     assert config.selection.scoring.criterion == "eig"
     assert config.replace(max_gaussians=9, seed=1) == dataclasses.replace(
         config, seed=1, density=dataclasses.replace(config.density, max_gaussians=9)
     )
     assert config.replace(selection=None, add=4).selection == SelectionConfig(add=4)
-    assert FitConfig.of() == FitConfig()
+    assert FitConfig().replace() == FitConfig()
     assert FitConfig().selection is None
-
-
-def test_names_are_unique_and_told():
-    """No two records have a field of the same name, and each has a text that `--help-all` shows."""
-    ways = ways_of(FitConfig)  # asserts it
-    assert len(ways) > 70
-    assert set(ways) == set(texts_of(FitConfig))
-    assert all(
-        text[-1] in ".?)" and text[0].isupper() or text.startswith("lambda") for text in texts_of(FitConfig).values()
-    )
 
 
 @pytest.mark.parametrize(
@@ -80,44 +67,8 @@ def test_names_are_unique_and_told():
 def test_mistakes_are_one_line(fields, message):
     """A name that is misspelt is refused with the nearest, a value with its range."""
     with pytest.raises(ValueError, match=message) as error:
-        FitConfig.of(**fields)
+        FitConfig().replace(**fields)
     assert "\n" not in str(error.value)
-
-
-def test_what_ran_before_goes_on():
-    """For a release: flat fields make and are read of the records, `ActiveConfig` makes a selection; each says how it
-    is written now.
-    """
-    with pytest.warns(DeprecationWarning, match=r"FitConfig\(max_gaussians=...\) is written FitConfig.of"):
-        config = FitConfig(max_steps=9, max_gaussians=7)
-    assert config == FitConfig.of(max_steps=9, max_gaussians=7)
-    with pytest.warns(DeprecationWarning, match="FitConfig.max_gaussians is written FitConfig.density.max_gaussians"):
-        assert config.max_gaussians == 7
-    with pytest.warns(DeprecationWarning, match="FitConfig.of"):
-        assert dataclasses.replace(config, noise=2.0).density.noise == 2.0
-    with pytest.warns(DeprecationWarning, match="SelectionConfig.of"):
-        chosen = ActiveConfig(policy="random", prior=1e-3, relative_prior=True)
-    assert chosen == SelectionConfig.of(policy="random", prior=Prior(1e-3, True))
-    with pytest.warns(DeprecationWarning, match="SelectionConfig.scoring.criterion"):
-        assert chosen.criterion == "v_opt"
-    with pytest.raises(AttributeError, match="no attribute 'max_gausians'"):
-        config.max_gausians  # noqa: B018
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert FitConfig(max_steps=9) != config
-
-
-def test_active_of_fit_goes_on(tmp_path):
-    """`fit(active=...)` is the config's selection: it is that which a data set without views is refused for."""
-    from drgs.data import Dataset
-    from drgs.train import fit
-
-    nothing = Dataset(tmp_path, "transforms", [])
-    with (
-        pytest.warns(DeprecationWarning, match="is written fit"),
-        pytest.raises(ValueError, match="active: there must be at least one training view"),
-    ):
-        fit(nothing, tmp_path / "run", active=SelectionConfig(), progress=False)
 
 
 # ------------------------------------------------------------------------------------------------------- as files
@@ -130,19 +81,6 @@ def test_files_hold_the_records():
     assert record["density"]["max_gaussians"] == 50
     assert record["selection"]["scoring"]["prior"] == {"value": 1e-3, "relative": True, "groups": {"sh": 0.5}}
     assert set(record["selection"]["scoring"]) & {"settings", "semantics"} == set()
-
-
-def test_records_of_older_versions_are_read():
-    """All fields of a fit beside each other, those of its selection beside it, lambda a number and a flag; the first
-    had no `restart`, and never did.
-    """
-    flat, active = {}, FULL.replace(prior=Prior(1e-3, True), weights={}, groups=None).selection.flat()
-    for part in FULL.replace(selection=None).to_json().items():
-        flat |= part[1] if isinstance(part[1], dict) and part[0] != "settings" else dict([part])
-    del flat["selection"], active["weights"], active["groups"], active["restart"]
-    assert {"max_gaussians", "settings", "save_every"} <= set(flat)
-    found = recorded_config(flat, active)
-    assert found == FULL.replace(prior=Prior(1e-3, True), weights={}, groups=None, restart="never")
 
 
 TOML = """
@@ -171,12 +109,12 @@ def files(tmp_path):
 
 
 def _fit(*words: str) -> FitConfig:
-    return cli._parse_arguments(["fit", "scene", "-o", "out", *words]).fit_config()
+    return cli._parse_arguments(["fit", "scene", "-o", "out", *words]).fit
 
 
 def test_a_file_says_what_options_say(files):
     """Fields that it leaves out have their defaults; a preset is what its settings are put over."""
-    wanted = FitConfig.of(
+    wanted = FitConfig().replace(
         settings=RenderSettings.preset("gsplat", max_hits=5),
         max_steps=500,
         test_every=4,
@@ -186,7 +124,7 @@ def test_a_file_says_what_options_say(files):
     )
     assert _fit("--config", str(files / "a.toml")) == wanted
     (files / "b.json").write_text(json.dumps({"max_steps": 500, "max_gaussians": 9, "data": {"times": 2}}))
-    assert _fit(f"--config={files / 'b.json'}") == FitConfig.of(max_steps=500, max_gaussians=9, times=2)
+    assert _fit(f"--config={files / 'b.json'}") == FitConfig().replace(max_steps=500, max_gaussians=9, times=2)
 
 
 def test_a_run_is_repeated_from_its_config(files):
@@ -211,7 +149,7 @@ def test_only_a_person_names_functions_of_others(files):
     """A run by a policy of one's own is repeated where the command line names the policy, too."""
     (files / "own.toml").write_text("[selection]\npolicy = 'mine:policy'\nadd = 2")
     again = _fit("--config", str(files / "own.toml"), "--policy", "mine:policy")
-    assert again == FitConfig.of(policy="mine:policy", add=2)
+    assert again == FitConfig().replace(policy="mine:policy", add=2)
 
 
 @pytest.mark.slow
@@ -224,9 +162,9 @@ def test_select_and_reproduce_take_the_same_file(files, tmp_path):
     assert (args.policy, args.settings()) == ("random", FULL.settings)
     usual, changed = (
         plan_of("static", "tiny", tmp_path, policies=["random"], fields=fields).study.fit
-        for fields in ({}, config_fields(files / "a.toml"))
+        for fields in ({}, config_fields(files / "a.toml", {}))
     )
-    stated = {k: x for k, x in config_fields(files / "a.toml").items() if k != "selection"}
+    stated = {k: x for k, x in config_fields(files / "a.toml", {}).items() if k != "selection"}
     assert changed == usual.replace(renderers=("gsplat",), **stated)
     assert (changed.max_steps, changed.density.max_gaussians) == (500, usual.density.max_gaussians)
     args = cli._parse_arguments(["reproduce", "static", "-o", "x", "--config", str(files / "a.toml")])
@@ -283,33 +221,7 @@ def test_bad_files_are_one_line(tmp_path, capsys, name, text, told):
     assert not (tmp_path / "run").exists()
 
 
-# ------------------------------------------------------------------------------------------- options that have moved
-
-
-@pytest.mark.parametrize(("row", "command"), [(row, command) for row in RENAMED for command in row.commands])
-def test_options_that_moved_work_as_before(row, command, capsys):
-    """Each does what its new spelling does, with a space or `=`, and says that in one line."""
-    value = {"--up": "z", "--center": "1"}.get(row.old, "30")
-    values = [value] * row.values
-    needed = {"select": ["--candidates", "orbit"]}.get(command, [])
-    old = cli._parse_arguments([command, "x", *needed, row.old, *values])
-    said = capsys.readouterr().err
-    new = row.new.format(*values)
-    assert old == cli._parse_arguments([command, "x", *needed, *new.split()])
-    assert capsys.readouterr().err == ""
-    assert said == f"drgs {command}: {row.old} is written {new} now; the old way ends with the next release\n"
-    if row.values == 1:
-        assert cli._parse_arguments([command, "x", *needed, f"{row.old}={value}"]) == old
-
-
-def test_a_moved_option_without_its_value_is_refused(capsys):
-    """As an option that is unknown; and one of another command is left alone."""
-    with pytest.raises(SystemExit):
-        cli._parse_arguments(["render", "x", "--center", "1", "2"])
-    assert "--center" in capsys.readouterr().err
-    assert as_written_now("fit", ["--up", "z"]) == (["--up", "z"], [])
-    with pytest.raises(SystemExit):
-        cli._parse_arguments(["select", "x", "--candidates", "orbit", "--fov", "30"])
+# ------------------------------------------------------------------------------------------------ shape of an orbit
 
 
 def test_keys_of_an_orbit():
@@ -337,7 +249,7 @@ def test_keys_of_an_orbit():
 # -------------------------------------------------------------------------------------------------------------- help
 
 
-@pytest.mark.parametrize("name", cli._OPTIONS)
+@pytest.mark.parametrize("name", cli.COMMANDS)
 def test_help_all_has_every_option(name, capsys):
     """Each that the parser knows, with a text; `--help` has at most 24 of them and says how many more there are."""
     for word in ("--help", "--help-all"):
@@ -346,29 +258,31 @@ def test_help_all_has_every_option(name, capsys):
         assert not end.value.code
     text = capsys.readouterr().out
     short, whole = (f"usage: drgs {name}{part}" for part in text.split(f"usage: drgs {name}")[1:])
-    found = list(options_in(cli._OPTIONS[name]))
-    assert all(option.text for option in found)
+    found = [option for option in options_in(cli.COMMANDS[name]).values() if not option.spec.file_only]
     for option in found:
-        assert f"  {option.flags}" in whole
-    shown = [option for option in found if f"\n  {option.flags}" in short]
+        assert len(option.spec.help) > 8
+        spelled = option.spec.metavar or option.flag.removeprefix("--")
+        assert spelled in whole or option.spec.positional, option.name
+    shown = [option for option in found if not option.spec.rare]
     assert len(shown) <= 24
+    assert all(option.flag.removeprefix("--") in short for option in shown if not option.spec.positional)
     more = len(found) - len(shown)
     assert (f"{more} more: drgs {name} --help-all" in short) == (more > 0)
-    assert set(EVERYDAY.get(name, ())) <= {option.name for option in found}
     assert max(map(len, text.splitlines())) <= 100
     headings = [line for line in whole.splitlines() if line in HEADINGS]
     assert headings == [heading for heading in HEADINGS if heading in headings]
+    assert {option.heading for option in found} == set(headings)
 
 
 def test_help_begins_with_what_is_needed():
     """What a command works on, where it writes, then what is most often said."""
     fit = [
         line.split()[:2]
-        for line in help_page("fit", cli._OPTIONS["fit"]).splitlines()
+        for line in help_page("fit", cli.COMMANDS["fit"]).splitlines()
         if line.startswith("  ") and line[2] != " "
     ]
     assert [words[0] for words in fit[:4]] == ["DATA", "-o,", "--config", "--resume"]
-    select = help_page("select", cli._OPTIONS["select"])
+    select = help_page("select", cli.COMMANDS["select"])
     assert select.index("--candidates") < select.index("--policy") < select.index("--variant")
     assert "elevation  " in select
     assert "fov  " not in select
@@ -408,6 +322,7 @@ def test_help_loads_nothing_heavy():
 
 
 def test_records_are_not_made_of_themselves():
-    """A part is a record, be it optional; plain values, settings and lambda are none."""
+    """A nested record has options, be it optional; plain values and render settings have none."""
     assert part_of(SelectionConfig | None) is SelectionConfig
-    assert part_of(Prior | None) is part_of(RenderSettings) is part_of(int) is None
+    assert part_of(Prior | None) is Prior
+    assert part_of(RenderSettings) is part_of(int) is None

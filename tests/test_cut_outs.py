@@ -10,7 +10,7 @@ from test_data import write_image
 
 from drgs import cli
 from drgs.cameras import orbit
-from drgs.commands.config_file import config_fields, default_of
+from drgs.commands.command_line import parsed_options
 from drgs.commands.options import Fit
 from drgs.data import Dataset, View, load
 from drgs.data.backgrounds import default_background
@@ -129,6 +129,6 @@ def test_a_fit_of_blenders_layout_is_on_white(tmp_path, caplog):
 def test_a_file_says_the_background_or_leaves_it_open(tmp_path, text, expected):
     """A file without settings leaves it to the photographs; black that is said is black."""
     (tmp_path / "fit.toml").write_text(text)
-    options = default_of(Fit, config_fields(tmp_path / "fit.toml"), None)
-    assert options.background == expected
-    assert options.fit_config().settings.background == (0, 0, 0)
+    args = parsed_options(Fit, ["scene", "-o", "run", "--config", str(tmp_path / "fit.toml")])
+    assert args.background == expected
+    assert args.fit.settings.background == (0, 0, 0)

@@ -129,7 +129,7 @@ def test_every_block_says_what_it_is():
 
 def test_commands_in_the_text_exist():
     """Options, scripts and targets that running text names are there."""
-    import dataclasses
+    from drgs.guards.records import options_in
 
     for page in PAGES:
         for command in inline_commands(page):
@@ -143,9 +143,9 @@ def test_commands_in_the_text_exist():
                 continue
             if words[1] in ("--help", "--version"):
                 continue
-            assert words[1] in cli._OPTIONS, f"{where}: {command}"
-            fields = {field.name.replace("_", "-") for field in dataclasses.fields(cli._OPTIONS[words[1]])}
-            fields |= {"set", "class", "help", "help-all"} | {f"no-{name}" for name in fields}
+            assert words[1] in cli.COMMANDS, f"{where}: {command}"
+            fields = {option.flag[2:] for option in options_in(cli.COMMANDS[words[1]]).values()}
+            fields |= {"help", "help-all"} | {f"no-{name}" for name in fields}
             for word in words[2:]:
                 if re.fullmatch(r"--[a-z-]+(=.*)?", word):
                     assert word[2:].partition("=")[0] in fields, f"{where}: {command}: no option {word}"

@@ -89,7 +89,9 @@ def test_examples_of_docstrings_run(folder, tmp_path, monkeypatch):
         "Ks": torch.from_numpy(np.stack([camera.K for camera in cameras])).float(),
     }
     shown = set()
-    drgs.fit(drgs.load_data("scene"), "runs/scene", drgs.FitConfig.of(max_steps=6, max_gaussians=100), progress=False)
+    drgs.fit(
+        drgs.load_data("scene"), "runs/scene", drgs.FitConfig().replace(max_steps=6, max_gaussians=100), progress=False
+    )
     names = sorted(name for name in drgs.__all__ if not isinstance(getattr(drgs, name), types.ModuleType))
     for name, owner in [("drgs", drgs), *((name, getattr(drgs, name)) for name in names)]:
         for block in examples(inspect.getdoc(owner) or ""):

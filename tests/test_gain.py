@@ -416,26 +416,28 @@ def test_one_default_criterion():
 
     from drgs.commands.options import Fit, Select
     from drgs.fitting.config import SelectionConfig
+    from drgs.guards.records import options_in
     from drgs.select import Scoring
 
     for function in (information_gain, scorer):
         assert inspect.signature(function).parameters["criterion"].default is inspect.Parameter.empty
     with pytest.raises(TypeError, match="missing 1 required positional argument: 'criterion'"):
         information_gain({}, {})
-    defaults = {Scoring().criterion, SelectionConfig().scoring.criterion, Fit.criterion, Select.criterion}
+    options = (options_in(kind)["criterion"].default for kind in (Fit, Select))
+    defaults = {Scoring().criterion, SelectionConfig().scoring.criterion, *options}
     assert defaults == {next(iter(CRITERIA))} == {"v_opt"}
 
 
 def test_lambda_is_of_the_criterion():
     """1e-2 of `v_opt`, 1e-6 of the others and of other policies; what is given goes before."""
-    from drgs.fitting.config import selection_of_flat
+    from drgs.fitting.config import SelectionConfig
     from drgs.select import Scoring
     from drgs.settings import RenderSettings
 
     assert Scoring().prior_of() == Scoring("v_opt").prior_of("fisher") == Prior(1e-2)
     assert all(Scoring(x).prior_of() == Prior(1e-6) == Scoring().prior_of("fisherrf") for x in list(CRITERIA)[1:])
     assert Scoring(prior=Prior(0.5)).prior_of() == Scoring(prior=Prior(0.5)).prior_of("coverage") == Prior(0.5)
-    of = lambda **fields: selection_of_flat(fields).scoring_of(RenderSettings.preset("fast")).prior_of()  # noqa: E731
+    of = lambda **fields: SelectionConfig().replace(**fields).scoring_of(RenderSettings.preset("fast")).prior_of()  # noqa: E731
     assert of() == Prior(1e-2)
-    assert of(prior=1e-4) == Prior(1e-4)
-    assert of(relative_prior=True) == Prior(1e-6, relative=True)
+    assert of(prior=Prior(1e-4)) == Prior(1e-4)
+    assert of(relative=True) == Prior(1e-6, relative=True)

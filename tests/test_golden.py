@@ -6,7 +6,6 @@ parsed into, and a run folder and a checkpoint of version 0.2.0 that are read an
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 import shutil
@@ -54,17 +53,28 @@ EVERYTHING += ("--filter-3d", "on")
 def parsed(line: str) -> dict:
     """Name of an option -> its value, of every option that a line of words is parsed into, as JSON has it."""
     from drgs import cli
+    from drgs.guards.records import options_in
 
     def plain(value):
-        if dataclasses.is_dataclass(value):
-            return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
         if isinstance(value, list | tuple):
             return [plain(x) for x in value]
         if isinstance(value, dict):
             return {str(key): plain(x) for key, x in value.items()}
         return value if value is None or isinstance(value, bool | int | float | str) else str(value)
 
-    return plain(cli._parse_arguments(line.split()))
+    args = cli._parse_arguments(line.split())
+    values = {}
+    for name, option in options_in(type(args)).items():
+        value = args
+        for step in option.path:
+            if value is None:  # a record that no option names would have the defaults, but for lambda
+                value = None if name == "value" else option.default
+                break
+            value = getattr(value, step)
+        values[name] = plain(value)
+    if "value" in values:  # of the prior, which is --prior and --relative-prior
+        values |= {"prior": values.pop("value"), "relative_prior": values.pop("relative")}
+    return values
 
 
 def test_commands_are_parsed_as_before():

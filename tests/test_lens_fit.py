@@ -131,9 +131,11 @@ def test_ordinary_lenses_are_taken_out(tmp_path):
     assert runs[0].run.config()["fit"] == runs[1].run.config()["fit"]
     assert runs[0].run.config()["lenses"] == choice.to_json()
     assert lost_share(orbit((0, 0, 0), 3.0, 1)[0]) == 0
-    assert FitConfig.of().difference(FitConfig.of(undistort="on")) is None
+    assert FitConfig().replace().difference(FitConfig().replace(undistort="on")) is None
     assert (
-        FitConfig.of(renderers=("fast",), undistort="off").difference(FitConfig.of(renderers=("fast",)))[0]
+        FitConfig()
+        .replace(renderers=("fast",), undistort="off")
+        .difference(FitConfig().replace(renderers=("fast",)))[0]
         == "undistort"
     )
 
@@ -152,7 +154,7 @@ def test_ordinary_lenses_are_taken_out(tmp_path):
 def test_what_does_not_work_is_refused(fields, told):
     """In one line, before anything is read."""
     with pytest.raises(ValueError, match=told):
-        FitConfig.of(**{"undistort": "off", **fields})
+        FitConfig().replace(**{"undistort": "off", **fields})
 
 
 def _psnr(g, frames):

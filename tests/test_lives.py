@@ -21,7 +21,6 @@ from drgs.dynamics.lives import LIVES, Lives, living, logit_at
 from drgs.ellipsoids import Gaussians
 from drgs.files import load_state, save_state
 from drgs.fitting.births import find_births
-from drgs.fitting.config import recorded_config
 from drgs.fitting.frames import load_frames
 from drgs.fitting.lives import BIRTHS, Lasting
 from drgs.fitting.records import load_run
@@ -288,7 +287,7 @@ def test_exposure_is_nothing_that_moves(tmp_path):
 def config(**fields) -> FitConfig:
     short = {"renderers": ("fast",), "max_steps": 240, "max_gaussians": 200, "sh_degree": 1, "save_every": 1000}
     rates = {"means_rate": (1e-3, 1e-4), "dc_rate": 0.02, "static_share": 0.2, "initial_opacity": 0.8}
-    return FitConfig.of(**{**short, **rates, **fields})
+    return FitConfig().replace(**{**short, **rates, **fields})
 
 
 @pytest.fixture(autouse=True)
@@ -379,14 +378,6 @@ def test_a_fit_that_was_stopped_ends_with_the_same_bits(dataset, tmp_path):
         save_state(parts.state, found | {f"parameter.{name}": bad}, header)
         with pytest.raises(ValueError, match=rf"state\.safetensors: \S*{name} must be"):
             load_run(parts)
-
-
-def test_old_runs_have_none():
-    """A config that knows nothing of lives was of a fit without."""
-    record = FitConfig().to_json()
-    assert recorded_config(record).motion.lives == "auto"
-    del record["motion"]["lives"]
-    assert recorded_config(record).motion.lives == "off"
 
 
 def test_what_the_static_stage_shows(tmp_path):

@@ -18,7 +18,7 @@ from drgs import cli, fisher, reference
 from drgs.data.camera_lists import save_cameras_json
 from drgs.files import CONFIG_SCHEMA, Run, load_state, save_ply
 from drgs.fisher import Nuisances
-from drgs.fitting.config import FitConfig, SelectionConfig, selection_of_flat
+from drgs.fitting.config import FitConfig, SelectionConfig
 from drgs.fitting.records import fit_record
 from drgs.gain import block_gain
 from drgs.information.complement import Eliminated, left
@@ -368,8 +368,7 @@ def test_what_a_fit_has_estimated():
     assert Scoring().over(("pose", "exposure")).nuisances.names == BOTH
     assert Scoring(nuisances=Nuisances(eliminate=())).over(BOTH).nuisances.names == ()
     assert Scoring(method="fisherrf").over(BOTH).nuisances.names == ()
-    selection = SelectionConfig.of(eliminate=("exposure",), exposure_std=0.1)
-    assert selection_of_flat(selection.flat()) == selection
+    selection = SelectionConfig().replace(eliminate=("exposure",), exposure_std=0.1)
     assert SelectionConfig.from_json(json.loads(json.dumps(selection.to_json()))) == selection
 
 

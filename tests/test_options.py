@@ -5,19 +5,20 @@ import importlib
 import inspect
 import subprocess
 import sys
-import textwrap
 import typing
+from pathlib import Path
+from typing import Literal
 
 import pytest
 
 from drgs import cli, fisher, gain, runtime, select
-from drgs.commands import making_options, options
-from drgs.commands.option_help import options_in
+from drgs.commands import options
+from drgs.commands.command_line import help_page, parsed_options, words_of
 from drgs.data import sfm
-from drgs.fitting.config import DataConfig, FitConfig, SelectionConfig
+from drgs.fitting.config import FitConfig, SelectionConfig
 from drgs.fitting.renderers import own_preset
-from drgs.guards.records import hints_of, part_of, texts_of, ways_of
-from drgs.information.choices import CRITERION_NAMES, POLICY_NAMES, Criterion, Policy
+from drgs.guards.records import Record, option, options_in, part
+from drgs.information.choices import CRITERION_NAMES, POLICY_NAMES
 from drgs.settings import PRESETS, RenderSettings
 
 pytestmark = pytest.mark.core
@@ -25,78 +26,111 @@ pytestmark = pytest.mark.core
 
 def _choices(command: type, name: str) -> tuple:
     """What an option may be, by its type."""
-    return typing.get_args(typing.get_type_hints(command)[name])
+    return typing.get_args(options_in(command)[name].hint)
 
 
-def _of_records(kind: type) -> dict[str, typing.Any]:
-    """Field -> default, of a record and of its parts, those that hold fields themselves aside."""
-    found = {}
-    for name, hint in hints_of(kind).items():
-        value = getattr(kind(), name)
-        found |= _of_records(part) if (part := part_of(hint)) and value is not None else {name: value}
-    return found
+@dataclasses.dataclass(frozen=True)
+class Inner(Record):
+    """A record of a package."""
+
+    where = "toy"
+    count: int = option(3, "How many.", within=(1, 9))
+    names: tuple[str, ...] = option(("a",), "Names.", commas=True, none="none", rare=True)
+
+    def __post_init__(self) -> None:
+        self.check()
 
 
-def test_texts_of_any_python():
-    """Python 3.13 takes the indentation of the code off docstrings; what they say of fields is read all the same."""
-    texts = dict(texts_of(DataConfig))
-    as_is = DataConfig.__doc__
-    for doc in (inspect.cleandoc(as_is), textwrap.indent(inspect.cleandoc(as_is), "    ").lstrip()):
-        texts_of.cache_clear()
-        DataConfig.__doc__ = doc
-        try:
-            assert dict(texts_of(DataConfig)) == texts
-        finally:
-            DataConfig.__doc__ = as_is
-            texts_of.cache_clear()
-    assert set(texts) >= {"max_pixels", "exposure", "poses"}
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Toy(options.Common):
+    """A command."""
+
+    place: Path = option(help="Where.", positional=True)
+    output: Path = option(help="Out.", short="o")
+    inner: Inner = part(Inner())
+    size: tuple[int, int] | None = option(None, "Two numbers.")
+    rates: tuple[float, ...] = option((0.5,), "Numbers.")
+    sets: tuple[str, ...] = option((), "Any.", flag="set", repeat=True)
+    kind: Literal["one", "two"] = option("one", "Kind.")
+    loud: bool = option(False, "Noise.")
+    share: float = option(0.5, "Share.", within=(0, 1))
 
 
-def test_fit_options_are_the_fields_of_its_records():
-    """Every field of a fit's configuration is an option of `fit`, with its type, its default and its text; but for the
-    render settings, which are --preset and --set, lambda, which is a number and a flag here, and names and weights of
-    groups, which a file says.
+def test_one_field_is_an_option_everywhere():
+    """A field of a record is spelled, parsed, checked, shown and written back by what it says of itself."""
+    line = "here -o out --count 4 --names a,b --size 3 -4 --rates 1 -2e-3 --set x=1 --set y --kind two --no-loud"
+    args = parsed_options(Toy, line.split())
+    assert (args.place, args.output, args.inner) == (Path("here"), Path("out"), Inner(4, ("a", "b")))
+    assert (args.size, args.rates, args.sets, args.kind, args.loud) == (
+        (3, -4),
+        (1.0, -2e-3),
+        ("x=1", "y"),
+        "two",
+        False,
+    )
+    assert parsed_options(Toy, ["--rates", "1", "here", "-oout", "--loud", "--names=none"]).inner.names == ()
+    assert "--count INT" in help_page("toy", Toy)
+    assert "--names" not in help_page("toy", Toy)
+    assert "(default: a)" in help_page("toy", Toy, ["--help-all"])
+    known = options_in(Toy)
+    for name, value in (("names", ("a", "b")), ("size", (3, -4)), ("rates", (1e-3, 2.0)), ("count", 5)):
+        words = words_of(known[name], value)
+        found = parsed_options(Toy, ["x", "-o", "y", *words])
+        for step in known[name].path:
+            found = getattr(found, step)
+        assert found == value
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("x", "--output must be given, is missing; add --output"),
+        ("-o y", "PLACE must be given"),
+        ("x -o y --cuont 3", "options must be those of the command, got --cuont; did you mean --count"),
+        ("x -o y --zzzz", "got --zzzz; none has a name like it"),
+        ("x -o y z", "words without an option must be PLACE, got 'z', too"),
+        ("x -o y --count", "--count must have a value, INT, got none"),
+        ("x -o y --count a", "--count must be a whole number, got 'a'"),
+        ("x -o y --count 10", r"toy: count must be a whole number in \[1, 9\], got 10"),
+        ("x -o y --share 2", r"--share must be in \[0, 1\], got 2; correct it"),
+        ("x -o y --size 3", "--size must have 2 values, got 3"),
+        ("x -o y --kind tow", "--kind must be one of one, two, got 'tow'; did you mean two"),
+        ("x -o y --loud=yes", "--loud must be without a value, got 'yes'"),
+        ("x -o y --no-count 3", "got --no-count"),
+    ],
+)
+def test_bad_usage_says_what_must_hold(line, told):
+    """What must hold, what was got, and what to do, in one line."""
+    with pytest.raises(ValueError, match=told) as error:
+        parsed_options(Toy, line.split())
+    assert "\n" not in str(error.value)
+
+
+def test_every_field_of_a_fit_is_an_option():
+    """With a text; but for the render settings, which are --preset and --set, and names and weights of groups, which a
+    file says.
     """
-    fields = _of_records(FitConfig) | _of_records(SelectionConfig)
-    offered = typing.get_type_hints(options.Fit)
-    texts = texts_of(FitConfig)
-    shown = {option.name: option for option in options_in(options.Fit)}
-    carried = {"weights", "groups"}
-    assert set(fields) - set(offered) == {"settings", "selection"}
-    for name in sorted(set(fields) & set(offered) - carried - {"prior"}):
-        assert getattr(options.Fit, name) == fields[name], name
-        # Help shows the names of policies and criteria; a config may hold the name of somebody's own.
-        own = {"policy": Policy | str, "criterion": Criterion | str}
-        assert offered[name] == own.get(name, _type_of(name)), name
-        assert shown[name].text == texts[name], name
-    assert not carried & set(shown)
-    assert options.Fit(data="x", output="y").given_prior() is fields["prior"] is None
-
-
-def _type_of(name: str) -> typing.Any:
-    kind = FitConfig
-    *ways, last = ways_of(FitConfig)[name]
-    for step in ways:
-        kind = part_of(hints_of(kind)[step])
-    return hints_of(kind)[last]
+    offered, fields = options_in(options.Fit), options_in(FitConfig)
+    assert len(fields) > 70
+    assert set(fields) <= set(offered)
+    assert {name for name, one in fields.items() if one.spec.file_only} == {"weights", "groups", "prior_groups"}
+    for name, one in fields.items():
+        assert offered[name].path == ("fit", *one.path)
+        assert one.spec.help[0].isupper() or one.spec.help.startswith("lambda"), name
+        assert one.spec.help[-1] in ".?)", name
+    assert parsed_options(options.Fit, ["x", "-o", "y"]).fit == FitConfig()
 
 
 @pytest.mark.parametrize("command", [options.Select, options.Fisher])
 def test_information_options_are_those_of_an_active_fit(command):
     """`select` and `fisher` weigh views as an active fit does, and as Python's `Scoring()`: it is one record."""
-    scoring = select.Scoring()
-    shared = {*hints_of(select.Scoring)} & {field.name for field in dataclasses.fields(command)}
-    assert {"method", "blocks", "probes"} <= shared
-    for name in shared - {"weights", "groups"}:
-        assert getattr(command, name) == getattr(scoring, name)
-    assert SelectionConfig().scoring == scoring
-    if command is options.Select:
-        assert options.Select(scene="x", candidates="y").scoring() == scoring
+    words = {options.Select: ["x", "--candidates", "y"], options.Fisher: ["x"]}[command]
+    assert parsed_options(command, words).scoring == SelectionConfig().scoring == select.Scoring()
 
 
 def test_choices_are_what_there_is():
-    """What an option offers is what the code knows, no more and no fewer."""
-    for command in (options.Render, options.Select, options.Fisher, options.Tradeoff):
+    """Presets, policies, criteria and methods are those of the package."""
+    for command in (options.Render, options.Select, options.Query, options.Fisher):
         assert _choices(command, "preset") == PRESETS
     for command, more in ((options.Fit, ()), (options.Eval, ("all",))):  # or none, which says what the fit is for
         named, none = _choices(command, "preset")
@@ -105,27 +139,27 @@ def test_choices_are_what_there_is():
     assert len({RenderSettings.preset(name) for name in PRESETS}) == len(PRESETS)
     assert options.Fit.preset is None
     assert FitConfig().settings == RenderSettings.preset(own_preset(FitConfig().renderers))
+    assert tuple(select.POLICIES) == POLICY_NAMES
+    assert tuple(gain.CRITERIA) == CRITERION_NAMES
     for command in (options.Fit, options.Select):
-        named, _ = _choices(command, "policy")
-        assert typing.get_args(named) == tuple(select.POLICIES) == POLICY_NAMES
-        named, _ = _choices(command, "criterion")
-        assert typing.get_args(named) == tuple(gain.CRITERIA) == CRITERION_NAMES
+        assert options_in(command)["policy"].spec.metavar == "{" + ",".join(POLICY_NAMES) + "}|TEXT"
+        assert options_in(command)["criterion"].spec.metavar == "{" + ",".join(CRITERION_NAMES) + "}|TEXT"
         assert _choices(command, "method") == fisher.METHODS
     assert _choices(options.Info, "variant") == ("auto", *runtime.VARIANTS)
     parameters = inspect.signature(sfm.run_sfm).parameters
-    assert _choices(making_options.Sfm, "camera_model") == sfm.CAMERA_MODELS
-    assert _choices(making_options.Sfm, "matcher") == sfm.MATCHING
-    assert making_options.Sfm.camera_model == parameters["camera_model"].default
-    assert making_options.Sfm.matcher == parameters["matching"].default
-    assert making_options.Sfm.seed == parameters["seed"].default
+    assert _choices(options.Sfm, "camera_model") == sfm.CAMERA_MODELS
+    assert _choices(options.Sfm, "matcher") == sfm.MATCHING
+    assert options.Sfm.camera_model == parameters["camera_model"].default
+    assert options.Sfm.matcher == parameters["matching"].default
+    assert options.Sfm.seed == parameters["seed"].default
 
 
-@pytest.mark.parametrize("name", cli._OPTIONS)
+@pytest.mark.parametrize("name", cli.COMMANDS)
 def test_a_command_is_a_module(name):
     """All have one shape: `run(args)` in the module of the command's name, with the command's options."""
     run = importlib.import_module(f"drgs.commands.{name}").run
     (args,) = inspect.signature(run).parameters.values()
-    assert (args.name, args.annotation) == ("args", cli._OPTIONS[name].__name__)
+    assert (args.name, args.annotation) == ("args", cli.COMMANDS[name].__name__)
 
 
 def test_options_import_nothing_heavy():

@@ -29,7 +29,7 @@ def folder(tmp_path_factory):
 
 def test_every_command_is_shown():
     """The list of commands is complete."""
-    assert {command[0] for command in _commands()} == set(cli._OPTIONS)
+    assert {command[0] for command in _commands()} == set(cli.COMMANDS)
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ import drgs
 from drgs import cli
 from drgs.cameras import Camera, intrinsics_from_fov, look_at, orbit
 from drgs.commands import orbits
-from drgs.commands.orbit_keys import UP
+from drgs.commands.values import UP
 from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.display import pictures
 from drgs.files import save_ply

@@ -13,8 +13,7 @@ from drgs import cli, metrics
 from drgs.commands.eval import print_table
 from drgs.commands.repeat import fit_command
 from drgs.evaluation import evaluate_run
-from drgs.files import load_state, save_state
-from drgs.fitting.config import FitConfig, recorded_config
+from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import load_frames
 from drgs.fitting.renderers import ANY, RendererSchedule, renderers_to_measure
 from drgs.fitting.resume import lock_run
@@ -108,7 +107,7 @@ def test_a_step_renders_what_is_due(dataset, monkeypatch):  # noqa: F811
 
 
 def _fit(*words: str) -> FitConfig:
-    return cli._parse_arguments(["fit", "scene", "-o", "out", *words]).fit_config()
+    return cli._parse_arguments(["fit", "scene", "-o", "out", *words]).fit
 
 
 @pytest.mark.parametrize(
@@ -135,7 +134,7 @@ def test_what_options_mean(words, renderers, preset):
     assert found.settings == RenderSettings.preset(preset, background=(1.0, 0.0, 0.0))
     line, beyond = fit_command(found, "scene", "out")
     assert not beyond
-    again = cli._parse_arguments(line.split()[1:]).fit_config()
+    again = cli._parse_arguments(line.split()[1:]).fit
     assert again.difference(found) is None
     assert again.settings == found.settings
 
@@ -165,30 +164,6 @@ def test_contradictions_are_one_line(words, told):
     with pytest.raises(ValueError, match=told) as error:
         _fit(*words)
     assert "\n" not in str(error.value)
-
-
-def test_fits_before_there_were_several_go_on(dataset, tmp_path):  # noqa: F811
-    """A record without the field is of one renderer, its settings; a plain `--resume` goes on with it."""
-    for settings in (FAST, RenderSettings.preset("gsplat", max_hits=9)):
-        record = FitConfig(settings=settings).to_json()
-        del record["renderers"]
-        found = recorded_config(record)
-        assert RendererSchedule.of(found.renderers, found.settings, 10).all_settings == (settings,)
-    cfg = config(max_steps=4, renderers=("fast",))
-    fit(dataset, tmp_path / "run", cfg, progress=False)
-    state = tmp_path / "run/state.safetensors"
-    tensors, header = load_state(state)
-    del header["config"]["renderers"]
-    header["step"] = 2
-    save_state(state, tensors, header)
-    trainer = Trainer.from_state(
-        cfg.replace(renderers=("auto",)), trainer_of(dataset, cfg).frames, *load_state(state), ""
-    )
-    assert trainer.renderers.all_settings == (FAST,)
-    result = fit(dataset, tmp_path / "run", cfg.replace(renderers=("auto",)), resume=True, progress=False)
-    assert result.run.config()["fit"]["renderers"] == ["fast"]
-    with pytest.raises(ValueError, match="renderers was .*fast.* and is .*any"):
-        fit(dataset, tmp_path / "run", cfg.replace(renderers=("any",)), resume=True, progress=False)
 
 
 # ---------------------------------------------------------------------------------------------------- what is seen

@@ -311,10 +311,14 @@ def test_stills_show_their_times():
 FAST = RenderSettings.preset("fast")
 CONFIGS = [
     FitConfig(),
-    FitConfig.of(max_steps=12, sh_degree=1, deterministic=True, seed=7, mask="ignore", selection=SelectionConfig()),
-    FitConfig.of(settings=FAST.replace(extent=4.5, background=(1.0, 0.5, 0.25)), grid_rate=(0.1, 1e-5), dc_rate=0.5),
-    FitConfig.of(settings=RenderSettings.preset("gsplat", max_hits=5), test_cameras=("cam00", "cam 07")),
-    FitConfig.of(
+    FitConfig().replace(
+        max_steps=12, sh_degree=1, deterministic=True, seed=7, mask="ignore", selection=SelectionConfig()
+    ),
+    FitConfig().replace(
+        settings=FAST.replace(extent=4.5, background=(1.0, 0.5, 0.25)), grid_rate=(0.1, 1e-5), dc_rate=0.5
+    ),
+    FitConfig().replace(settings=RenderSettings.preset("gsplat", max_hits=5), test_cameras=("cam00", "cam 07")),
+    FitConfig().replace(
         settings=RenderSettings.preset("exact"),
         test_cameras=(),
         couple_features=True,
@@ -333,14 +337,14 @@ def test_the_command_repeats_the_fit(config):
     """The program reads from the line the same fit."""
     line, beyond = fit_command(config, Path("my data"), Path("runs/a b"))
     args = cli._parse_arguments(shlex.split(line)[1:])
-    assert args.fit_config() == config
+    assert args.fit == config
     assert (args.data, args.output) == (Path("my data"), Path("runs/a b"))
     assert not beyond
 
 
 def test_what_no_option_sets_is_said(run):
     """A fit from Python or a file may have fields that the command line has not."""
-    assert fit_command(FitConfig.of(weights={"sh": 0.5}), run, run)[1] == ['weights={"sh": 0.5}']
+    assert fit_command(FitConfig().replace(weights={"sh": 0.5}), run, run)[1] == ['weights={"sh": 0.5}']
 
 
 # The number of words in tables, and those of them that do not stand on one line.

@@ -19,7 +19,7 @@ transformers = pytest.importorskip("transformers", reason="needs the extra teach
 
 from drgs import data  # noqa: E402 (after the reason to skip)
 from drgs.cli import main  # noqa: E402
-from drgs.commands import making_options  # noqa: E402
+from drgs.commands import options  # noqa: E402
 from drgs.features.encoders import MAP_NORM, SCALES, TEMPLATES, ClipEncoder  # noqa: E402
 from drgs.features.teacher import read_map  # noqa: E402
 
@@ -311,7 +311,7 @@ def test_teach_refuses_bad_options(capture, model, capsys):
     shutil.copytree(capture / "images", capture / "alone/images")
     assert teach(capture / "alone", capture / "nowhere") == 2  # before a model is looked for
     assert "must hold camera poses, found" in capsys.readouterr().err
-    assert making_options.Teach.scales == ",".join(f"{scale:g}" for scale in SCALES)
+    assert options.Teach.scales == ",".join(f"{scale:g}" for scale in SCALES)
 
 
 def test_numbers_of_labels_are_not_named_by_a_teacher(capture, model, capsys):

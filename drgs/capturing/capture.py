@@ -16,7 +16,7 @@ import numpy as np
 
 from drgs.capturing.record import FOLDER, Batch, CaptureRecord
 from drgs.data.checks import read_image
-from drgs.fitting.config import FitConfig, recorded_config
+from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import fit_record, is_run
 from drgs.guards import memory
@@ -203,7 +203,7 @@ class Capture:
         if is_run(self.options.output):
             return config_of(self.run)
         before = self.batch.plan.get("before")
-        return None if before is None else recorded_config(before["config"])
+        return None if before is None else FitConfig.from_json(before["config"])
 
 
 def config_of(run: Run) -> FitConfig:
@@ -211,5 +211,5 @@ def config_of(run: Run) -> FitConfig:
     checkpoint may differ from where there was no room for them.
     """
     if run.state.is_file():
-        return recorded_config(state_header(run.state)["config"])
+        return FitConfig.from_json(state_header(run.state)["config"])
     return fit_record(run).config

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from drgs.capturing import diagnosis
 from drgs.capturing.budget import FitPlan, Pacer, plan_fit
 from drgs.capturing.capture import config_of
-from drgs.fitting.config import FitConfig, recorded_config
+from drgs.fitting.config import FitConfig
 from drgs.fitting.records import fit_record, is_run
 from drgs.fitting.resume import FILES, last_checkpoint, lock_run
 from drgs.io.checkpoint import save_state
@@ -127,7 +127,7 @@ def _joined_config(capture: Capture) -> tuple[FitConfig, bool]:
     what there is.
     """
     recorded = capture.batch.plan["before"]
-    before, views = recorded_config(recorded["config"]), recorded["views"]
+    before, views = FitConfig.from_json(recorded["config"]), recorded["views"]
     train, _ = capture.dataset.split(before.data.test_every, before.data.test_offset, before.data.test_cameras)
     joined = len(train) - views
     continues = joined <= NEW_FIT_SHARE * views

@@ -17,7 +17,7 @@ from drgs.commands.report import report_of
 from drgs.fitting.config import FitConfig
 
 if TYPE_CHECKING:
-    from drgs.commands.making_options import Capture
+    from drgs.commands.options import Capture
 
 __all__ = ["capture_photographs", "run"]
 
@@ -27,7 +27,7 @@ def run(args: Capture) -> None:
     if args.more:
         _print_next(args)
     else:
-        capture_photographs(args, FitConfig.of(exposure="auto"))
+        capture_photographs(args, FitConfig().replace(exposure="auto"))
 
 
 def capture_photographs(args: Capture, config: FitConfig) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from drgs.cluster.workers import Cluster
-    from drgs.commands.option_groups import Clustered
+    from drgs.commands.options import Clustered
 
 __all__ = ["workers_of"]
 

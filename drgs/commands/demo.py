@@ -36,7 +36,7 @@ from drgs.sizes import cropped
 from drgs.train import FitConfig, fit
 
 if TYPE_CHECKING:
-    from drgs.commands.making_options import Demo
+    from drgs.commands.options import Demo
     from drgs.ellipsoids import Gaussians
 
 __all__ = ["Plan", "make_demo", "run"]
@@ -160,7 +160,7 @@ def _make_demo(out_dir: Path, run_folder: LockedFolder, plan: Plan, progress: bo
 
     start = time.perf_counter()
     dataset = load(data)
-    config = FitConfig.of(
+    config = FitConfig().replace(
         renderers=("fast",),  # the picture shows what others make of it; to take all in turn takes twice as long
         max_steps=plan.steps,
         max_gaussians=plan.gaussians,

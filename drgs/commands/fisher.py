@@ -36,7 +36,6 @@ from drgs.information.sums import add, together
 from drgs.io.checkpoint import save_state
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import lock_folder, write_json
-from drgs.select import Scoring
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -55,7 +54,7 @@ def run(args: Fisher) -> None:
     """`drgs fisher SCENE`."""
     check_counts(args)
     settings = args.settings()  # refuses what cannot be, before anything is read
-    prior = args.given_prior() or MAP_PRIOR
+    prior = args.scoring.prior or MAP_PRIOR
     inputs = [args.scene, args.train or "", args.cameras or ""]
     output = lock_folder(args.output, "fisher", ["information.safetensors", "fisher.json"], inputs)
     given = SceneInput.of(args)
@@ -103,12 +102,12 @@ def run(args: Fisher) -> None:
         "command": "fisher",
         "scene": str(args.scene),
         "gaussians": len(given.gaussians),
-        "method": args.method,
+        "method": args.scoring.method,
         "prior": prior.to_json(),
         "blocks": list(blocks.names),
         "semantics": blocks.metric.to_json() if blocks.metric else None,
         **blocks.scoring.nuisances.if_any(),
-        "probes": args.probes if "deformation" in blocks.names or args.method == "probes" else None,
+        "probes": args.scoring.probes if "deformation" in blocks.names or args.scoring.method == "probes" else None,
         "settings": dataclasses.asdict(settings),
         "pixels": known.pixels,
         "known": {"source": known.source, "names": [camera.name for camera in known.cameras]},
@@ -129,14 +128,7 @@ def asked_blocks(
     Raises:
         ValueError: If a block is named that the scene does not have.
     """
-    scoring = Scoring(
-        settings=settings,
-        method=args.method,
-        blocks=args.blocks,
-        semantics=given.semantics(),
-        probes=args.probes,
-        nuisances=args.given_nuisances(),
-    )
+    scoring = dataclasses.replace(args.scoring, settings=settings, semantics=given.semantics())
     return SceneBlocks.of(given.scene, scoring.over(given.estimated), cameras, "fisher")
 
 

@@ -28,7 +28,7 @@ _log = logging.getLogger(__name__)
 
 def run(args: Fit) -> None:
     """`drgs fit DATA -o RUN`."""
-    config = args.fit_config()
+    config = args.fit
     is_active = config.selection is not None
     # Before minutes of reading images and triangulating points.
     lock_run(Run(args.output), "fit", args.resume, [args.data])

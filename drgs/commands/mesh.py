@@ -15,12 +15,11 @@ from drgs.display.progress import Bar
 from drgs.io.checkpoint import state_header
 from drgs.io.outputs import lock_folder
 from drgs.meshing.extraction import mesh_of
-from drgs.meshing.options import MeshOptions
 from drgs.meshing.writing import MESH_SUFFIXES, save_mesh
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
-    from drgs.commands.making_options import Mesh
+    from drgs.commands.options import Mesh
     from drgs.ellipsoids import Gaussians
 
 __all__ = ["run"]
@@ -29,7 +28,6 @@ __all__ = ["run"]
 def run(args: Mesh) -> None:
     """`drgs mesh SCENE -o FILE`."""
     settings = args.settings()  # refuses what cannot be, before anything is read
-    options = MeshOptions(**{field.name: getattr(args, field.name) for field in dataclasses.fields(MeshOptions)})
     suffix = args.output.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise ValueError(
@@ -53,12 +51,12 @@ def run(args: Mesh) -> None:
         seen = known if args.cameras is None else known_views(args.cameras, args, given, lenses)
         cameras = evenly(_places(seen.cameras), args.limit or len(seen.cameras))
         check_lenses("mesh", settings, cameras)
-        with Bar("information" if options.crop else "depth", show=not args.quiet) as bar:
+        with Bar("information" if args.meshing.crop else "depth", show=not args.quiet) as bar:
             mesh = mesh_of(
                 gaussians,
                 cameras,
                 given.over_background(settings),
-                options,
+                args.meshing,
                 known=_places(known.cameras),
                 advance=lambda label, done, total: bar.update(done, total, label),
             )
@@ -69,7 +67,7 @@ def run(args: Mesh) -> None:
         size = " x ".join(f"{x:.3g}" for x in np.asarray(high - low))
         print(
             f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, {size}, of {len(cameras)} views "
-            f"({seen.source}), {options.depth} depth, voxels of {mesh.voxel:.3g}: {args.output}"
+            f"({seen.source}), {args.meshing.depth} depth, voxels of {mesh.voxel:.3g}: {args.output}"
         )
 
 

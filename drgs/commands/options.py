@@ -1,371 +1,980 @@
-"""The options of every command: a dataclass each, its docstrings the help texts.
+"""The options of every command: a frozen dataclass each, whose fields say all that there is to say of an option.
 
-What can be chosen, and what is chosen by default, is read from the record that an option ends up in. Imports nothing
-heavy: `drgs --help` reads them all.
+The name of a field is that of the option, its type what may be chosen, and `option` has its default, text and range;
+`part` holds a record of the package, whose fields are options in the same way (`drgs.guards.records`). The command
+line, its help and configuration files are read from these alone (`command_line.py`). Imports nothing heavy: `drgs
+--help` reads it.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
-from tyro.conf import Positional, UseAppendAction, arg
-
-from drgs.commands.option_groups import (
-    Around,
-    Choosing,
-    Clustered,
-    Common,
-    Comparing,
-    Data,
-    Informed,
-    Lenses,
-    Moments,
-    OutputPath,
-    SceneFile,
-    Seen,
-    Settings,
-    Split,
-    Views,
-)
-from drgs.commands.orbit_keys import ORBIT_KEYS
-from drgs.commands.overrides import check_color
-from drgs.commands.record_options import BLOCKS_TEXT, options_of
-from drgs.fitting.config import FitConfig, SelectionConfig
+from drgs.cluster.options import check_options
+from drgs.commands.values import ORBIT_KEYS, check_color, parsed
+from drgs.fitting.config import SEED, FitConfig, SelectionConfig, UndistortUse
 from drgs.fitting.renderers import AUTO, own_preset
-from drgs.guards.records import ways_of
-from drgs.information.choices import Block
+from drgs.guards.records import check_ranges, option, options_in, part, same_option
+from drgs.information.scoring import Scoring
+from drgs.meshing.options import MeshOptions
 from drgs.settings import Preset, RenderSettings
+from drgs.studies.protocols import ExperimentName, ProtocolName, StudyScale
 
 __all__ = [
+    "COMMANDS",
+    "Around",
+    "Capture",
     "Cite",
+    "Clustered",
+    "Common",
+    "Comparing",
     "Convert",
     "Crossval",
+    "Data",
+    "Demo",
     "Eval",
     "Fisher",
     "Fit",
     "Info",
+    "Informed",
+    "Lenses",
+    "Mesh",
+    "Moments",
     "Query",
     "Render",
     "Report",
+    "Reproduce",
+    "Scene",
+    "Seen",
     "Select",
+    "Settings",
+    "Sfm",
     "Share",
     "Stress",
+    "Teach",
+    "Timed",
     "Tradeoff",
     "View",
+    "Views",
 ]
+
+Split = Literal["all", "train", "test"]
+
+
+def _scene() -> Any:
+    """What a command looks at."""
+    return option(
+        help="A run folder, or Gaussians: .ply, .spz, .splat, .ksplat, .sog, .glb, a SOG or INRIA model folder.",
+        positional=True,
+    )
+
+
+# ------------------------------------------------------------------------------- what several commands have
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Common:
+    """Options that every command has."""
+
+    heading: ClassVar[str] = "Machine"
+
+    variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb"] = option(
+        "auto",
+        "Backend; auto follows DRGS_VARIANT, then CUDA if it works, else LLVM.",
+    )
+    threads: int | None = option(None, "Threads of Dr.Jit and torch; default DRGS_THREADS, else every usable core.")
+    quiet: bool = option(False, "Print only warnings and errors; results are in the files.")
+    debug: bool = option(False, "Show the traceback of an error.")
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+    @classmethod
+    def values(cls, given: Mapping[str, Any], line: Collection[str]) -> dict[tuple[str, ...], Any]:
+        """Path of a field -> its value, as `drgs.guards.records.nested` makes these options of them.
+
+        Args:
+            given: Name of an option -> its value, of a file of --config and of the command line, which wins.
+            line: Those that the command line names.
+        Raises:
+            ValueError: If options contradict each other.
+        """
+        return {options_in(cls)[name].path: value for name, value in given.items()}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings(Common):
+    """Options of commands that render."""
+
+    heading: ClassVar[str] = "Rendering"
+
+    preset: Preset = option("exact", "Preset of render settings.")
+    overrides: tuple[str, ...] = option(
+        (), "Replace one render setting, e.g. order=ray.", repeat=True, metavar="KEY=VALUE", flag="set"
+    )
+
+    def settings(self) -> RenderSettings:
+        """The `RenderSettings` that --preset and --set describe.
+
+        Raises:
+            ValueError: If an override is no KEY=VALUE, names no field or has the wrong type.
+        """
+        return RenderSettings.preset(self.preset, **self.replaced())
+
+    def replaced(self) -> dict[str, Any]:
+        """The fields that --set replaces.
+
+        Raises:
+            ValueError: If one is no KEY=VALUE, names no field or has the wrong type.
+        """
+        return parsed(self.overrides)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Data:
+    """Options of commands that load data sets."""
+
+    heading: ClassVar[str] = "Data"
+
+    strict: bool = option(
+        False,
+        "Refuse a data set with missing images; by default they are left out, and at least 3 must remain.",
+        rare=True,
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Timed(Data):
+    """Options of commands that load data sets of one time or of several."""
+
+    heading: ClassVar[str] = "Data"
+
+    times: int | None = option(
+        None,
+        "Number of frames of each synchronous camera, evenly spaced in its video; default that of the run, else 40.",
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Views(Timed):
+    """Options of commands that take some of the views of a data set."""
+
+    heading: ClassVar[str] = "Data"
+
+    test_cameras: tuple[str, ...] | None = option(
+        None,
+        "Synchronous cameras to hold out at all times (cam00,cam05), or none; default those of the run, else "
+        "the first.",
+        commas=True,
+        none="none",
+        metavar="CAMERA,CAMERA|none",
+        rare=True,
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Lenses:
+    """Options of commands that can look through lenses."""
+
+    heading: ClassVar[str] = "Data"
+
+    undistort: UndistortUse = option(
+        "auto",
+        "Undistort cameras (on), render through their lenses, by presets along rays (off), or do as the run "
+        "did (auto).",
+        rare=True,
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Around:
+    """Options of commands that can make cameras around a scene."""
+
+    heading: ClassVar[str] = "Views"
+
+    orbit: tuple[str, ...] = option(
+        (),
+        "Shape of an orbit or a dome, e.g. elevation=30,span=180; by default chosen from the photographs' cameras.",
+        repeat=True,
+        metavar="KEY=VALUE",
+    )
+    orbit_keys: ClassVar[tuple[str, ...]] = tuple(ORBIT_KEYS)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Seen(Settings, Around, Views):
+    """Options of commands that look at a scene from a few cameras."""
+
+    scene: Path = _scene()
+    cameras: str | None = option(
+        None,
+        "Views: a data set, a run, a cameras.json or selection.json, or orbit; default those of the run, else orbit.",
+        heading="Views",
+    )
+    split: Split = option("all", "Which views of a data set to take.", heading="Views", rare=True)
+    limit: int = option(2, "At most this many views, evenly spaced.", heading="Views")
+    max_pixels: int = option(20000, "Views are reduced to at most this many pixels.")
+    seed: int = option(0, "Random seed.", within=SEED, rare=True)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Informed(Settings):
+    """Options of commands that compute Fisher information."""
+
+    scoring: Scoring = part(Scoring(), only=("method", "blocks", "prior", "probes", "nuisances"))
+    info_pixels: int | None = same_option(SelectionConfig, "info_pixels", rare=False, heading="Views")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Comparing(Informed, Around, Views, Lenses):
+    """Options of commands that compare views with known ones."""
+
+    scene: Path = _scene()
+    train: str | None = option(
+        None,
+        "Training views: a data set, a run, a cameras.json or a selection.json; default those of the run.",
+        heading="Views",
+    )
+    split: Split = option(
+        "all",
+        "Which views of the data set of --candidates or --cameras to take.",
+        heading="Views",
+        rare=True,
+    )
+    count: int = option(40, "Number of cameras of an orbit or a dome.", heading="Views")
+    time: float | None = option(
+        None,
+        "Dynamic scenes: the time of cameras that have none, such as those of an orbit.",
+        heading="Views",
+    )
+    orbit_keys: ClassVar[tuple[str, ...]] = tuple(key for key in ORBIT_KEYS if key != "fov")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Clustered(Common):
+    """Options of commands that can let other processes compute."""
+
+    heading: ClassVar[str] = "Machine"
+
+    scheduler: str | None = option(
+        None,
+        "HOST:PORT of a Dask cluster that computes information of views, or whole fits (docs/many-machines.md).",
+        rare=True,
+    )
+    workers: int | None = option(
+        None,
+        "Number of worker processes, of one thread each, on this machine; the same as --scheduler without a cluster.",
+        rare=True,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_options(self.scheduler, self.workers)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Moments:
+    """Options of commands that draw a scene that moves."""
+
+    time: str | None = option(
+        None,
+        "Dynamic scenes: one time, or a range (0..1) over all views; default that of each view, else all times.",
+        heading="Views",
+    )
+    view: str | None = option(
+        None,
+        "Only the view, or the camera, of this name; with a range of --time, --frames images of it.",
+        heading="Views",
+    )
+    moving: bool = option(False, "Write only moving Gaussians to ply files.", rare=True)
+
+
+# ------------------------------------------------------------------------------------------ commands
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Info(Common):
     """Report backend, libLLVM, CUDA, threads and package versions."""
 
-    json: bool = False
-    """Print JSON."""
+    json: bool = option(False, "Print JSON.")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Render(Settings, Around, Views, Moments, Lenses):
     """Render a file of Gaussians, or a finished run, to pictures or a video."""
 
-    scene: SceneFile
-    cameras: str | None = None
-    """Views: a data set, a run, a cameras.json or selection.json, or orbit; default orbit, or with --view the run."""
-    output: OutputPath = Path("out/render")
-    """Folder for the images, or one file: a video NAME.mp4 or .webm, or one view NAME.png, .jpg or .exr."""
-    width: int | None = None
-    """Image width in pixels; default that of the camera; 640 for an orbit or a flight, 2048 for a panorama."""
-    height: int | None = None
-    """Image height in pixels; default that of the camera."""
-    path: Path | None = None
-    """Camera path: a flight.json saved by drgs view, or a camera_path.json of Nerfstudio's viewer (docs/view.md)."""
-    panorama: bool = False
-    """Panoramas (360 by 180 degrees, upright) at the places of the cameras; default that of the middle photograph."""
-    frames: int | None = None
-    """Number of images of an orbit, a flight or a range of --time; default 60, for a flight by its seconds."""
-    duration: float | None = None
-    """Seconds of the video of an orbit, a flight or a range of --time, instead of --frames."""
-    format: str | None = None
-    """List of png, jpg, exr, webm, mp4 and ply (all Gaussians at each time), by commas; default png, or by -o."""
-    fps: float | None = None
-    """Frames a second of the video; default 24, for a flight the rate in its file."""
-    depth: bool = False
-    """Write color-mapped depth too; exr files hold it anyway."""
-    features: bool = False
-    """Write images of the semantic features too, three principal components as colors."""
-    labels: bool = False
-    """Write images of the classes too, for a run that was fitted with classes."""
-    overlay: bool = False
-    """Write images of the classes over the colors too."""
-    split: Split = "all"
-    """Which views of a data set to take."""
-    limit: int | None = None
-    """At most this many views."""
-
-
-_ON_THE_WAY = ("schedule", "initial", "start", "add", "every", "pick_points", "restart", "measure")
-_Fitted: Any = options_of(FitConfig, without=("settings", "selection"))
-_Selecting: Any = options_of(SelectionConfig, only=_ON_THE_WAY)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Fit(_Fitted, _Selecting, Choosing, Clustered, Data):
-    """Fit Gaussians to photographs with known cameras."""
-
-    data: Positional[Path]
-    """Data set: COLMAP, transforms.json, LLFF, Replica, Neu3D (cam*.mp4), train_meta.json, folders cam00, ..."""
-    output: OutputPath
-    """The run folder."""
-    preset: Preset | None = None
-    """Fit for the renderer of this name alone; with several renderers in --for, render previews and views by it."""
-    resume: bool = False
-    """Continue from the last checkpoint in the run folder."""
-    background: tuple[float, float, float] | None = None
-    """Background color: RGB in [0, 1]; default black, or for photographs with transparency as docs/datasets.md says."""
-    views: Literal["all", "active"] = "all"
-    """Fit to all training views, or start with a few and choose more during the fit (active; options below)."""
-    report: bool = True
-    """Write report.html into the run folder at the end, unless --no-report is given."""
-
-    def settings(self) -> RenderSettings:
-        """As for every command, with the background that the photographs are composited on; without --preset those of
-        the renderer that the fit is for, `fast` of several.
-        """
-        if any(text.startswith("background=") for text in self.overrides):
-            raise ValueError("--set background: must be --background here, which photographs are composited on as well")
-        background = RenderSettings.background if self.background is None else self.background
-        check_color("--background", background)
-        preset = self.preset or own_preset(self.renderers)
-        return RenderSettings.preset(preset, **self.replaced()).replace(background=background)
-
-    def fit_config(self) -> FitConfig:
-        """What these options say of the fit, its selection with --views active.
-
-        Raises:
-            ValueError: If an option is out of range, or belongs to --views active and that is missing.
-        """
-        names = {*ways_of(FitConfig)} & {field.name for field in dataclasses.fields(_Fitted)}
-        fields = {name: getattr(self, name) for name in names}
-        if self.renderers == AUTO and self.preset == "fast":
-            fields["renderers"] = ("fast",)  # asked for by name, it is not the default
-        config = FitConfig.of(settings=self.settings(), **fields)
-        if self.views != "active" and (self.scheduler, self.workers) != (None, None):
-            raise ValueError(
-                "fit: --scheduler and --workers must have --views active, got --views all; workers compute what "
-                "candidates tell, the fit itself is one process"
-            )
-        selection = {name: getattr(self, name) for name in ("policy", "info_pixels", *_ON_THE_WAY)}
-        if self.views == "active":
-            return config.replace(selection=SelectionConfig.of(scoring=self.scoring(), **selection))
-        names = {*ways_of(SelectionConfig), "relative_prior"}
-        for field in dataclasses.fields(self) if self.config is None else ():  # a file may well say more
-            if field.name in names and getattr(self, field.name) != _default(field):
-                option = "--" + field.name.replace("_", "-")
-                raise ValueError(f"fit: {option} must have --views active, got --views all; add it or drop {option}")
-        return config
-
-
-def _default(field: dataclasses.Field) -> Any:
-    return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Select(Choosing, Clustered, Comparing):
-    """Rank cameras by what their views would add to a run, or to a file of Gaussians."""
-
-    candidates: str
-    """A data set or a run (its views without the training views), a cameras.json or selection.json, orbit, or dome."""
-    k: Annotated[int, arg(aliases=["-k"])] = 1
-    """Number of views to pick, one after the other."""
-    refine: int = 0
-    """Move each pick to a better pose near it, by scoring at most this many further cameras; 0: keep it."""
-    refine_box: str | None = None
-    """X0,Y0,Z0,X1,Y1,Z1: box for --refine, world units; default the box around candidates and training views."""
-    output: OutputPath = Path("out/select.json")
-    """The JSON file."""
-    preset: Preset = "fast"
-    """Preset of render settings; fast ranks like exact in a fraction of the time (docs/tradeoff-fisher.md)."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Fisher(Comparing):
-    """Write the Fisher information of training views about every Gaussian, and maps of the remaining uncertainty."""
-
-    cameras: str | None = None
-    """Views for maps: a data set, a run, a cameras.json or selection.json, orbit or dome; default training views."""
-    output: OutputPath = Path("out/fisher")
-    """Folder for information.safetensors, fisher.json and the maps."""
-    limit: int = 4
-    """At most this many views for maps, evenly spaced."""
-    pose: bool = False
-    """Also report the information of each of these views about its own pose, a 6x6 matrix."""
-    maps: bool = False
-    """Also write an image of each view side by side with its maps of moments, of fisherrf and of every block."""
+    scene: Path = _scene()
+    cameras: str | None = option(
+        None,
+        "Views: a data set, a run, a cameras.json or selection.json, or orbit; default orbit, or with --view the run.",
+        heading="Views",
+    )
+    output: Path = option(
+        Path("out/render"),
+        "Folder for the images, or one file: a video NAME.mp4 or .webm, or one view NAME.png, .jpg or .exr.",
+        short="o",
+    )
+    width: int | None = option(
+        None,
+        "Image width in pixels; default that of the camera; 640 for an orbit or a flight, 2048 for a panorama.",
+        heading="Rendering",
+    )
+    height: int | None = option(None, "Image height in pixels; default that of the camera.", heading="Rendering")
+    path: Path | None = option(
+        None,
+        "Camera path: a flight.json saved by drgs view, or a camera_path.json of Nerfstudio's viewer (docs/view.md).",
+        rare=True,
+    )
+    panorama: bool = option(
+        False,
+        "Panoramas (360 by 180 degrees, upright) at the places of the cameras; default that of the middle photograph.",
+        rare=True,
+    )
+    frames: int | None = option(
+        None,
+        "Number of images of an orbit, a flight or a range of --time; default 60, for a flight by its seconds.",
+        heading="Views",
+    )
+    duration: float | None = option(
+        None,
+        "Seconds of the video of an orbit, a flight or a range of --time, instead of --frames.",
+        rare=True,
+    )
+    format: str | None = option(
+        None,
+        "List of png, jpg, exr, webm, mp4 and ply (all Gaussians at each time), by commas; default png, or by -o.",
+    )
+    fps: float | None = option(
+        None,
+        "Frames a second of the video; default 24, for a flight the rate in its file.",
+        rare=True,
+    )
+    depth: bool = option(False, "Write color-mapped depth too; exr files hold it anyway.")
+    features: bool = option(False, "Write images of the semantic features too, three principal components as colors.")
+    labels: bool = option(False, "Write images of the classes too, for a run that was fitted with classes.")
+    overlay: bool = option(False, "Write images of the classes over the colors too.", rare=True)
+    split: Split = option("all", "Which views of a data set to take.", heading="Views", rare=True)
+    limit: int | None = option(None, "At most this many views.", heading="Views")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class View(Informed, Around, Views):
     """Look at a run or a file of Gaussians in the browser, also during a fit."""
 
-    scene: Positional[Path]
-    """A run folder, a 3DGS point_cloud.ply, or Gaussians in another format (docs/files.md)."""
-    train: str | None = None
-    """Training views to display: a data set, a run, a cameras.json or selection.json; default those of the run."""
-    selection: Path | None = None
-    """Scores of cameras, a file that drgs select wrote; default those of the run, if it chose its views."""
-    blocks: Annotated[tuple[Block, ...] | None, BLOCKS_TEXT] = ("geometry", "backdrop")
-    """Outputs that count in the map of uncertainty: geometry, semantic, deformation, backdrop."""
-    max_pixels: int = 500_000
-    """Images rendered by drgs have at most this many pixels, also in a larger window."""
-    host: str = "127.0.0.1"
-    """Address to listen at; 0.0.0.0: all addresses of this machine, for other machines, which then need a token."""
-    port: int = 8080
-    """Port to listen at; 0: any free port."""
-    token: str | None = None
-    """Token that browsers must send; default none on this machine, else a random one, which is printed."""
-    open: bool = False
-    """Open the page in a browser."""
-    orbit_keys: ClassVar[tuple[str, ...]] = tuple(key for key in ORBIT_KEYS if key != "fov")  # the browser has its own
+    scene: Path = option(
+        help="A run folder, a 3DGS point_cloud.ply, or Gaussians in another format (docs/files.md).",
+        positional=True,
+    )
+    train: str | None = option(
+        None,
+        "Training views to display: a data set, a run, a cameras.json or selection.json; default those of the run.",
+        heading="Views",
+    )
+    selection: Path | None = option(
+        None,
+        "Scores of cameras, a file that drgs select wrote; default those of the run, if it chose its views.",
+        heading="Views",
+    )
+    scoring: Scoring = part(
+        Scoring(blocks=("geometry", "backdrop")), only=("method", "blocks", "prior", "probes", "nuisances")
+    )
+    max_pixels: int = option(500000, "Images rendered by drgs have at most this many pixels, also in a larger window.")
+    host: str = option(
+        "127.0.0.1",
+        "Address to listen at; 0.0.0.0: all addresses of this machine, for other machines, which then need a token.",
+    )
+    port: int = option(8080, "Port to listen at; 0: any free port.")
+    token: str | None = option(
+        None,
+        "Token that browsers must send; default none on this machine, else a random one, which is printed.",
+    )
+    open: bool = option(False, "Open the page in a browser.")
+    orbit_keys: ClassVar[tuple[str, ...]] = tuple(key for key in ORBIT_KEYS if key != "fov")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Crossval(Seen):
-    """Compare a rasterizer's image and gradients with a reference and name differences, by parameter group."""
+class Fit(Clustered, Data):
+    """Fit Gaussians to photographs with known cameras."""
 
-    rasterizer: str = "drgs:ewa"
-    """drgs:ewa or drgs:PRESET, gsplat, package.module:function, or a dump (.npz, .safetensors)."""
-    preset: Literal["auto", Preset] = "auto"
-    """Model that the rasterizer implements; auto: the preset with the nearest image."""
-    ladder: bool = True
-    """Measure which approximations of that model cause its difference from exact, unless --no-ladder is given."""
-    strict: bool = False
-    """Fail also for other conventions, known deviations and missing images of a data set."""
-    export: Path | None = None
-    """Only write scene, cameras and cotangents to this .npz, for a rasterizer on another machine."""
-    output: OutputPath = Path("out/crossval")
-    """Folder for report.html and crossval.json."""
+    data: Path = option(
+        help="Data set: COLMAP, transforms.json, LLFF, Replica, Neu3D (cam*.mp4), train_meta.json, folders cam00, ...",
+        positional=True,
+    )
+    output: Path = option(help="The run folder.", short="o")
+    config: Path | None = option(
+        None,
+        "Configuration: a TOML or JSON file, or a run; options of the command line override it "
+        "(docs/configuration.md).",
+    )
+    resume: bool = option(False, "Continue from the last checkpoint in the run folder.")
+    views: Literal["all", "active"] = option(
+        "all",
+        "Fit to all training views, or start with a few and choose more during the fit (active; options below).",
+        heading="Views",
+    )
+    report: bool = option(
+        True,
+        "Write report.html into the run folder at the end, unless --no-report is given.",
+        rare=True,
+    )
+    fit: FitConfig = part(FitConfig())
+    preset: Preset | None = option(
+        None,
+        "Fit for the renderer of this name alone; with several renderers in --for, render previews and views by it.",
+        heading="Rendering",
+    )
+    overrides: tuple[str, ...] = option(
+        (),
+        "Replace one render setting, e.g. order=ray.",
+        repeat=True,
+        metavar="KEY=VALUE",
+        flag="set",
+        heading="Rendering",
+        rare=True,
+    )
+    background: tuple[float, float, float] | None = option(
+        None,
+        "Background color: RGB in [0, 1]; default black, or for photographs with transparency as "
+        "docs/datasets.md says.",
+        heading="Rendering",
+    )
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Tradeoff(Seen):
-    """Measure time and errors (image, gradient, information) of every accuracy setting on a scene."""
-
-    max_error: tuple[float, ...] = (1e-4, 1e-3, 1e-2)
-    """Error budgets: for each, the fastest setting whose errors are all below it is recommended."""
-    repeats: int = 5
-    """Rounds of timing, in each of which all settings are timed in turn."""
-    seconds: float = 300.0
-    """Seconds for timing the best settings on views of full size; with less time the views are smaller."""
-    output: OutputPath = Path("out/tradeoff")
-    """Folder for tradeoff.json, tradeoff.md and the plot."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Query(Settings, Around, Views, Lenses):
-    """Find objects by text: write masks of views, and a PLY of the Gaussians of the objects, or of all others."""
-
-    scene: Positional[Path]
-    """A run that was fitted with semantics, or a 3DGS PLY with features."""
-    classes: Annotated[tuple[str, ...], arg(name="class", metavar="NAME"), UseAppendAction] = ()
-    """Name of a class of the run; may be repeated."""
-    text_embedding: Path | None = None
-    """Embeddings of texts by the teacher's text encoder: .npy or .pt, of shape (C,) or (K, C)."""
-    threshold: float | None = None
-    """Least score: probability of a class, or cosine of an embedding; default the largest wins."""
-    temperature: float | None = None
-    """Temperature of the softmax over cosines; default 0.01, that of CLIP."""
-    decoder: Path | None = None
-    """Decoder for a PLY, a decoder_chkpnt*.pth of Feature 3DGS; a run has its own."""
-    remove: bool = False
-    """Write all Gaussians except the selected ones."""
-    preset: Preset = "fast"
-    """Preset of render settings."""
-    cameras: str | None = None
-    """Views: a data set, a run, a cameras.json or selection.json, or orbit; default those of the run, else orbit."""
-    split: Split = "all"
-    """Which views of a data set to take."""
-    limit: int = 4
-    """At most this many views for masks, evenly spaced."""
-    max_pixels: int | None = None
-    """Views are reduced to at most this many pixels; default that of the fit."""
-    output: OutputPath = Path("out/query")
-    """Folder for masks, images, query.json, and selected.ply or (--remove) rest.ply."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Convert(Common):
-    """Write Gaussians in another format: .ply, .spz, .sog, .splat, .compressed.ply or .glb (KHR_gaussian_splatting)."""
-
-    scene: SceneFile
-    out: Positional[Path]
-    """Output file; its suffix is the format."""
-    as_stored: bool = False
-    """Do not turn the axes of an .spz: some programs write the axes of PLY files instead of the format's."""
-    time: float | None = None
-    """Dynamic scenes: the time at which Gaussians are written."""
-    uncertainty: Path | None = None
-    """information.safetensors of drgs fisher: adds a column of standard deviations for each group to the PLY."""
-    prior: float = 1.0
-    """For --uncertainty: prior information about every parameter (lambda), as in the maps of drgs fisher."""
-    labels: bool = False
-    """Add a column with the class of each Gaussian to the PLY, for a run that was fitted with classes."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Stress(Common):
-    """Test the renderer on extreme scenes on this machine and print its errors, compared with a float64 oracle."""
-
-    match: str = ""
-    """Run only the cases with this text in their name."""
-    output: Annotated[Path | None, arg(aliases=["-o"])] = None
-    """Folder for stress.json and stress.md; by default none is written."""
+    @classmethod
+    def values(cls, given: Mapping[str, Any], line: Collection[str]) -> dict[tuple[str, ...], Any]:
+        """As for every command, with the render settings of the fit, and its selection with --views active alone."""
+        found = super().values(given, line)
+        if any(text.startswith("background=") for text in given.get("overrides", ())):
+            raise ValueError("--set background: must be --background here, which photographs are composited on as well")
+        background = given.get("background") or RenderSettings.background
+        check_color("--background", background)
+        renderers, preset = given.get("renderers", AUTO), given.get("preset")
+        if renderers == AUTO and preset == "fast":
+            found["fit", "renderers"] = ("fast",)  # named, it is not what `auto` means
+        settings = RenderSettings.preset(preset or own_preset(renderers), **parsed(given.get("overrides", ())))
+        found["fit", "settings"] = settings.replace(background=background)
+        if given.get("views") == "active":
+            return {("fit", "selection"): SelectionConfig(), **found}
+        if given.get("scheduler") is not None or given.get("workers") is not None:
+            raise ValueError(
+                "fit: --scheduler and --workers must have --views active, got --views all; workers compute what "
+                "candidates tell, the fit itself is one process"
+            )
+        for name in line if "config" not in given else ():  # a file may well say more
+            one = options_in(cls)[name]
+            if one.path[:2] == ("fit", "selection") and given[name] != one.default:
+                raise ValueError(
+                    f"fit: {one.flag} must have --views active, got --views all; add it or drop {one.flag}"
+                )
+        return {path: value for path, value in found.items() if path[:2] != ("fit", "selection")}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Eval(Common, Data):
     """Measure a run on held-out views: PSNR, SSIM, FLIP, and LPIPS if weights are given."""
 
-    run: Positional[Path]
-    """A run folder."""
-    split: Split = "test"
-    """Which views to measure."""
-    preset: Literal["all", Preset] | None = None
-    """Further renderers to measure with; default those that the run was fitted for, and gsplat."""
-    scale: float = 1.0
-    """Factor of width and height of the images over those of the fit, up to the size of the photographs."""
-    lpips_weights: Path | None = None
-    """torchvision's AlexNet or VGG16 (docs/install.md names the files), for LPIPS; needs pip install 'drgs[lpips]'."""
+    run: Path = option(help="A run folder.", positional=True)
+    split: Split = option("test", "Which views to measure.", heading="Views")
+    preset: Literal["all", Preset] | None = option(
+        None,
+        "Further renderers to measure with; default those that the run was fitted for, and gsplat.",
+        heading="Rendering",
+    )
+    scale: float = option(
+        1.0,
+        "Factor of width and height of the images over those of the fit, up to the size of the photographs.",
+        heading="Rendering",
+    )
+    lpips_weights: Path | None = option(
+        None,
+        "torchvision's AlexNet or VGG16 (docs/install.md names the files), for LPIPS; needs pip install 'drgs[lpips]'.",
+        heading="Data",
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Report(Common):
     """Write a report of a fit as one HTML file: curves, views, picks, maps, timings, and the command."""
 
-    run: Positional[Path]
-    """A run folder; the fit may still run, or have been stopped."""
-    output: Annotated[Path | None, arg(aliases=["-o"])] = None
-    """Output HTML file; default report.html in the run folder. While a fit writes there, name another place."""
+    run: Path = option(help="A run folder; the fit may still run, or have been stopped.", positional=True)
+    output: Path | None = option(
+        None,
+        "Output HTML file; default report.html in the run folder. While a fit writes there, name another place.",
+        short="o",
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Share(Common):
     """Write a run or a file of Gaussians as one HTML page that opens from disk, on a phone too."""
 
-    scene: SceneFile
-    output: Annotated[Path | None, arg(aliases=["-o"])] = None
-    """Output HTML file; default scene.html in the run folder, for a file its name with .html."""
-    selection: Path | None = None
-    """Photographs to take next, a file that drgs select wrote; default those of the run, if it chose its views."""
-    uncertainty: bool = True
-    """Add a layer of the uncertainty that the photographs leave, unless --no-uncertainty is given."""
-    moments: int = 12
-    """Dynamic scenes: number of times to store; the page interpolates linearly between them."""
+    scene: Path = _scene()
+    output: Path | None = option(
+        None,
+        "Output HTML file; default scene.html in the run folder, for a file its name with .html.",
+        short="o",
+    )
+    selection: Path | None = option(
+        None,
+        "Photographs to take next, a file that drgs select wrote; default those of the run, if it chose its views.",
+        heading="Views",
+    )
+    uncertainty: bool = option(
+        True,
+        "Add a layer of the uncertainty that the photographs leave, unless --no-uncertainty is given.",
+    )
+    moments: int = option(12, "Dynamic scenes: number of times to store; the page interpolates linearly between them.")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Select(Comparing, Clustered):
+    """Rank cameras by what their views would add to a run, or to a file of Gaussians."""
+
+    candidates: str = option(
+        help="A data set or a run (its views without the training views), a cameras.json or selection.json, orbit,"
+        " or dome.",
+        heading="Views",
+    )
+    k: int = option(1, "Number of views to pick, one after the other.", short="k", heading="Views")
+    refine: int = option(
+        0,
+        "Move each pick to a better pose near it, by scoring at most this many further cameras; 0: keep it.",
+        rare=True,
+    )
+    refine_box: str | None = option(
+        None,
+        "X0,Y0,Z0,X1,Y1,Z1: box for --refine, world units; default the box around candidates and training views.",
+        rare=True,
+    )
+    output: Path = option(Path("out/select.json"), "The JSON file.", short="o")
+    preset: Preset = option(
+        "fast",
+        "Preset of render settings; fast ranks like exact in a fraction of the time (docs/tradeoff-fisher.md).",
+        heading="Rendering",
+    )
+    policy: str = same_option(SelectionConfig, "policy", heading="Views")
+    scoring: Scoring = part(Scoring())
+    config: Path | None = option(
+        None,
+        "Configuration: a TOML or JSON file, or a run; options of the command line override it "
+        "(docs/configuration.md).",
+    )
+    seed: int = option(0, "Random seed.", within=SEED, rare=True)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Fisher(Comparing):
+    """Write the Fisher information of training views about every Gaussian, and maps of the remaining uncertainty."""
+
+    cameras: str | None = option(
+        None,
+        "Views for maps: a data set, a run, a cameras.json or selection.json, orbit or dome; default training views.",
+        heading="Views",
+    )
+    output: Path = option(
+        Path("out/fisher"),
+        "Folder for information.safetensors, fisher.json and the maps.",
+        short="o",
+    )
+    limit: int = option(4, "At most this many views for maps, evenly spaced.", heading="Views")
+    pose: bool = option(False, "Also report the information of each of these views about its own pose, a 6x6 matrix.")
+    maps: bool = option(
+        False,
+        "Also write an image of each view side by side with its maps of moments, of fisherrf and of every block.",
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Query(Settings, Around, Views, Lenses):
+    """Find objects by text: write masks of views, and a PLY of the Gaussians of the objects, or of all others."""
+
+    scene: Path = option(help="A run that was fitted with semantics, or a 3DGS PLY with features.", positional=True)
+    classes: tuple[str, ...] = option(
+        (),
+        "Name of a class of the run; may be repeated.",
+        repeat=True,
+        metavar="NAME",
+        flag="class",
+    )
+    text_embedding: Path | None = option(
+        None,
+        "Embeddings of texts by the teacher's text encoder: .npy or .pt, of shape (C,) or (K, C).",
+    )
+    threshold: float | None = option(
+        None,
+        "Least score: probability of a class, or cosine of an embedding; default the largest wins.",
+    )
+    temperature: float | None = option(
+        None,
+        "Temperature of the softmax over cosines; default 0.01, that of CLIP.",
+        rare=True,
+    )
+    decoder: Path | None = option(
+        None,
+        "Decoder for a PLY, a decoder_chkpnt*.pth of Feature 3DGS; a run has its own.",
+        rare=True,
+    )
+    remove: bool = option(False, "Write all Gaussians except the selected ones.")
+    preset: Preset = option("fast", "Preset of render settings.", heading="Rendering")
+    cameras: str | None = option(
+        None,
+        "Views: a data set, a run, a cameras.json or selection.json, or orbit; default those of the run, else orbit.",
+        heading="Views",
+    )
+    split: Split = option("all", "Which views of a data set to take.", heading="Views", rare=True)
+    limit: int = option(4, "At most this many views for masks, evenly spaced.", heading="Views")
+    max_pixels: int | None = option(None, "Views are reduced to at most this many pixels; default that of the fit.")
+    output: Path = option(
+        Path("out/query"),
+        "Folder for masks, images, query.json, and selected.ply or (--remove) rest.ply.",
+        short="o",
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Convert(Common):
+    """Write Gaussians in another format: .ply, .spz, .sog, .splat, .compressed.ply or .glb (KHR_gaussian_splatting)."""
+
+    scene: Path = _scene()
+    out: Path = option(help="Output file; its suffix is the format.", positional=True)
+    as_stored: bool = option(
+        False,
+        "Do not turn the axes of an .spz: some programs write the axes of PLY files instead of the format's.",
+    )
+    time: float | None = option(None, "Dynamic scenes: the time at which Gaussians are written.", heading="Views")
+    uncertainty: Path | None = option(
+        None,
+        "information.safetensors of drgs fisher: adds a column of standard deviations for each group to the PLY.",
+    )
+    prior: float = option(
+        1.0,
+        "For --uncertainty: prior information about every parameter (lambda), as in the maps of drgs fisher.",
+        heading="Views",
+    )
+    labels: bool = option(
+        False,
+        "Add a column with the class of each Gaussian to the PLY, for a run that was fitted with classes.",
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Mesh(Settings, Views, Lenses):
+    """Make a triangle mesh with colors from the depth of a run in the views that it was fitted to."""
+
+    scene: Path = _scene()
+    output: Path = option(help="Output file: .ply, .glb or .obj.", short="o")
+    meshing: MeshOptions = part(MeshOptions())
+    cameras: str | None = option(
+        None,
+        "Views whose depth is used: a data set, a run or a cameras.json; default those that the run was fitted to.",
+        heading="Views",
+    )
+    info_pixels: int | None = option(
+        None,
+        "Views are reduced to at most this many pixels; default that of the fit, or 130000.",
+    )
+    limit: int | None = option(None, "At most this many views, evenly spaced.", heading="Views")
+    time: float | None = option(None, "Dynamic scenes: the time of the surface.", heading="Views")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Crossval(Seen):
+    """Compare a rasterizer's image and gradients with a reference and name differences, by parameter group."""
+
+    rasterizer: str = option(
+        "drgs:ewa",
+        "drgs:ewa or drgs:PRESET, gsplat, package.module:function, or a dump (.npz, .safetensors).",
+    )
+    preset: Literal["auto", Preset] = option(
+        "auto",
+        "Model that the rasterizer implements; auto: the preset with the nearest image.",
+        heading="Rendering",
+    )
+    ladder: bool = option(
+        True,
+        "Measure which approximations of that model cause its difference from exact, unless --no-ladder is given.",
+    )
+    strict: bool = option(
+        False,
+        "Fail also for other conventions, known deviations and missing images of a data set.",
+        heading="Data",
+    )
+    export: Path | None = option(
+        None,
+        "Only write scene, cameras and cotangents to this .npz, for a rasterizer on another machine.",
+    )
+    output: Path = option(Path("out/crossval"), "Folder for report.html and crossval.json.", short="o")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Tradeoff(Seen):
+    """Measure time and errors (image, gradient, information) of every accuracy setting on a scene."""
+
+    max_error: tuple[float, ...] = option(
+        (0.0001, 0.001, 0.01),
+        "Error budgets: for each, the fastest setting whose errors are all below it is recommended.",
+    )
+    repeats: int = option(5, "Rounds of timing, in each of which all settings are timed in turn.")
+    seconds: float = option(
+        300.0,
+        "Seconds for timing the best settings on views of full size; with less time the views are smaller.",
+    )
+    output: Path = option(Path("out/tradeoff"), "Folder for tradeoff.json, tradeoff.md and the plot.", short="o")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Stress(Common):
+    """Test the renderer on extreme scenes on this machine and print its errors, compared with a float64 oracle."""
+
+    match: str = option("", "Run only the cases with this text in their name.")
+    output: Path | None = option(None, "Folder for stress.json and stress.md; by default none is written.", short="o")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Capture(Common):
+    """Make a scene from photographs or videos in one command: frames, poses, fit, report; can be resumed."""
+
+    paths: tuple[Path, ...] = option(
+        (),
+        "Photographs, videos, folders of both, or one data set that has poses; none with --more.",
+        positional=True,
+        metavar="PATH",
+    )
+    output: Path = option(help="The run folder; photographs and poses are in its folder capture.", short="o")
+    budget: str | None = option(
+        None,
+        "Time for the whole command (90s, 10min, 2h), from which sizes and steps follow; default those of drgs fit.",
+    )
+    frames: int = option(150, "At most this many frames of all videos together.", heading="Views")
+    masks: str | None = option(
+        None,
+        "Masks of an object that was turned or moved: a folder (NAME.png, white is kept), or alpha, the alpha"
+        " channels.",
+    )
+    resume: bool = option(
+        False,
+        "Continue a command that was stopped, with the same options, and the same files or none.",
+    )
+    add: bool = option(
+        False,
+        "Add photographs of the same scene to the run and continue the fit (or, if they are many, begin it again).",
+    )
+    more: bool = option(
+        False,
+        "Print which photographs to take next: where to stand, where to look, and how much they would tell.",
+    )
+    k: int = option(5, "Number of photographs that --more suggests.", short="k", heading="Views")
+    length: str | None = option(
+        None,
+        "Measured distance of two photographs, 'IMG_0001 IMG_0004 1.5 m', so that --more prints meters.",
+    )
+    seed: int = option(0, "Random seed.", within=SEED)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Sfm(Common):
+    """Recover cameras and points from plain photographs or videos (COLMAP on the CPU)."""
+
+    paths: tuple[Path, ...] = option(
+        help="Folders of photographs, or videos, of which sharp frames with parallax are taken.",
+        positional=True,
+        metavar="PATH",
+    )
+    output: Path = option(help="Folder for the data set.", short="o")
+    frames: int = option(150, "At most this many frames of all videos together.", heading="Views")
+    camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"] = option(
+        "SIMPLE_RADIAL",
+        "COLMAP's camera model; photographs of one size and focal length share one camera.",
+    )
+    matcher: Literal["auto", "exhaustive", "sequential", "retrieval"] = option(
+        "auto",
+        "Match all pairs, neighbors by name (video), or those and the most similar images; auto: all pairs of"
+        " up to 60.",
+    )
+    masks: str | None = option(
+        None,
+        "Masks of an object that was turned or moved: a folder (NAME.png, white is kept), or alpha, the alpha"
+        " channels.",
+    )
+    seed: int = option(0, "Random seed.", within=SEED)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Teach(Common, Timed):
+    """Add a teacher's feature maps, by a local CLIP model, and text embeddings to a data set."""
+
+    data: Path = option(
+        help="Data set; files are written into its folder, where drgs fit finds them, and none is replaced.",
+        positional=True,
+    )
+    model: Path = option(
+        help="Folder of a CLIP model as transformers saves it; needs pip install 'drgs[teacher]'. Nothing is "
+        "downloaded.",
+    )
+    classes: str | None = option(
+        None,
+        "Class names, with commas between, or a file (.txt, .json); default those of the data set.",
+    )
+    size: str | None = option(
+        None,
+        "WIDTHxHEIGHT of a feature map; default 80 along the longer side, in the photograph's shape.",
+    )
+    scales: str = option(
+        "0.75,1,1.5",
+        "Scales of the photographs to average over; at 1 the short side is twice the model's image size.",
+    )
+    flip: bool = option(
+        True,
+        "Average with the mirrored photographs, unless --no-flip is given, which takes half the time.",
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Scene(Common):
+    """Make a synthetic data set by path tracing: a room, a dynamic kitchen or hall, a still life, a phone capture."""
+
+    name: Literal["room", "kitchen", "hall", "still_life", "capture"] = option(
+        help="Room, kitchen and hall have classes, points and teacher's maps; kitchen and hall are dynamic.",
+        positional=True,
+    )
+    output: Path = option(help="Folder for the data set; an interrupted command is continued there.", short="o")
+    size: str | None = option(
+        None,
+        "WIDTHxHEIGHT of the images in pixels; default 320x240; 240x180 (capture, kitchen), 160x120 (hall).",
+    )
+    views: int | None = option(
+        None,
+        "Number of images; default 75 (room), 32 (still_life) or 28 (capture).",
+        heading="Views",
+    )
+    cameras: int | None = option(
+        None,
+        "Number of video cameras (kitchen, hall); default 15, 12. cam00, in the middle of their arc, is the test view.",
+        heading="Views",
+    )
+    times: int | None = option(None, "Number of frames of each camera (kitchen, hall); default 40, 12.", heading="Data")
+    seed: int = option(
+        0, "Random seed of shapes, textures, motions, cameras, light paths and simulated errors.", within=SEED
+    )
+    spp: int | None = option(
+        None,
+        "Samples (light paths) a pixel; default 25 (room), 16 (kitchen, hall), 30 (still_life), 25 (capture).",
+    )
+    teacher_size: str | None = option(
+        None,
+        "WIDTHxHEIGHT of the teacher's feature maps; default 80x60 (room), 60x45 (kitchen), 40x30 (hall).",
+    )
+    test_every: int | None = option(None, "Hold out every n-th view (room); default 5, which is 15 of 75 views.")
+    exposure: Literal["auto", "fixed"] | None = option(
+        None,
+        "Exposure and white balance (capture): automatic and drifting (auto, the default), or the same for all.",
+    )
+    wall: Literal["white", "paper"] | None = option(
+        None,
+        "Wall behind the table (capture): white without texture (default), or papered.",
+    )
+    shadow: bool = option(
+        True,
+        "Add the photographer's shadow to some photographs (capture), unless --no-shadow is given.",
+    )
+    passer_by: bool = option(True, "Add a passer-by to some photographs (capture), unless --no-passer-by is given.")
+    pose_error: str | None = option(
+        None,
+        "DEGREES,METERS of simulated errors of training poses (capture); default 0.4,0.006; 0,0 for none.",
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Reproduce(Clustered):
+    """Compare policies of view selection on synthetic scenes or on your data, as arXiv 2512.22771 does."""
+
+    what: ExperimentName = option(
+        help="Study: policies on static scenes, dynamic scenes or captures, values of lambda (prior), or blocks.",
+        positional=True,
+    )
+    output: Path = option(
+        help="Folder for scenes, runs, rows.jsonl, tables and figures; finished fits there are kept.",
+        short="o",
+    )
+    data: tuple[Path, ...] = option(
+        (),
+        "Data set instead of the synthetic scenes; may be repeated.",
+        repeat=True,
+        metavar="DATA",
+    )
+    scale: StudyScale = option(
+        "small",
+        "Size of fits and scenes: minutes (tiny), hours (small: 1,400 steps, dynamic 900), or as in the paper.",
+        heading="Rendering",
+    )
+    seeds: int = option(
+        3,
+        "Number of sets of initial views of each static scene; dynamic: of kitchens, or of fits of each data set.",
+    )
+    protocol: ProtocolName = option(
+        "paper",
+        "Initial points: of all views (paper), or of picked views only (blind, and variants; docs/glossary.md).",
+    )
+    policies: tuple[str, ...] = option(
+        (),
+        "Run only this row of the table, by its label in rows.jsonl (docs/results.md); may be repeated.",
+        repeat=True,
+        metavar="LABEL",
+        flag="policy",
+    )
+    test_every: int = option(8, "Hold out every n-th view of --data, by name, unless its files state a split.")
+    test_offset: int = option(0, "Index of the first held-out view.")
+    lpips_weights: Path | None = option(
+        None,
+        "torchvision's AlexNet or VGG16, to measure LPIPS, too; needs pip install 'drgs[lpips]'.",
+        heading="Data",
+    )
+    config: Path | None = option(
+        None,
+        "Configuration that replaces that of --scale: a TOML or JSON file, or a run (docs/configuration.md).",
+    )
+    figures: bool = option(True, "Draw the comparison sheet and the maps at the end, unless --no-figures is given.")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Demo(Common):
+    """Make a still life, fit it, render it and compare presets: a tour in minutes."""
+
+    output: Path = option(Path("out/demo"), "Folder for pictures and tables.", short="o")
+    quick: bool = option(False, "Take half a minute, with poor images, to see that everything runs.")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Cite(Common):
     """Print BibTeX of what a run used, by its config.json; without a run, of what drgs always uses."""
 
-    run: Positional[Path | None] = None
-    """A run folder; the fit may still run."""
+    run: Path | None = option(None, "A run folder; the fit may still run.", positional=True)
+
+
+COMMANDS: dict[str, type[Common]] = {
+    "info": Info,
+    "render": Render,
+    "view": View,
+    "fit": Fit,
+    "eval": Eval,
+    "report": Report,
+    "share": Share,
+    "select": Select,
+    "fisher": Fisher,
+    "query": Query,
+    "convert": Convert,
+    "mesh": Mesh,
+    "crossval": Crossval,
+    "tradeoff": Tradeoff,
+    "stress": Stress,
+    "capture": Capture,
+    "sfm": Sfm,
+    "teach": Teach,
+    "scene": Scene,
+    "reproduce": Reproduce,
+    "demo": Demo,
+    "cite": Cite,
+}
+"""Command -> its options, in the order of `drgs --help`; the module of drgs.commands of that name does the work."""

@@ -18,13 +18,13 @@ import numpy as np
 import numpy.typing as npt
 
 from drgs.cameras import Camera, intrinsics_from_fov, look_at, orbit
-from drgs.commands.orbit_keys import UP, parsed_orbit
+from drgs.commands.values import UP, parsed_orbit
 from drgs.data.capture import Focus, path, upright
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from drgs.commands.option_groups import Around
+    from drgs.commands.options import Around
     from drgs.ellipsoids import Gaussians
 
 __all__ = ["Wish", "capture_orbit", "dome", "scene_orbit"]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from drgs.commands import fisher
 from drgs.commands.clustered import workers_of
-from drgs.commands.config_file import config_fields
+from drgs.commands.command_line import config_fields
 from drgs.commands.options import Fisher
 from drgs.display import tables
 from drgs.display.progress import Bar
@@ -27,7 +27,7 @@ from drgs.studies.sheets import comparison_sheet
 
 if TYPE_CHECKING:
     from drgs.cluster.workers import Cluster
-    from drgs.commands.making_options import Reproduce
+    from drgs.commands.options import Reproduce
 
 __all__ = ["run"]
 
@@ -57,7 +57,7 @@ def run(args: Reproduce) -> None:
             args.policies,
             (args.test_every, args.test_offset),
             weights,
-            {} if args.config is None else config_fields(args.config, ("--policy",)),  # each cell has its own
+            {} if args.config is None else config_fields(args.config, {"policy": None}),  # each cell has its own
         )
         write_json(out / _GIVEN, known)
         for note in plan.notes:

@@ -9,11 +9,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from drgs.commands.overrides import parsed_size
+from drgs.commands.values import parsed_size
 from drgs.display.progress import Bar
 
 if TYPE_CHECKING:
-    from drgs.commands.making_options import Scene
+    from drgs.commands.options import Scene
 
 __all__ = ["maker_of", "run"]
 

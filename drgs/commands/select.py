@@ -38,12 +38,11 @@ def run(args: Select) -> None:
     settings = args.settings()  # refuses what cannot be, before anything is read
     refine = _refine(args)
     check_file(args.output, "select", [args.scene, args.train or "", args.candidates])
-    wanted = args.scoring()  # before files are read, too
     policy_named(args.policy)
-    criterion_named(args.criterion, "--criterion")
+    criterion_named(args.scoring.criterion, "--criterion")
     given = SceneInput.of(args)
     settings = given.over_background(settings)
-    scoring = dataclasses.replace(wanted.over(given.estimated), settings=settings, semantics=given.semantics())
+    scoring = dataclasses.replace(args.scoring.over(given.estimated), settings=settings, semantics=given.semantics())
     known = known_views(args.train, args, given, given.keeps_lenses(args.undistort))
     candidates, source = other_views("--candidates", args.candidates, args, given, known, fresh=True)
     candidates = timed(candidates, args, given)
@@ -76,8 +75,8 @@ def run(args: Select) -> None:
         "scene": str(args.scene),
         "gaussians": len(given.gaussians),
         "policy": args.policy,
-        "criterion": args.criterion if args.policy == "fisher" else None,
-        "method": args.method,
+        "criterion": args.scoring.criterion if args.policy == "fisher" else None,
+        "method": args.scoring.method,
         "prior": scoring.prior_of(args.policy).to_json(),
         **selection.blocks_json(),
         **(scoring.nuisances.if_any() if args.policy == "fisher" else {}),

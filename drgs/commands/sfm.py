@@ -9,7 +9,7 @@ from drgs.data.sfm import run_sfm
 from drgs.display.progress import Bar
 
 if TYPE_CHECKING:
-    from drgs.commands.making_options import Sfm
+    from drgs.commands.options import Sfm
 
 __all__ = ["run"]
 

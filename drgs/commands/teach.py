@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from drgs import data
-from drgs.commands.overrides import parsed_size
+from drgs.commands.values import parsed_size
 from drgs.data.class_names import CLASS_FILES, read_class_names
 from drgs.data.sidecars import LABEL_FOLDERS, TEACHER_FOLDERS
 from drgs.display.progress import Bar
@@ -31,7 +31,7 @@ from drgs.io.json_files import read_json
 from drgs.io.outputs import LockedFolder, atomic_write, lock_folder, write_json
 
 if TYPE_CHECKING:
-    from drgs.commands.making_options import Teach
+    from drgs.commands.options import Teach
     from drgs.data import View
 
 __all__ = ["run"]

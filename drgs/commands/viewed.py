@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.commands.fisher import asked_blocks
-from drgs.commands.orbit_keys import UP
 from drgs.commands.orbits import Wish, capture_orbit, scene_orbit
 from drgs.commands.painters import PAINTINGS, painters
+from drgs.commands.values import UP
 from drgs.commands.viewpoints import Known, Source, known_views
 from drgs.data import View as DataView
 from drgs.data.capture import Focus, upright
@@ -181,7 +181,7 @@ def _uncertainty(args: View, given: SceneInput, known: Known | None) -> Uncertai
     if not cameras:
         return None
     blocks = asked_blocks(args, given, given.settings("fast"), cameras)
-    prior = args.given_prior() or MAP_PRIOR
+    prior = args.scoring.prior or MAP_PRIOR
     return Uncertainty(
         cameras,
         lambda camera: together(blocks.information(camera)),

@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Literal
 from drgs import data
 from drgs.codecs.folders import cameras_of_model
 from drgs.commands.nerfstudio_frame import DATAPARSER_TRANSFORMS
-from drgs.commands.orbit_keys import UP
 from drgs.commands.orbits import Wish, capture_orbit, dome, scene_orbit
+from drgs.commands.values import UP
 from drgs.data.camera_lists import is_camera_list, load_cameras_json
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import load_dataset
@@ -36,8 +36,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from drgs.cameras import Camera
-    from drgs.commands.option_groups import Views
-    from drgs.commands.options import Crossval, Fisher, Query, Render, Select, Tradeoff
+    from drgs.commands.options import Crossval, Fisher, Query, Render, Select, Tradeoff, Views
     from drgs.commands.scene_input import SceneInput
     from drgs.data import Dataset, View
     from drgs.ellipsoids import Gaussians

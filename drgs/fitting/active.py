@@ -26,7 +26,7 @@ from drgs.data.camera_lists import described
 from drgs.data.guided import Matches
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
-from drgs.fitting.config import recorded_config
+from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import Frame, frames_for
 from drgs.fitting.timetable import Timetable
 from drgs.io.journal import SCHEMA
@@ -391,7 +391,7 @@ class ActiveViews:
             ValueError: If the checkpoint chose by another rule, or from other views.
         """
         old = header["active"]
-        selection = recorded_config(header["config"], old.get("config")).selection
+        selection = FitConfig.from_json(header["config"]).selection
         assert selection is not None
         new = self._resolved(self.active.flat())
         was = self._resolved(selection.flat())

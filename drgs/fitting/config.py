@@ -1,24 +1,17 @@
-"""What a fit does, as frozen records by subject; imports nothing heavy, for the options of the command line are theirs.
+"""What a fit does, as frozen records by subject; imports nothing heavy, for the command line reads its options here.
 
-What `Attributes` say of a field is what `drgs fit --help-all` says of its option; what takes longer to say stands above
-them.
+A field is an option of `drgs fit`: its text and its range are stated beside its default, and nowhere else. What takes
+longer to say stands in the docstring of its record.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
-import warnings
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from drgs.fitting.motion_config import Dynamics, FieldPreset, LivesUse, MotionConfig
-from drgs.fitting.ranges import COUNT, FADING, FRACTION, OPACITY, RATE, WEIGHT
 from drgs.fitting.renderers import AUTO, check_renderers, named_renderers, planar_of
-from drgs.guards.arguments import check_fields
-from drgs.guards.records import Record, first_difference, ways_of
-from drgs.information.choices import POLICIES, check_named
-from drgs.information.prior import Prior
+from drgs.guards.records import Record, first_difference, one_of, option, part
+from drgs.information.choices import POLICIES, POLICY_NAMES, check_named
 from drgs.information.scoring import Scoring
 from drgs.settings import RenderSettings
 
@@ -26,7 +19,6 @@ if TYPE_CHECKING:
     from drgs.information.semantics import SemanticMetric
 
 __all__ = [
-    "ActiveConfig",
     "DataConfig",
     "Degree",
     "DensityConfig",
@@ -54,7 +46,6 @@ __all__ = [
     "Start",
     "TransientUse",
     "UndistortUse",
-    "recorded_config",
 ]
 
 InitPoints = Literal["auto", "views", "all"]
@@ -72,6 +63,18 @@ TransientUse = Literal["auto", "mask", "keep"]
 Degree = Literal[0, 1, 2, 3]
 SemanticUse = Literal["auto", "ignore"]
 FeatureSize = Literal["image", "teacher"]
+Dynamics = Literal["auto", "ignore"]
+FieldPreset = Literal["neu3d", "dnerf"]
+LivesUse = Literal["auto", "off"]
+
+# Ranges of numbers, both ends included.
+COUNT = (1, 10**9)
+SEED = (0, 2**31 - 1)  # what COLMAP takes
+FRACTION = (0.0, 1.0)
+RATE = (0.0, 1e6)
+FADING = (1e-30, 1e6)  # of rates whose logarithms are interpolated
+WEIGHT = (0.0, 1e6)
+OPACITY = (1e-6, 1 - 1e-6)  # its logit is finite in float32
 
 _FAST = RenderSettings.preset("fast")
 
@@ -83,50 +86,79 @@ class DataConfig(Record):
     An active fit reads nothing of a view before it is picked, so that its initial points are of the initial views
     unless `init_points` is `all`. A split that the data set's own files state wins over `test_every` and `test_offset`,
     and `test_cameras` wins over both.
-
-    Attributes:
-        max_pixels: Images are reduced to at most this many pixels.
-        num_downscales: Start with images of half the width and height, this many times halved; full size is reached in
-            the first half of the steps, and no side is below 11 pixels.
-        init_points: Initial points: of the training views (views) or of the data set (all); auto: all, or views if
-            --views active.
-        test_every: Hold out every n-th view, by name; 0 holds out none.
-        test_offset: Index of the first held-out view, below --test-every; a split in the data set's files overrides
-            both.
-        test_cameras: Synchronous cameras to hold out at all times, e.g. cam00,cam07; none: hold out by --test-every.
-        times: Number of frames of each synchronous camera, evenly spaced in its video, the first and the last included.
-        mask: Outside of masks the scene is empty (object), or unknown (valid); auto: object if all photographs have a
-            mask file, valid if only some have one, and for empty corners of undistorted photographs; ignore: no masks.
-            With object, and as with masks with auto, transparent pixels of an alpha channel are empty, too.
-        undistort: Undistort photographs (on), or fit them as they were taken (off), with renderers along rays (--for
-            drgs, exact, fast or 3dgut); auto: off for these renderers if undistorting would crop more than a fifth of
-            the picture.
-        exposure: Multiply the rendering of each photograph by gains of R, G and B: none (off), estimated from points
-            that several show (points), then optimized (learned); auto: points, if gains clearly differ and lower the
-            error of held-out photographs in short fits.
-        poses: Keep the cameras of training photographs (fixed), or optimize them (refined); auto: refined if
-            reprojection errors of a COLMAP model are large.
-        skybox: Place a tenth of the Gaussians far around the scene, for the sky and the far background: if photographs
-            clearly agree on it (auto; not in active fits and dynamic scenes), always (on), or never (off).
     """
 
-    max_pixels: int = 130_000
-    num_downscales: int = 0
-    init_points: InitPoints = "auto"
-    test_every: int = 8
-    test_offset: int = 0
-    test_cameras: tuple[str, ...] | None = None
-    times: int = 40
-    mask: MaskUse = "auto"
-    undistort: UndistortUse = "auto"
-    exposure: ExposureUse = "off"
-    poses: PoseUse = "fixed"
-    skybox: SkyboxUse = "auto"
+    max_pixels: int = option(130_000, "Images are reduced to at most this many pixels.", within=COUNT)
+    num_downscales: int = option(
+        0,
+        "Start with images of half the width and height, this many times halved; full size is reached in the "
+        "first half of the steps, and no side is below 11 pixels.",
+        within=(0, 16),
+        rare=True,
+    )
+    init_points: InitPoints = option(
+        "auto",
+        "Initial points: of the training views (views) or of the data set (all); auto: all, or views if --views "
+        "active.",
+        rare=True,
+    )
+    test_every: int = option(8, "Hold out every n-th view, by name; 0 holds out none.", within=(0, 10**9))
+    test_offset: int = option(
+        0,
+        "Index of the first held-out view, below --test-every; a split in the data set's files overrides both.",
+        within=(0, 10**9),
+        rare=True,
+    )
+    test_cameras: tuple[str, ...] | None = option(
+        None,
+        "Synchronous cameras to hold out at all times, e.g. cam00,cam07; none: hold out by --test-every.",
+        rare=True,
+        commas=True,
+        none="none",
+        metavar="CAMERA,CAMERA|none",
+    )
+    times: int = option(
+        40,
+        "Number of frames of each synchronous camera, evenly spaced in its video, the first and the last included.",
+        within=(1, 10**6),
+    )
+    mask: MaskUse = option(
+        "auto",
+        "Outside of masks the scene is empty (object), or unknown (valid); auto: object if all photographs have a"
+        " mask file, valid if only some have one, and for empty corners of undistorted photographs; ignore: no "
+        "masks. With object, and as with masks with auto, transparent pixels of an alpha channel are empty, too.",
+    )
+    undistort: UndistortUse = option(
+        "auto",
+        "Undistort photographs (on), or fit them as they were taken (off), with renderers along rays (--for drgs,"
+        " exact, fast or 3dgut); auto: off for these renderers if undistorting would crop more than a fifth of "
+        "the picture.",
+        rare=True,
+    )
+    exposure: ExposureUse = option(
+        "off",
+        "Multiply the rendering of each photograph by gains of R, G and B: none (off), estimated from points that"
+        " several show (points), then optimized (learned); auto: points, if gains clearly differ and lower the "
+        "error of held-out photographs in short fits.",
+        rare=True,
+    )
+    poses: PoseUse = option(
+        "fixed",
+        "Keep the cameras of training photographs (fixed), or optimize them (refined); auto: refined if "
+        "reprojection errors of a COLMAP model are large.",
+        rare=True,
+    )
+    skybox: SkyboxUse = option(
+        "auto",
+        "Place a tenth of the Gaussians far around the scene, for the sky and the far background: if photographs "
+        "clearly agree on it (auto; not in active fits and dynamic scenes), always (on), or never (off).",
+        rare=True,
+    )
     where: ClassVar[str] = "fit"
+    heading: ClassVar[str] = "Data"
 
     def __post_init__(self) -> None:
-        low = {"test_every": (0, 10**9), "test_offset": (0, 10**9)}
-        check_fields("fit", self, {"max_pixels": COUNT, "num_downscales": (0, 16), "times": (1, 10**6), **low})
+        self.check()
         if self.test_every == 1:
             raise ValueError("fit: test_every must be 0 (hold out none) or >= 2, got 1")
         if self.test_offset >= max(self.test_every, 1):
@@ -145,46 +177,61 @@ class DensityConfig(Record):
     `office`). The exploration noise is off: in 1,500 steps on `banana` it cost 0.4 dB of held-out PSNR (28.0 against
     28.4); MCMC has 5e5, for 30,000 steps.
 
-    Attributes:
-        max_gaussians: Largest number of Gaussians, at the start and later.
-        initial_opacity: Opacity of every Gaussian at the start.
-        dense_opacity: Opacity at the start of Gaussians at points of depth maps.
-        dense_scale: Factor of the scales of Gaussians at points of depth maps.
-        refine_start: Fraction of the steps at which density control begins.
-        refine_stop: Fraction of the steps at which density control ends.
-        refine_every: Fraction of the steps between two steps of density control.
-        min_opacity: A Gaussian below this opacity is moved elsewhere.
-        grow_until: Fraction of the steps at which --max-gaussians is reached, at a constant rate of growth.
-        noise: Strength of the exploration noise of MCMC; 0 is none, 5e5 is that of the paper.
-        jitter: Displacement of copied Gaussians, in their own standard deviations.
     Reference:
         [1] Kheradmand et al., "3D Gaussian Splatting as Markov Chain Monte Carlo", NeurIPS 2024.
     """
 
-    max_gaussians: int = 30_000
-    initial_opacity: float = 0.1
-    dense_opacity: float = 0.3
-    dense_scale: float = 0.5
-    refine_start: float = 1 / 30
-    refine_stop: float = 0.8
-    refine_every: float = 1 / 30
-    min_opacity: float = 0.005
-    grow_until: float = 0.5
-    noise: float = 0.0
-    jitter: float = 0.1
+    max_gaussians: int = option(30_000, "Largest number of Gaussians, at the start and later.", within=COUNT)
+    initial_opacity: float = option(0.1, "Opacity of every Gaussian at the start.", within=OPACITY, rare=True)
+    dense_opacity: float = option(
+        0.3,
+        "Opacity at the start of Gaussians at points of depth maps.",
+        within=OPACITY,
+        rare=True,
+    )
+    dense_scale: float = option(
+        0.5,
+        "Factor of the scales of Gaussians at points of depth maps.",
+        within=(1e-6, 1e6),
+        rare=True,
+    )
+    refine_start: float = option(
+        1 / 30,
+        "Fraction of the steps at which density control begins.",
+        within=FRACTION,
+        rare=True,
+    )
+    refine_stop: float = option(0.8, "Fraction of the steps at which density control ends.", within=FRACTION, rare=True)
+    refine_every: float = option(
+        1 / 30,
+        "Fraction of the steps between two steps of density control.",
+        within=FRACTION,
+        rare=True,
+    )
+    min_opacity: float = option(0.005, "A Gaussian below this opacity is moved elsewhere.", within=FRACTION, rare=True)
+    grow_until: float = option(
+        0.5,
+        "Fraction of the steps at which --max-gaussians is reached, at a constant rate of growth.",
+        within=FRACTION,
+        rare=True,
+    )
+    noise: float = option(
+        0.0,
+        "Strength of the exploration noise of MCMC; 0 is none, 5e5 is that of the paper.",
+        within=WEIGHT,
+        rare=True,
+    )
+    jitter: float = option(
+        0.1,
+        "Displacement of copied Gaussians, in their own standard deviations.",
+        within=(0.0, 1e3),
+        rare=True,
+    )
     where: ClassVar[str] = "fit"
+    heading: ClassVar[str] = "Quality"
 
     def __post_init__(self) -> None:
-        shares = ("refine_start", "refine_stop", "refine_every", "min_opacity", "grow_until")
-        ranges = {
-            "max_gaussians": COUNT,
-            "initial_opacity": OPACITY,
-            "dense_opacity": OPACITY,
-            "dense_scale": (1e-6, 1e6),
-            "noise": WEIGHT,
-            "jitter": (0.0, 1e3),
-        }
-        check_fields("fit", self, ranges | dict.fromkeys(shares, FRACTION))
+        self.check()
 
     def start_of(self, dense: bool) -> tuple[float, float]:
         """Opacity, and factor of the scales, of new Gaussians; `dense` for points from depth maps."""
@@ -197,55 +244,66 @@ class RateConfig(Record):
 
     Those of means, scales and SH are four times those of 3DGS, which are for 30,000 steps: in fits of some hundred or
     thousand steps they gain up to 3 dB (docs/real-data.md, "Rates for short fits").
-
-    Attributes:
-        means_rate: First and last learning rate of the means, in units of the scene's extent, log-linear between.
-        dc_rate: Learning rate of the base color, SH of degree 0.
-        rest_rate: Learning rate of the SH of higher degrees.
-        opacity_rate: Learning rate of the logits of the opacities.
-        scale_rate: Learning rate of the logarithms of the scales.
-        rotation_rate: Learning rate of the quaternions.
-        sh_every: Fraction of the steps between two degrees of SH.
     """
 
-    means_rate: tuple[float, float] = (6.4e-4, 6.4e-6)
-    dc_rate: float = 2.5e-3
-    rest_rate: float = 5e-4
-    opacity_rate: float = 0.05
-    scale_rate: float = 2e-2
-    rotation_rate: float = 1e-3
-    sh_every: float = 1 / 30
+    means_rate: tuple[float, float] = option(
+        (6.4e-4, 6.4e-6),
+        "First and last learning rate of the means, in units of the scene's extent, log-linear between.",
+        within=FADING,
+        rare=True,
+    )
+    dc_rate: float = option(2.5e-3, "Learning rate of the base color, SH of degree 0.", within=RATE, rare=True)
+    rest_rate: float = option(5e-4, "Learning rate of the SH of higher degrees.", within=RATE, rare=True)
+    opacity_rate: float = option(0.05, "Learning rate of the logits of the opacities.", within=RATE, rare=True)
+    scale_rate: float = option(2e-2, "Learning rate of the logarithms of the scales.", within=RATE, rare=True)
+    rotation_rate: float = option(1e-3, "Learning rate of the quaternions.", within=RATE, rare=True)
+    sh_every: float = option(1 / 30, "Fraction of the steps between two degrees of SH.", within=FRACTION, rare=True)
     where: ClassVar[str] = "fit"
+    heading: ClassVar[str] = "Quality"
 
     def __post_init__(self) -> None:
-        single = ("dc_rate", "rest_rate", "opacity_rate", "scale_rate", "rotation_rate")
-        check_fields("fit", self, {"means_rate": FADING, "sh_every": FRACTION, **dict.fromkeys(single, RATE)})
+        self.check()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LossConfig(Record):
-    """Weights of the terms of the loss that every fit has; the photographs' L1 distance has what SSIM leaves of 1.
+    """Weights of the terms of the loss that every fit has; the photographs' L1 distance has what SSIM leaves of 1."""
 
-    Attributes:
-        ssim_weight: Weight of 1 - SSIM in the loss, in [0, 1]; the rest is that of the L1 distance.
-        outside_weight: Weight of the opacity outside of object masks, and where the alpha channel of a photograph is
-            transparent.
-        opacity_weight: Weight of the mean opacity, which lets Gaussians of no use fade (MCMC).
-        scale_weight: Weight of the mean scale, which keeps Gaussians small (MCMC).
-        transients: Leave shadows and passers-by, which single photographs have, out of the loss: never (keep), if
-            residuals clearly reveal some (auto), or at all suspicious pixels (mask).
-    """
-
-    ssim_weight: float = 0.2
-    outside_weight: float = 1.0
-    opacity_weight: float = 0.01
-    scale_weight: float = 0.01
-    transients: TransientUse = "keep"
+    ssim_weight: float = option(
+        0.2,
+        "Weight of 1 - SSIM in the loss, in [0, 1]; the rest is that of the L1 distance.",
+        within=FRACTION,
+        rare=True,
+    )
+    outside_weight: float = option(
+        1.0,
+        "Weight of the opacity outside of object masks, and where the alpha channel of a photograph is transparent.",
+        within=WEIGHT,
+        rare=True,
+    )
+    opacity_weight: float = option(
+        0.01,
+        "Weight of the mean opacity, which lets Gaussians of no use fade (MCMC).",
+        within=WEIGHT,
+        rare=True,
+    )
+    scale_weight: float = option(
+        0.01,
+        "Weight of the mean scale, which keeps Gaussians small (MCMC).",
+        within=WEIGHT,
+        rare=True,
+    )
+    transients: TransientUse = option(
+        "keep",
+        "Leave shadows and passers-by, which single photographs have, out of the loss: never (keep), if residuals"
+        " clearly reveal some (auto), or at all suspicious pixels (mask).",
+        rare=True,
+    )
     where: ClassVar[str] = "fit"
+    heading: ClassVar[str] = "Quality"
 
     def __post_init__(self) -> None:
-        weights = ("outside_weight", "opacity_weight", "scale_weight")
-        check_fields("fit", self, {"ssim_weight": FRACTION, **dict.fromkeys(weights, WEIGHT)})
+        self.check()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -254,50 +312,168 @@ class FeatureConfig(Record):
 
     In [1] features are rendered at the size of the image, and the feature image reaches the features alone.
 
-    Attributes:
-        semantics: Fit semantic features and a decoder if the data set has a teacher's feature maps (auto), or never
-            (ignore).
-        feature_width: Feature channels of a Gaussian; a linear decoder maps them to those of the teacher.
-        feature_weight: Weight of the distance to the teacher's feature maps in the loss; that of the photographs is 1.
-        feature_rate: Learning rate of the features; five times as much for fits of about 1,000 steps
-            (docs/semantic.md).
-        decoder_rate: Learning rate of the decoder, usually a tenth of that of the features.
-        couple_features: Let gradients of the features change the geometry, too, not only those of colors.
-        feature_resolution: Render features at the size of the image and reduce them, or, faster, at the size of the
-            teacher's map.
     Reference:
         [1] Zhou et al., "Feature 3DGS", CVPR 2024, and its code.
     """
 
-    semantics: SemanticUse = "auto"
-    feature_width: int = 128
-    feature_weight: float = 1.0
-    feature_rate: float = 1e-3
-    decoder_rate: float = 1e-4
-    couple_features: bool = False
-    feature_resolution: FeatureSize = "image"
+    semantics: SemanticUse = option(
+        "auto",
+        "Fit semantic features and a decoder if the data set has a teacher's feature maps (auto), or never (ignore).",
+    )
+    feature_width: int = option(
+        128,
+        "Feature channels of a Gaussian; a linear decoder maps them to those of the teacher.",
+        within=(1, 4096),
+        rare=True,
+    )
+    feature_weight: float = option(
+        1.0,
+        "Weight of the distance to the teacher's feature maps in the loss; that of the photographs is 1.",
+        within=WEIGHT,
+        rare=True,
+    )
+    feature_rate: float = option(
+        1e-3,
+        "Learning rate of the features; five times as much for fits of about 1,000 steps (docs/semantic.md).",
+        within=RATE,
+        rare=True,
+    )
+    decoder_rate: float = option(
+        1e-4,
+        "Learning rate of the decoder, usually a tenth of that of the features.",
+        within=RATE,
+        rare=True,
+    )
+    couple_features: bool = option(
+        False,
+        "Let gradients of the features change the geometry, too, not only those of colors.",
+        rare=True,
+    )
+    feature_resolution: FeatureSize = option(
+        "image",
+        "Render features at the size of the image and reduce them, or, faster, at the size of the teacher's map.",
+        rare=True,
+    )
     where: ClassVar[str] = "fit"
+    heading: ClassVar[str] = "Features"
 
     def __post_init__(self) -> None:
-        rates = {"feature_rate": RATE, "decoder_rate": RATE}
-        check_fields("fit", self, {"feature_width": (1, 4096), "feature_weight": WEIGHT, **rates})
+        self.check()
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MotionConfig(Record):
+    """Gaussians that a deformation field moves [1], where the training views are of two times or more.
+
+    The static stage fits Gaussians that stand still to the first time of all training cameras (to all times, where
+    fewer than 3 photographs show the first). The dynamic stage goes on with them, and with their moments in the
+    optimizer, and adds the field. Rates and SH follow one schedule over both; those of the field begin with the dynamic
+    stage. Density control goes through its schedule in each stage: the static one up to half of `max_gaussians`, the
+    dynamic one up to all, so that there are some left for what appears later.
+
+    The field's rates are ten times those of [1], which are for 14,000 steps: in some hundred or thousand, motion must
+    be found before what is in the wrong place has become transparent. A gate is a logit a Gaussian; what no photograph
+    shows to move comes to a rest by their weight, and is not deformed.
+
+    Something that goes further between photographs than it is large, or that appears, is born where photographs of its
+    time show it: Gaussians with a center and a width in time and a velocity of their own, so that no photograph of
+    another time fades them (`drgs.fitting.lives`).
+
+    Reference:
+        [1] Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", CVPR 2024, and its code.
+    """
+
+    dynamics: Dynamics = option(
+        "auto",
+        "Fit a deformation field if the views have several times (auto), or static Gaussians to all times (ignore).",
+    )
+    static_share: float = option(
+        3 / 17,
+        "Fraction of the steps that fit static Gaussians to the first time, before the deformation field is "
+        "added; 0: none.",
+        within=FRACTION,
+        rare=True,
+    )
+    field_preset: FieldPreset = option(
+        "neu3d",
+        "Size of the deformation field: for videos of several cameras (neu3d), or one camera around an object (dnerf).",
+        rare=True,
+    )
+    grid_rate: tuple[float, float] = option(
+        (1.6e-2, 1.6e-3),
+        "First and last learning rate of the field's planes.",
+        within=FADING,
+        rare=True,
+    )
+    field_rate: tuple[float, float] = option(
+        (1.6e-3, 1.6e-4),
+        "First and last learning rate of the field's MLP.",
+        within=FADING,
+        rare=True,
+    )
+    motion_rate: float = option(
+        120.0,
+        "Learning rate of the gates (for each Gaussian a logit of whether it moves), times the steps of the "
+        "dynamic stage.",
+        within=RATE,
+        rare=True,
+    )
+    motion_weight: float = option(
+        0.03,
+        "Weight of the mean gate in the loss: the larger, the fewer Gaussians move.",
+        within=WEIGHT,
+        rare=True,
+    )
+    smooth_weight: float = option(1e-3, "Weight of the smoothness of the field along time.", within=WEIGHT, rare=True)
+    plane_weight: float = option(
+        2e-4,
+        "Weight of the smoothness of the field's spatial planes (xy, xz, yz).",
+        within=WEIGHT,
+        rare=True,
+    )
+    l1_time_weight: float = option(
+        1e-4,
+        "Weight of the L1 distance of the field's temporal planes from 1, where they have no effect.",
+        within=WEIGHT,
+        rare=True,
+    )
+    lives: LivesUse = option(
+        "auto",
+        "Add Gaussians with a limited lifetime where photographs of one time differ from the static Gaussians "
+        "(auto), or none (off).",
+        rare=True,
+    )
+    life_weight: float = option(
+        0.1,
+        "Weight of the mean ratio of the time between photographs to a Gaussian's lifetime, where it is below 1: "
+        "the larger, the longer they live.",
+        within=WEIGHT,
+        rare=True,
+    )
+    where: ClassVar[str] = "fit"
+    heading: ClassVar[str] = "Motion"
+
+    def __post_init__(self) -> None:
+        self.check()
+        if self.static_share == 1:
+            raise ValueError("fit: static_share must be below 1, got 1; --dynamics ignore fits no motion at all")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SavingConfig(Record):
-    """When checkpoints are written. It changes nothing of what is fitted: a fit may go on with another one.
+    """When checkpoints are written. It changes nothing of what is fitted: a fit may go on with another one."""
 
-    Attributes:
-        save_every: Steps between checkpoints.
-        save_minutes: Minutes between checkpoints, if --save-every takes longer.
-    """
-
-    save_every: int = 1000
-    save_minutes: float = 10.0
+    save_every: int = option(1000, "Steps between checkpoints.", within=COUNT, rare=True)
+    save_minutes: float = option(
+        10.0,
+        "Minutes between checkpoints, if --save-every takes longer.",
+        within=(1e-3, 1e9),
+        rare=True,
+    )
     where: ClassVar[str] = "fit"
 
     def __post_init__(self) -> None:
-        check_fields("fit", self, {"save_every": COUNT, "save_minutes": (1e-3, 1e9)})
+        self.check()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -318,45 +494,76 @@ class SelectionConfig(Record):
     schedules, networks and photographs go on. `auto`: until 1,000 were triangulated at a start; `always`, as FisherRF's
     code; `never`, as arXiv 2512.22771. Not where `pick_points` brings none, with points of depth maps, and where next
     to none can be triangulated.
-
-    Attributes:
-        policy: How views are picked: a policy's name, or package.module:function of your own (docs/extending.md).
-        scoring: What counts, and how; its settings and the metric of its features are the fit's.
-        schedule: Pick view by view (views), one camera at each later time (times), or any camera at any time (pairs);
-            auto: times for dynamic scenes, else views.
-        initial: Number of initial views: the one of --start, then those farthest away; default 2, or all cameras at the
-            first time.
-        start: First of the initial views: the first training view by name, or a random one by the seed.
-        add: Number of views to pick during the fit; the others are not read; default 10, or one for every time after
-            the first.
-        every: Steps before the first pick, and between picks; default 200, with --schedule times or pairs 200 of
-            17,000.
-        info_pixels: Compute information on views of at most this many pixels; default that of the fit.
-        pick_points: Points that a picked view adds: triangulated, and where no Gaussian is yet (uncovered), or none;
-            auto: none with --init-points all.
-        restart: Restart the Gaussians after a pick, at points of all views so far: until these are 1,000 (auto),
-            always, or never.
-        measure: Numbers of training views at which held-out views are measured, too, just before the next pick.
     """
 
-    policy: str = "fisher"
-    scoring: Scoring = dataclasses.field(default_factory=Scoring)
-    schedule: Schedule = "auto"
-    initial: int = 2
-    start: Start = "first"
-    add: int | None = None
-    every: int | None = None
-    info_pixels: int | None = None
-    pick_points: PickPoints = "auto"
-    restart: Restart = "auto"
-    measure: tuple[int, ...] = ()
+    policy: str = option(
+        "fisher",
+        "How views are picked: a policy's name, or package.module:function of your own (docs/extending.md).",
+        metavar=one_of(POLICY_NAMES),
+    )
+    scoring: Scoring = part(Scoring(), rare=True)
+    schedule: Schedule = option(
+        "auto",
+        "Pick view by view (views), one camera at each later time (times), or any camera at any time (pairs); "
+        "auto: times for dynamic scenes, else views.",
+        rare=True,
+    )
+    initial: int = option(
+        2,
+        "Number of initial views: the one of --start, then those farthest away; default 2, or all cameras at the "
+        "first time.",
+        within=COUNT,
+        rare=True,
+    )
+    start: Start = option(
+        "first",
+        "First of the initial views: the first training view by name, or a random one by the seed.",
+        rare=True,
+    )
+    add: int | None = option(
+        None,
+        "Number of views to pick during the fit; the others are not read; default 10, or one for every time after"
+        " the first.",
+        within=COUNT,
+    )
+    every: int | None = option(
+        None,
+        "Steps before the first pick, and between picks; default 200, with --schedule times or pairs 200 of 17,000.",
+        within=COUNT,
+        rare=True,
+    )
+    info_pixels: int | None = option(
+        None,
+        "Compute information on views of at most this many pixels; default that of the fit.",
+        within=COUNT,
+        rare=True,
+    )
+    pick_points: PickPoints = option(
+        "auto",
+        "Points that a picked view adds: triangulated, and where no Gaussian is yet (uncovered), or none; auto: "
+        "none with --init-points all.",
+        rare=True,
+    )
+    restart: Restart = option(
+        "auto",
+        "Restart the Gaussians after a pick, at points of all views so far: until these are 1,000 (auto), always,"
+        " or never.",
+        rare=True,
+    )
+    measure: tuple[int, ...] = option(
+        (),
+        "Numbers of training views at which held-out views are measured, too, just before the next pick.",
+        within=COUNT,
+        rare=True,
+    )
     where: ClassVar[str] = "active"
+    heading: ClassVar[str] = "Views"
 
     def __post_init__(self) -> None:
         check_named("active", POLICIES, self.policy)
         if self.add == 0:
             raise ValueError("active: add must be >= 1, got 0; without --views active all views are used")
-        check_fields("active", self, dict.fromkeys(("initial", "add", "every", "info_pixels", "measure"), COUNT))
+        self.check()
         if self.scoring.settings != Scoring.settings or self.scoring.semantics is not None:
             raise ValueError("active: scoring must leave settings and semantics to the fit, got others; drop them")
 
@@ -373,42 +580,11 @@ class SelectionConfig(Record):
         return record | scoring | {"prior": prior["value"], "relative_prior": prior["relative"]}
 
 
-def recorded_config(fit: Any, active: Mapping[str, Any] | None = None) -> FitConfig:
-    """The config of a run's files.
-
-    Args:
-        fit: What `to_json` made, or all fields beside each other, as older versions wrote them.
-        active: Those of the selection, which older versions wrote elsewhere. The first did not begin again after a
-            pick, and had no field that says so. Nor had they one for renderers, all steps had the same settings, nor
-            for lives, all Gaussians were always there.
-    Raises:
-        ValueError: If a field is unknown or out of range.
-    """
-    config = FitConfig.from_json(fit)
-    if "lives" not in fit.get("motion", fit):
-        config = config.replace(motion=dataclasses.replace(config.motion, lives="off"))
-    if "renderers" not in fit:
-        config = config.replace(renderers=(config.settings.nearest_preset()[0],))
-    return config.replace(selection=selection_of_flat({"restart": "never", **active})) if active else config
-
-
-def selection_of_flat(fields: Mapping[str, Any]) -> SelectionConfig:
-    """The record of fields as `drgs.fitting.config.ActiveConfig` had them: lambda as a number and a flag.
-
-    Raises:
-        ValueError: If a field is unknown or out of range.
-    """
-    known: dict[str, Any] = {name: tuple(x) if isinstance(x, list) else x for name, x in fields.items()}
-    relative = known.pop("relative_prior", False)
-    prior = known.pop("prior", None)
-    return SelectionConfig.of(**known, prior=Prior.given(prior, relative))
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FitConfig(Record):
     """Everything that determines a fit besides its data. Fractions are of `max_steps`.
 
-    `FitConfig.of(max_steps=500, max_gaussians=5000)` takes any field of any part by its name, as `replace` does.
+    `FitConfig().replace(max_steps=500, max_gaussians=5000)` takes any field of any of its records by its name.
 
     `deterministic`: an image that is drawn again without gradients differs from the one that was fitted by 1e-7, the
     rounding of its sums (presets `fast`, `inria` and `gsplat`; those of `exact` and `mitsuba` have the same bits).
@@ -418,48 +594,49 @@ class FitConfig(Record):
     well; their background is that of all. A single renderer is drawn with `settings`, whatever fields they replace.
     `auto` is `any`, and with other settings than those of preset `fast` these alone.
 
-    Attributes:
-        settings: What `drgs.render` computes.
-        renderers: Renderers that the result must look right in, used in turn: any (exact, fast, inria, gsplat, 3dgut),
-            drgs (exact, fast), viewers (gsplat, inria), or presets; auto: any, or --preset alone if it is given.
-        filter_3d: Limit Gaussians to the sampling rate of the photographs (on), for renderings larger than those of the
-            fit: the 3D smoothing filter of Mip-Splatting.
-        max_steps: Optimizer steps.
-        seed: Random seed.
-        sh_degree: Highest degree of the view-dependent color.
-        deterministic: Use one Dr.Jit thread, which is slower: the same seed gives the same bits. (Images rendered again
-            without gradients differ by 1e-7: docs/numerics.md.)
-        data: Photographs, split and initial points.
-        density: Numbers of Gaussians, and density control.
-        rates: Learning rates.
-        loss: Weights of the terms of the loss.
-        features: A fit to a teacher's maps.
-        motion: A fit to what moves.
-        saving: Checkpoints.
-        selection: How views are chosen on the way; None: the fit is to all of them.
     Raises:
         ValueError: If a field has another type or is out of its range.
     """
 
     settings: RenderSettings = _FAST
-    renderers: tuple[str, ...] = AUTO
-    filter_3d: Filter3DUse = "off"
-    max_steps: int = 3000
-    seed: int = 0
-    sh_degree: Degree = 3
-    deterministic: bool = False
-    data: DataConfig = dataclasses.field(default_factory=DataConfig)
-    density: DensityConfig = dataclasses.field(default_factory=DensityConfig)
-    rates: RateConfig = dataclasses.field(default_factory=RateConfig)
-    loss: LossConfig = dataclasses.field(default_factory=LossConfig)
-    features: FeatureConfig = dataclasses.field(default_factory=FeatureConfig)
-    motion: MotionConfig = dataclasses.field(default_factory=MotionConfig)
-    saving: SavingConfig = dataclasses.field(default_factory=SavingConfig)
-    selection: SelectionConfig | None = None
+    renderers: tuple[str, ...] = option(
+        AUTO,
+        "Renderers that the result must look right in, used in turn: any (exact, fast, inria, gsplat, 3dgut), "
+        "drgs (exact, fast), viewers (gsplat, inria), or presets; auto: any, or --preset alone if it is given.",
+        heading="Rendering",
+        flag="for",
+        commas=True,
+        metavar="any|drgs|viewers|PRESET,PRESET",
+    )
+    filter_3d: Filter3DUse = option(
+        "off",
+        "Limit Gaussians to the sampling rate of the photographs (on), for renderings larger than those of the "
+        "fit: the 3D smoothing filter of Mip-Splatting.",
+        rare=True,
+        heading="Quality",
+    )
+    max_steps: int = option(3000, "Optimizer steps.", within=COUNT)
+    seed: int = option(0, "Random seed.", within=SEED)
+    sh_degree: Degree = option(3, "Highest degree of the view-dependent color.", heading="Quality")
+    deterministic: bool = option(
+        False,
+        "Use one Dr.Jit thread, which is slower: the same seed gives the same bits. (Images rendered again "
+        "without gradients differ by 1e-7: docs/numerics.md.)",
+        rare=True,
+        heading="Machine",
+    )
+    data: DataConfig = part(DataConfig())
+    density: DensityConfig = part(DensityConfig())
+    rates: RateConfig = part(RateConfig())
+    loss: LossConfig = part(LossConfig())
+    features: FeatureConfig = part(FeatureConfig())
+    motion: MotionConfig = part(MotionConfig())
+    saving: SavingConfig = part(SavingConfig())
+    selection: SelectionConfig | None = part(None)
     where: ClassVar[str] = "fit"
 
     def __post_init__(self) -> None:
-        check_fields("fit", self, {"max_steps": COUNT, "seed": (0, 2**31 - 1)})  # a seed is what COLMAP takes
+        self.check()
         check_renderers(self.renderers, self.settings)
         if self.data.undistort == "off":
             _check_lenses(self)
@@ -496,50 +673,3 @@ def _check_lenses(config: FitConfig) -> None:
         raise ValueError(f"fit: undistort off must have poses fixed, got {poses}; drop --poses, or use --undistort on")
     if config.selection:
         raise ValueError("fit: undistort off must have --views all, got active; use it, or --undistort on")
-
-
-# ------------------------------------------------------- as it was written before the records, for one release
-
-
-def _with_flat_fields(kind: type[FitConfig]) -> None:
-    """Let `FitConfig(max_gaussians=5)` and `config.max_gaussians` go on, with a warning that says how it is written."""
-    made = kind.__init__
-
-    @functools.wraps(made)
-    def begin(self: FitConfig, **fields: Any) -> None:
-        own = {field.name for field in dataclasses.fields(kind)}
-        if flat := [name for name in fields if name not in own]:
-            base = kind(**{name: x for name, x in fields.items() if name in own})
-            whole = base.replace(**{name: fields[name] for name in flat})
-            _warn(f"FitConfig({flat[0]}=...) is written FitConfig.of({flat[0]}=...)")
-            fields = {name: getattr(whole, name) for name in own}
-        made(self, **fields)
-
-    kind.__init__ = begin  # type: ignore[method-assign]
-
-
-def _read_flat(self: Record, name: str) -> Any:
-    """A field of a part, read of the whole."""
-    kind: Any = type(self)
-    way = ways_of(kind).get(name, ())
-    value: Any = self
-    if len(way) < 2:
-        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-    for step in way:
-        value = getattr(value, step)
-    _warn(f"{type(self).__name__}.{name} is written {type(self).__name__}.{'.'.join(way)}")
-    return value
-
-
-def _warn(text: str) -> None:
-    warnings.warn(f"{text}; the old way ends with the next release", DeprecationWarning, stacklevel=3)
-
-
-_with_flat_fields(FitConfig)
-FitConfig.__getattr__ = SelectionConfig.__getattr__ = _read_flat  # type: ignore[attr-defined]
-
-
-def ActiveConfig(**fields: Any) -> SelectionConfig:
-    """A `SelectionConfig`, of fields as they stood beside each other; the name ends with the next release."""
-    _warn("ActiveConfig(...) is written drgs.train.SelectionConfig.of(...), and lambda as prior=Prior(...)")
-    return selection_of_flat(fields)

@@ -21,7 +21,7 @@ from drgs.data import scene_extent
 from drgs.data.guesses import points_along_rays, subset
 from drgs.data.resizing import resize_area
 from drgs.ellipsoids import Gaussians
-from drgs.fitting.config import FitConfig, recorded_config
+from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import Frame
 from drgs.fitting.records import check_checkpoint
 from drgs.fitting.rows import GaussianRows
@@ -141,7 +141,7 @@ class OnlineFit:
                 raise ValueError(f"{where}: rng.{name} must be a hexadecimal number of 128 bits, is none; {advice}")
         if header["config"].get("selection") is not None:
             raise ValueError(f"{where}: config must have no selection, got one; {advice}")
-        found = cls(recorded_config(header["config"]))
+        found = cls(FitConfig.from_json(header["config"]))
         found._rng.bit_generator.state = {
             "bit_generator": "PCG64",
             "state": {name: int(header["rng"][name], 16) for name in ("state", "inc")},
@@ -160,7 +160,7 @@ class OnlineFit:
             return found
         own = {name.removeprefix("fit."): x for name, x in tensors.items() if name.startswith("fit.")}
         check_checkpoint(where, own, header["fit"])
-        config = recorded_config(header["fit"]["config"])  # whose steps may be more by now
+        config = FitConfig.from_json(header["fit"]["config"])  # whose steps may be more by now
         if config.selection is not None:
             raise ValueError(f"{where}: config must have no selection, got one; {advice}")
         found.trainer = Trainer.from_state(config, frames, own, header["fit"], str(where))

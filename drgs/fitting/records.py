@@ -19,7 +19,7 @@ import torch
 
 from drgs.codecs.ply import load_ply
 from drgs.data.camera_lists import load_cameras_json
-from drgs.fitting.config import FitConfig, recorded_config
+from drgs.fitting.config import FitConfig
 from drgs.fitting.filter_3d import VARIANCES, filtered
 from drgs.fitting.networks import saved_networks
 from drgs.fitting.poses import CAMERAS
@@ -325,10 +325,8 @@ def fit_record(run: Run) -> FitRecord:
     advice = "restore the file, or fit again in another folder"
     optional = {name: kind for name, kind in _OPTIONAL.items() if name in config}
     check_json(where, config, _CONFIG | optional, advice)
-    active = config.get("active")  # of versions that wrote it there
-    check_json(where, {"active": active}, {"active": (None, dict)}, advice)
     try:
-        fit = recorded_config(config["fit"], active)
+        fit = FitConfig.from_json(config["fit"])
     except (ValueError, NotImplementedError) as error:
         raise ValueError(f"{where}: {error}; {advice}") from None
     estimated = tuple(config.get("estimated", ()))
@@ -410,10 +408,8 @@ def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict)
     kind |= {"transients": bool} if "transients" in header else {}
     kind |= {"skybox": int} if "skybox" in header else {}
     check_json(str(path), header, kind, advice)
-    active = (header.get("active") or {}).get("config")  # of versions that wrote it there
-    check_json(str(path), {"active": active}, {"active": (None, dict)}, advice)
     try:
-        recorded_config(header["config"], active)
+        FitConfig.from_json(header["config"])
     except (ValueError, NotImplementedError) as error:
         raise ValueError(f"{path}: {error}; {advice}") from None
     least = {"step": 0, "bad_steps": 0, "start_count": 1, "seconds": 0}

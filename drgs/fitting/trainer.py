@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from drgs.ellipsoids import Gaussians
-from drgs.fitting.config import FitConfig, recorded_config
+from drgs.fitting.config import FitConfig
 from drgs.fitting.density import add_gaussians, explore, relocate
 from drgs.fitting.exposure import Exposure
 from drgs.fitting.filter_3d import VARIANCES
@@ -349,7 +349,7 @@ class Trainer:
             ValueError: If the checkpoint belongs to another config, other views or other networks.
         """
         # What an older drgs did not know, it did as the defaults say.
-        before = recorded_config(header["config"])
+        before = FitConfig.from_json(header["config"])
         if config.renderers == AUTO and config.settings == before.settings:
             config = config.replace(renderers=before.renderers)  # `auto` goes on with what the fit began with
         if other := config.difference(before):

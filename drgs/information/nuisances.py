@@ -8,7 +8,7 @@ import typing
 from collections.abc import Sequence
 from typing import ClassVar, Literal
 
-from drgs.guards.records import Record
+from drgs.guards.records import Record, option
 
 __all__ = ["NO_NUISANCES", "NUISANCES", "Nuisance", "Nuisances"]
 
@@ -27,20 +27,32 @@ class Nuisances(Record):
     A view that shows only its own exposure has no information about the scene. `drgs.information.elimination` has the
     equations.
 
-    Attributes:
-        eliminate: Unknowns of each view to marginalize in its information: exposure (three log gains), pose; none;
-            default those that the fit estimated.
-        exposure_std: Prior standard deviation of a log gain of a view; default unknown.
-        pose_std: Prior standard deviations of a camera's rotation about its center (radians) and of its center (world
-            units); default unknown.
     Raises:
         ValueError: If a name is unknown, or a standard deviation is out of range.
     """
 
-    eliminate: tuple[Nuisance, ...] | None = None
-    exposure_std: float | None = None
-    pose_std: tuple[float, float] | None = None
+    eliminate: tuple[Nuisance, ...] | None = option(
+        None,
+        "Unknowns of each view to marginalize in its information: exposure (three log gains), pose; none; default"
+        " those that the fit estimated.",
+        rare=True,
+        commas=True,
+        none="none",
+        metavar="UNKNOWN,UNKNOWN|none",
+    )
+    exposure_std: float | None = option(
+        None,
+        "Prior standard deviation of a log gain of a view; default unknown.",
+        rare=True,
+    )
+    pose_std: tuple[float, float] | None = option(
+        None,
+        "Prior standard deviations of a camera's rotation about its center (radians) and of its center (world "
+        "units); default unknown.",
+        rare=True,
+    )
     where: ClassVar[str] = "nuisances"
+    heading: ClassVar[str] = "Views"
 
     def __post_init__(self) -> None:
         if self.eliminate is not None:

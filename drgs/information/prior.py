@@ -6,7 +6,9 @@ import dataclasses
 import math
 import numbers
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
+
+from drgs.guards.records import option
 
 if TYPE_CHECKING:
     import torch
@@ -21,17 +23,30 @@ class Prior:
     A relative one makes `eig` and `logdet` independent of the unit of a group. A group that no view sees has no median:
     its lambda is 0.
 
-    Attributes:
-        value: lambda of every group, >= 0. With 0, parameters that no training view sees are left out of every score.
-        relative: lambda is its value (--prior) times the median of the nonzero information of a parameter's group.
-        groups: Group -> lambda in place of `value`.
     Raises:
         ValueError: If a lambda is negative, infinite or NaN.
     """
 
-    value: float = 1e-6
-    relative: bool = False
-    groups: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    value: float = option(
+        1e-6,
+        "Prior information about every parameter (lambda): 1e-2 with v_opt, 1 in drgs fisher, else 1e-6. With 0, "
+        "parameters that no training view sees are left out of every score.",
+        flag="prior",
+        shown="",
+    )
+    relative: bool = option(
+        False,
+        "lambda is its value (--prior) times the median of the nonzero information of a parameter's group.",
+        rare=True,
+        flag="relative_prior",
+    )
+    groups: Mapping[str, float] = option(
+        {},
+        "Group -> lambda in place of `value`.",
+        name="prior_groups",
+        file_only=True,
+    )
+    heading: ClassVar[str] = "Views"
 
     def __post_init__(self) -> None:
         for name, value in (("value", self.value), *self.groups.items()):
@@ -39,13 +54,6 @@ class Prior:
                 raise ValueError(f"Prior: lambda ({name}) must be in [0, inf), got {value!r}; try 1e-6")
         if not isinstance(self.value, (int, float)):  # NumPy's, which no file holds
             object.__setattr__(self, "value", float(self.value))
-
-    @classmethod
-    def given(cls, value: float | None, relative: bool) -> Prior | None:
-        """As options name it; None where they leave it to the criterion."""
-        if value is None:
-            return cls(relative=True) if relative else None
-        return cls(value, relative)
 
     def to_json(self) -> dict:
         """As files hold it."""

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 from drgs.guards.arguments import kind_of, must_be
-from drgs.guards.records import TRANSIENT, Record
+from drgs.guards.records import TRANSIENT, Record, one_of, option, part
 from drgs.information.choices import (
     BLOCK_NAMES,
     BLOCKS,
@@ -61,41 +61,61 @@ class Scoring(Record):
     Criterion, method, groups and blocks are of policy `fisher`, method and groups not of `block_logdet`; weights are of
     `fisher` and `fisherrf`. Groups of a scene's network need method `columns` or `probes`.
 
-    Attributes:
-        criterion: Score of policy fisher, or package.module:function of your own; v_opt chooses best from six views on
-            (docs/active-static.md).
-        settings: What `drgs.render` computes of a view.
-        method: How information is computed: exactly (columns: slower), by random probes, or as FisherRF's code does.
-        prior: Prior information about every parameter (lambda): 1e-2 with v_opt, 1 in drgs fisher, else 1e-6.
-        weights: Group -> factor of its part of the score; 1 where none is given.
-        groups: Groups of the parameters that count, as `drgs.fisher.diagonal` takes them; None: all that there are.
-        blocks: Outputs of a view that count: geometry (colors), semantic (features), deformation (motion), backdrop
-            (where no Gaussian is).
-        semantics: Metric of the block semantic; None: that of features as they are stored, all channels alike.
-        network: Score of block deformation: relative to the information of the training views (ratio), or without it
-            (trace, paper).
-        combine: Add the scores of several blocks (sum), or their z-scores over the candidates (zscore); default sum,
-            with --network trace or paper zscore.
-        probes: Number of random probes of each view, for block deformation and for --method probes.
-        nuisances: Unknowns of each view that are eliminated from its information; of policy fisher.
     Raises:
         ValueError: If a criterion, method or block is unknown, blocks cannot be combined so, or something else is of
             the wrong kind.
     """
 
-    criterion: str = CRITERION_NAMES[0]
+    criterion: str = option(
+        CRITERION_NAMES[0],
+        "Score of policy fisher, or package.module:function of your own; v_opt chooses best from six views on "
+        "(docs/active-static.md).",
+        metavar=one_of(CRITERION_NAMES),
+    )
     settings: RenderSettings = dataclasses.field(default=_EXACT, metadata=TRANSIENT)
-    method: Method = METHODS[0]
-    prior: Prior | None = None
-    weights: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    groups: tuple[str, ...] | None = None
-    blocks: tuple[Block, ...] | None = None
+    method: Method = option(
+        METHODS[0],
+        "How information is computed: exactly (columns: slower), by random probes, or as FisherRF's code does.",
+    )
+    prior: Prior | None = part(None)
+    weights: Mapping[str, float] = option(
+        {},
+        "Group -> factor of its part of the score; 1 where none is given.",
+        file_only=True,
+    )
+    groups: tuple[str, ...] | None = option(
+        None,
+        "Groups of the parameters that count, as `drgs.fisher.diagonal` takes them; None: all that there are.",
+        file_only=True,
+    )
+    blocks: tuple[Block, ...] | None = option(
+        None,
+        "Outputs of a view that count: geometry (colors), semantic (features), deformation (motion), backdrop "
+        "(where no Gaussian is).",
+        commas=True,
+        metavar="BLOCK,BLOCK",
+    )
     semantics: SemanticMetric | None = dataclasses.field(default=None, metadata=TRANSIENT)
-    network: NetworkScore = NETWORK_SCORES[0]
-    combine: Combine | None = None
-    probes: int = 16
-    nuisances: Nuisances = dataclasses.field(default_factory=Nuisances)
+    network: NetworkScore = option(
+        NETWORK_SCORES[0],
+        "Score of block deformation: relative to the information of the training views (ratio), or without it "
+        "(trace, paper).",
+        rare=True,
+    )
+    combine: Combine | None = option(
+        None,
+        "Add the scores of several blocks (sum), or their z-scores over the candidates (zscore); default sum, "
+        "with --network trace or paper zscore.",
+        rare=True,
+    )
+    probes: int = option(
+        16,
+        "Number of random probes of each view, for block deformation and for --method probes.",
+        rare=True,
+    )
+    nuisances: Nuisances = part(Nuisances())
     where: ClassVar[str] = "select"
+    heading: ClassVar[str] = "Views"
 
     def __post_init__(self) -> None:
         check_named("select", CRITERIA, self.criterion)

@@ -67,7 +67,6 @@ _PACKAGES = (
     "numpy",
     "pycolmap",
     "opencv-contrib-python-headless",
-    "tyro",
     "rich",
     "plyfile",
     "safetensors",
