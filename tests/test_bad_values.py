@@ -89,7 +89,7 @@ def test_every_field_of_a_fit_is_checked(field, value):
         ("render SCENE --set background=0,0,-1", "--set background must be R, G and B in [0, 1], got 0 0 -1"),
         ("render SCENE --set near=inf", "near must be a finite number in [0, 1e+30], got inf"),
         ("render SCENE --set extent=nan", "extent must be a finite number"),
-        ("fit DATA -o RUN --seed 99999999999999999999", "--seed must be in [0, 2147483647]"),
+        ("fit DATA -o RUN --seed 99999999999999999999", "seed must be a whole number in [0, 2147483647]"),
         ("select SCENE --candidates orbit --seed -1", "--seed must be in [0, 2147483647], got -1"),
     ],
 )

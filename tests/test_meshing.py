@@ -338,7 +338,7 @@ def test_the_command(made, capsys):
         (("-o", "mesh.ply", "--voxel", "0.008", "--max-voxels", "320000"), "mesh: the lattice must have at most"),
         (("-o", "mesh.ply", "--min-views", "13"), "lower --min-views"),
         (("-o", "mesh.ply", "--crop", "1e-9"), "set --crop 0"),
-        (("-o", "mesh.ply", "--limit", "0"), "--limit must be at least 1"),
+        (("-o", "mesh.ply", "--limit", "0"), "--limit must be in [1, 1000000000], got 0"),
         (("-o", "mesh.ply", "--trunc", "-1"), "trunc"),
     ],
 )

@@ -94,7 +94,7 @@ def test_how_many_frames(scene, flight, tmp_path, capsys):
     ("words", "expected"),
     [
         ("--path {flight} --frames 3 --duration 2", "--duration must be alone, --frames and --fps say how long"),
-        ("--path {flight} --duration 0", "--duration must be in (0, 86400] seconds, got 0"),
+        ("--path {flight} --duration 0", "--duration must be in [0.001, 86400], got 0"),
         ("--path {flight} --duration 86400 --fps 240", "there must be at most 100000 frames, got 20736001"),
         ("--path {flight} --orbit up=z", "--path must be alone, --orbit names other cameras"),
         ("--path {flight} --split test", "--path must be alone, --split is of the views of a data set"),

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from drgs import runtime
+from drgs.commands.orbits import Wish
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewpoints import check_counts, seen_views
+from drgs.commands.viewpoints import seen_views
 from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.io.journal import SCHEMA
@@ -25,7 +26,7 @@ __all__ = ["run"]
 
 def run(args: Crossval) -> int:
     """`drgs crossval SCENE`: 1 if a gradient is wrong, or, with --strict, if anything is not as the preset has it."""
-    check_counts(args)
+    Wish.of(args)  # refuses what cannot be, before anything is read
     inputs = [args.scene, args.cameras or "", args.rasterizer]
     if args.export is None:
         lock_folder(args.output, "crossval", ["report.html", "crossval.json"], inputs)

@@ -25,8 +25,9 @@ import torch
 
 from drgs import fisher
 from drgs.commands.compared_maps import ComparedMaps
+from drgs.commands.orbits import Wish
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewpoints import check_counts, check_lenses, evenly, known_views, other_views, timed
+from drgs.commands.viewpoints import check_lenses, evenly, known_views, other_views, timed
 from drgs.data.camera_lists import described
 from drgs.display import pictures, tables
 from drgs.display.progress import Bar
@@ -52,8 +53,8 @@ KINDS = ("variance", "share")  # of maps
 
 def run(args: Fisher) -> None:
     """`drgs fisher SCENE`."""
-    check_counts(args)
-    settings = args.settings()  # refuses what cannot be, before anything is read
+    Wish.of(args)  # refuses what cannot be, before anything is read, as settings do
+    settings = args.settings()
     prior = args.scoring.prior or MAP_PRIOR
     inputs = [args.scene, args.train or "", args.cameras or ""]
     output = lock_folder(args.output, "fisher", ["information.safetensors", "fisher.json"], inputs)

@@ -57,8 +57,6 @@ def check_flight_options(args: Render) -> None:
         raise ValueError(
             "render: --duration must be alone, --frames and --fps say how long a film is; drop one of both"
         )
-    if args.duration is not None and not 0 < args.duration <= 86400:
-        raise ValueError(f"render: --duration must be in (0, 86400] seconds, got {args.duration:g}; correct it")
     if args.path is not None:
         for option, value in (("--cameras", args.cameras), ("--view", args.view), ("--orbit", args.orbit)):
             if value:

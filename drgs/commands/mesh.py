@@ -33,9 +33,6 @@ def run(args: Mesh) -> None:
         raise ValueError(
             f"{args.output}: -o must be a {', '.join(MESH_SUFFIXES)}, got {suffix or 'no suffix'}; rename it"
         )
-    for option, value in (("--limit", args.limit), ("--info-pixels", args.info_pixels)):
-        if value is not None and value < 1:
-            raise ValueError(f"{option} must be at least 1, got {value}; correct it")
     if importlib.util.find_spec("skimage") is None:
         raise ValueError("marching cubes need the package scikit-image, which is missing; pip install 'drgs[mesh]'")
     with lock_folder(args.output.parent, "mesh", [args.output.name], [args.scene, args.cameras or ""]):

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Literal
 
 from drgs.cluster.options import check_options
 from drgs.commands.values import ORBIT_KEYS, check_color, parsed
-from drgs.fitting.config import SEED, FitConfig, SelectionConfig, UndistortUse
+from drgs.fitting.config import COUNT, SEED, FitConfig, SelectionConfig, UndistortUse
 from drgs.fitting.renderers import AUTO, own_preset
 from drgs.guards.records import check_ranges, option, options_in, part, same_option
 from drgs.information.scoring import Scoring
@@ -25,6 +25,7 @@ from drgs.studies.protocols import ExperimentName, ProtocolName, StudyScale
 
 __all__ = [
     "COMMANDS",
+    "SIDE",
     "Around",
     "Capture",
     "Cite",
@@ -63,6 +64,9 @@ __all__ = [
 
 Split = Literal["all", "train", "test"]
 
+SIDE = (1, 16_384)  # pixels; a mistyped size shall not ask for terabytes
+VIEWS = (1, 10_000)  # that are looked at one after the other
+
 
 def _scene() -> Any:
     """What a command looks at."""
@@ -82,8 +86,7 @@ class Common:
     heading: ClassVar[str] = "Machine"
 
     variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb"] = option(
-        "auto",
-        "Backend; auto follows DRGS_VARIANT, then CUDA if it works, else LLVM.",
+        "auto", "Backend; auto follows DRGS_VARIANT, then CUDA if it works, else LLVM."
     )
     threads: int | None = option(None, "Threads of Dr.Jit and torch; default DRGS_THREADS, else every usable core.")
     quiet: bool = option(False, "Print only warnings and errors; results are in the files.")
@@ -215,8 +218,8 @@ class Seen(Settings, Around, Views):
         heading="Views",
     )
     split: Split = option("all", "Which views of a data set to take.", heading="Views", rare=True)
-    limit: int = option(2, "At most this many views, evenly spaced.", heading="Views")
-    max_pixels: int = option(20000, "Views are reduced to at most this many pixels.")
+    limit: int = option(2, "At most this many views, evenly spaced.", heading="Views", within=VIEWS)
+    max_pixels: int = option(20000, "Views are reduced to at most this many pixels.", within=COUNT)
     seed: int = option(0, "Random seed.", within=SEED, rare=True)
 
 
@@ -239,16 +242,11 @@ class Comparing(Informed, Around, Views, Lenses):
         heading="Views",
     )
     split: Split = option(
-        "all",
-        "Which views of the data set of --candidates or --cameras to take.",
-        heading="Views",
-        rare=True,
+        "all", "Which views of the data set of --candidates or --cameras to take.", heading="Views", rare=True
     )
-    count: int = option(40, "Number of cameras of an orbit or a dome.", heading="Views")
+    count: int = option(40, "Number of cameras of an orbit or a dome.", heading="Views", within=VIEWS)
     time: float | None = option(
-        None,
-        "Dynamic scenes: the time of cameras that have none, such as those of an orbit.",
-        heading="Views",
+        None, "Dynamic scenes: the time of cameras that have none, such as those of an orbit.", heading="Views"
     )
     orbit_keys: ClassVar[tuple[str, ...]] = tuple(key for key in ORBIT_KEYS if key != "fov")
 
@@ -321,8 +319,11 @@ class Render(Settings, Around, Views, Moments, Lenses):
         None,
         "Image width in pixels; default that of the camera; 640 for an orbit or a flight, 2048 for a panorama.",
         heading="Rendering",
+        within=SIDE,
     )
-    height: int | None = option(None, "Image height in pixels; default that of the camera.", heading="Rendering")
+    height: int | None = option(
+        None, "Image height in pixels; default that of the camera.", heading="Rendering", within=SIDE
+    )
     path: Path | None = option(
         None,
         "Camera path: a flight.json saved by drgs view, or a camera_path.json of Nerfstudio's viewer (docs/view.md).",
@@ -337,27 +338,29 @@ class Render(Settings, Around, Views, Moments, Lenses):
         None,
         "Number of images of an orbit, a flight or a range of --time; default 60, for a flight by its seconds.",
         heading="Views",
+        within=(1, 100_000),
     )
     duration: float | None = option(
         None,
         "Seconds of the video of an orbit, a flight or a range of --time, instead of --frames.",
         rare=True,
+        within=(1e-3, 86_400),
     )
     format: str | None = option(
-        None,
-        "List of png, jpg, exr, webm, mp4 and ply (all Gaussians at each time), by commas; default png, or by -o.",
+        None, "List of png, jpg, exr, webm, mp4 and ply (all Gaussians at each time), by commas; default png, or by -o."
     )
     fps: float | None = option(
         None,
         "Frames a second of the video; default 24, for a flight the rate in its file.",
         rare=True,
+        within=(1e-3, 240),
     )
     depth: bool = option(False, "Write color-mapped depth too; exr files hold it anyway.")
     features: bool = option(False, "Write images of the semantic features too, three principal components as colors.")
     labels: bool = option(False, "Write images of the classes too, for a run that was fitted with classes.")
     overlay: bool = option(False, "Write images of the classes over the colors too.", rare=True)
     split: Split = option("all", "Which views of a data set to take.", heading="Views", rare=True)
-    limit: int | None = option(None, "At most this many views.", heading="Views")
+    limit: int | None = option(None, "At most this many views.", heading="Views", within=COUNT)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -365,8 +368,7 @@ class View(Informed, Around, Views):
     """Look at a run or a file of Gaussians in the browser, also during a fit."""
 
     scene: Path = option(
-        help="A run folder, a 3DGS point_cloud.ply, or Gaussians in another format (docs/files.md).",
-        positional=True,
+        help="A run folder, a 3DGS point_cloud.ply, or Gaussians in another format (docs/files.md).", positional=True
     )
     train: str | None = option(
         None,
@@ -381,15 +383,16 @@ class View(Informed, Around, Views):
     scoring: Scoring = part(
         Scoring(blocks=("geometry", "backdrop")), only=("method", "blocks", "prior", "probes", "nuisances")
     )
-    max_pixels: int = option(500000, "Images rendered by drgs have at most this many pixels, also in a larger window.")
+    max_pixels: int = option(
+        500000, "Images rendered by drgs have at most this many pixels, also in a larger window.", within=(100, 1 << 24)
+    )
     host: str = option(
         "127.0.0.1",
         "Address to listen at; 0.0.0.0: all addresses of this machine, for other machines, which then need a token.",
     )
-    port: int = option(8080, "Port to listen at; 0: any free port.")
+    port: int = option(8080, "Port to listen at; 0: any free port.", within=(0, 65_535))
     token: str | None = option(
-        None,
-        "Token that browsers must send; default none on this machine, else a random one, which is printed.",
+        None, "Token that browsers must send; default none on this machine, else a random one, which is printed."
     )
     open: bool = option(False, "Open the page in a browser.")
     orbit_keys: ClassVar[tuple[str, ...]] = tuple(key for key in ORBIT_KEYS if key != "fov")
@@ -416,9 +419,7 @@ class Fit(Clustered, Data):
         heading="Views",
     )
     report: bool = option(
-        True,
-        "Write report.html into the run folder at the end, unless --no-report is given.",
-        rare=True,
+        True, "Write report.html into the run folder at the end, unless --no-report is given.", rare=True
     )
     fit: FitConfig = part(FitConfig())
     preset: Preset | None = option(
@@ -512,9 +513,7 @@ class Share(Common):
 
     scene: Path = _scene()
     output: Path | None = option(
-        None,
-        "Output HTML file; default scene.html in the run folder, for a file its name with .html.",
-        short="o",
+        None, "Output HTML file; default scene.html in the run folder, for a file its name with .html.", short="o"
     )
     selection: Path | None = option(
         None,
@@ -522,10 +521,11 @@ class Share(Common):
         heading="Views",
     )
     uncertainty: bool = option(
-        True,
-        "Add a layer of the uncertainty that the photographs leave, unless --no-uncertainty is given.",
+        True, "Add a layer of the uncertainty that the photographs leave, unless --no-uncertainty is given."
     )
-    moments: int = option(12, "Dynamic scenes: number of times to store; the page interpolates linearly between them.")
+    moments: int = option(
+        12, "Dynamic scenes: number of times to store; the page interpolates linearly between them.", within=(2, 200)
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -574,15 +574,12 @@ class Fisher(Comparing):
         heading="Views",
     )
     output: Path = option(
-        Path("out/fisher"),
-        "Folder for information.safetensors, fisher.json and the maps.",
-        short="o",
+        Path("out/fisher"), "Folder for information.safetensors, fisher.json and the maps.", short="o"
     )
-    limit: int = option(4, "At most this many views for maps, evenly spaced.", heading="Views")
+    limit: int = option(4, "At most this many views for maps, evenly spaced.", heading="Views", within=VIEWS)
     pose: bool = option(False, "Also report the information of each of these views about its own pose, a 6x6 matrix.")
     maps: bool = option(
-        False,
-        "Also write an image of each view side by side with its maps of moments, of fisherrf and of every block.",
+        False, "Also write an image of each view side by side with its maps of moments, of fisherrf and of every block."
     )
 
 
@@ -592,29 +589,19 @@ class Query(Settings, Around, Views, Lenses):
 
     scene: Path = option(help="A run that was fitted with semantics, or a 3DGS PLY with features.", positional=True)
     classes: tuple[str, ...] = option(
-        (),
-        "Name of a class of the run; may be repeated.",
-        repeat=True,
-        metavar="NAME",
-        flag="class",
+        (), "Name of a class of the run; may be repeated.", repeat=True, metavar="NAME", flag="class"
     )
     text_embedding: Path | None = option(
-        None,
-        "Embeddings of texts by the teacher's text encoder: .npy or .pt, of shape (C,) or (K, C).",
+        None, "Embeddings of texts by the teacher's text encoder: .npy or .pt, of shape (C,) or (K, C)."
     )
     threshold: float | None = option(
-        None,
-        "Least score: probability of a class, or cosine of an embedding; default the largest wins.",
+        None, "Least score: probability of a class, or cosine of an embedding; default the largest wins."
     )
     temperature: float | None = option(
-        None,
-        "Temperature of the softmax over cosines; default 0.01, that of CLIP.",
-        rare=True,
+        None, "Temperature of the softmax over cosines; default 0.01, that of CLIP.", rare=True
     )
     decoder: Path | None = option(
-        None,
-        "Decoder for a PLY, a decoder_chkpnt*.pth of Feature 3DGS; a run has its own.",
-        rare=True,
+        None, "Decoder for a PLY, a decoder_chkpnt*.pth of Feature 3DGS; a run has its own.", rare=True
     )
     remove: bool = option(False, "Write all Gaussians except the selected ones.")
     preset: Preset = option("fast", "Preset of render settings.", heading="Rendering")
@@ -624,12 +611,12 @@ class Query(Settings, Around, Views, Lenses):
         heading="Views",
     )
     split: Split = option("all", "Which views of a data set to take.", heading="Views", rare=True)
-    limit: int = option(4, "At most this many views for masks, evenly spaced.", heading="Views")
-    max_pixels: int | None = option(None, "Views are reduced to at most this many pixels; default that of the fit.")
+    limit: int = option(4, "At most this many views for masks, evenly spaced.", heading="Views", within=VIEWS)
+    max_pixels: int | None = option(
+        None, "Views are reduced to at most this many pixels; default that of the fit.", within=COUNT
+    )
     output: Path = option(
-        Path("out/query"),
-        "Folder for masks, images, query.json, and selected.ply or (--remove) rest.ply.",
-        short="o",
+        Path("out/query"), "Folder for masks, images, query.json, and selected.ply or (--remove) rest.ply.", short="o"
     )
 
 
@@ -640,13 +627,11 @@ class Convert(Common):
     scene: Path = _scene()
     out: Path = option(help="Output file; its suffix is the format.", positional=True)
     as_stored: bool = option(
-        False,
-        "Do not turn the axes of an .spz: some programs write the axes of PLY files instead of the format's.",
+        False, "Do not turn the axes of an .spz: some programs write the axes of PLY files instead of the format's."
     )
     time: float | None = option(None, "Dynamic scenes: the time at which Gaussians are written.", heading="Views")
     uncertainty: Path | None = option(
-        None,
-        "information.safetensors of drgs fisher: adds a column of standard deviations for each group to the PLY.",
+        None, "information.safetensors of drgs fisher: adds a column of standard deviations for each group to the PLY."
     )
     prior: float = option(
         1.0,
@@ -654,8 +639,7 @@ class Convert(Common):
         heading="Views",
     )
     labels: bool = option(
-        False,
-        "Add a column with the class of each Gaussian to the PLY, for a run that was fitted with classes.",
+        False, "Add a column with the class of each Gaussian to the PLY, for a run that was fitted with classes."
     )
 
 
@@ -672,10 +656,9 @@ class Mesh(Settings, Views, Lenses):
         heading="Views",
     )
     info_pixels: int | None = option(
-        None,
-        "Views are reduced to at most this many pixels; default that of the fit, or 130000.",
+        None, "Views are reduced to at most this many pixels; default that of the fit, or 130000.", within=COUNT
     )
-    limit: int | None = option(None, "At most this many views, evenly spaced.", heading="Views")
+    limit: int | None = option(None, "At most this many views, evenly spaced.", heading="Views", within=COUNT)
     time: float | None = option(None, "Dynamic scenes: the time of the surface.", heading="Views")
 
 
@@ -684,26 +667,19 @@ class Crossval(Seen):
     """Compare a rasterizer's image and gradients with a reference and name differences, by parameter group."""
 
     rasterizer: str = option(
-        "drgs:ewa",
-        "drgs:ewa or drgs:PRESET, gsplat, package.module:function, or a dump (.npz, .safetensors).",
+        "drgs:ewa", "drgs:ewa or drgs:PRESET, gsplat, package.module:function, or a dump (.npz, .safetensors)."
     )
     preset: Literal["auto", Preset] = option(
-        "auto",
-        "Model that the rasterizer implements; auto: the preset with the nearest image.",
-        heading="Rendering",
+        "auto", "Model that the rasterizer implements; auto: the preset with the nearest image.", heading="Rendering"
     )
     ladder: bool = option(
-        True,
-        "Measure which approximations of that model cause its difference from exact, unless --no-ladder is given.",
+        True, "Measure which approximations of that model cause its difference from exact, unless --no-ladder is given."
     )
     strict: bool = option(
-        False,
-        "Fail also for other conventions, known deviations and missing images of a data set.",
-        heading="Data",
+        False, "Fail also for other conventions, known deviations and missing images of a data set.", heading="Data"
     )
     export: Path | None = option(
-        None,
-        "Only write scene, cameras and cotangents to this .npz, for a rasterizer on another machine.",
+        None, "Only write scene, cameras and cotangents to this .npz, for a rasterizer on another machine."
     )
     output: Path = option(Path("out/crossval"), "Folder for report.html and crossval.json.", short="o")
 
@@ -716,10 +692,11 @@ class Tradeoff(Seen):
         (0.0001, 0.001, 0.01),
         "Error budgets: for each, the fastest setting whose errors are all below it is recommended.",
     )
-    repeats: int = option(5, "Rounds of timing, in each of which all settings are timed in turn.")
+    repeats: int = option(5, "Rounds of timing, in each of which all settings are timed in turn.", within=(1, 1000))
     seconds: float = option(
         300.0,
         "Seconds for timing the best settings on views of full size; with less time the views are smaller.",
+        within=(1, 1e6),
     )
     output: Path = option(Path("out/tradeoff"), "Folder for tradeoff.json, tradeoff.md and the plot.", short="o")
 
@@ -754,21 +731,18 @@ class Capture(Common):
         " channels.",
     )
     resume: bool = option(
-        False,
-        "Continue a command that was stopped, with the same options, and the same files or none.",
+        False, "Continue a command that was stopped, with the same options, and the same files or none."
     )
     add: bool = option(
         False,
         "Add photographs of the same scene to the run and continue the fit (or, if they are many, begin it again).",
     )
     more: bool = option(
-        False,
-        "Print which photographs to take next: where to stand, where to look, and how much they would tell.",
+        False, "Print which photographs to take next: where to stand, where to look, and how much they would tell."
     )
-    k: int = option(5, "Number of photographs that --more suggests.", short="k", heading="Views")
+    k: int = option(5, "Number of photographs that --more suggests.", short="k", heading="Views", within=COUNT)
     length: str | None = option(
-        None,
-        "Measured distance of two photographs, 'IMG_0001 IMG_0004 1.5 m', so that --more prints meters.",
+        None, "Measured distance of two photographs, 'IMG_0001 IMG_0004 1.5 m', so that --more prints meters."
     )
     seed: int = option(0, "Random seed.", within=SEED)
 
@@ -785,8 +759,7 @@ class Sfm(Common):
     output: Path = option(help="Folder for the data set.", short="o")
     frames: int = option(150, "At most this many frames of all videos together.", heading="Views")
     camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"] = option(
-        "SIMPLE_RADIAL",
-        "COLMAP's camera model; photographs of one size and focal length share one camera.",
+        "SIMPLE_RADIAL", "COLMAP's camera model; photographs of one size and focal length share one camera."
     )
     matcher: Literal["auto", "exhaustive", "sequential", "retrieval"] = option(
         "auto",
@@ -814,20 +787,16 @@ class Teach(Common, Timed):
         "downloaded.",
     )
     classes: str | None = option(
-        None,
-        "Class names, with commas between, or a file (.txt, .json); default those of the data set.",
+        None, "Class names, with commas between, or a file (.txt, .json); default those of the data set."
     )
     size: str | None = option(
-        None,
-        "WIDTHxHEIGHT of a feature map; default 80 along the longer side, in the photograph's shape.",
+        None, "WIDTHxHEIGHT of a feature map; default 80 along the longer side, in the photograph's shape."
     )
     scales: str = option(
-        "0.75,1,1.5",
-        "Scales of the photographs to average over; at 1 the short side is twice the model's image size.",
+        "0.75,1,1.5", "Scales of the photographs to average over; at 1 the short side is twice the model's image size."
     )
     flip: bool = option(
-        True,
-        "Average with the mirrored photographs, unless --no-flip is given, which takes half the time.",
+        True, "Average with the mirrored photographs, unless --no-flip is given, which takes half the time."
     )
 
 
@@ -841,13 +810,10 @@ class Scene(Common):
     )
     output: Path = option(help="Folder for the data set; an interrupted command is continued there.", short="o")
     size: str | None = option(
-        None,
-        "WIDTHxHEIGHT of the images in pixels; default 320x240; 240x180 (capture, kitchen), 160x120 (hall).",
+        None, "WIDTHxHEIGHT of the images in pixels; default 320x240; 240x180 (capture, kitchen), 160x120 (hall)."
     )
     views: int | None = option(
-        None,
-        "Number of images; default 75 (room), 32 (still_life) or 28 (capture).",
-        heading="Views",
+        None, "Number of images; default 75 (room), 32 (still_life) or 28 (capture).", heading="Views"
     )
     cameras: int | None = option(
         None,
@@ -859,30 +825,24 @@ class Scene(Common):
         0, "Random seed of shapes, textures, motions, cameras, light paths and simulated errors.", within=SEED
     )
     spp: int | None = option(
-        None,
-        "Samples (light paths) a pixel; default 25 (room), 16 (kitchen, hall), 30 (still_life), 25 (capture).",
+        None, "Samples (light paths) a pixel; default 25 (room), 16 (kitchen, hall), 30 (still_life), 25 (capture)."
     )
     teacher_size: str | None = option(
-        None,
-        "WIDTHxHEIGHT of the teacher's feature maps; default 80x60 (room), 60x45 (kitchen), 40x30 (hall).",
+        None, "WIDTHxHEIGHT of the teacher's feature maps; default 80x60 (room), 60x45 (kitchen), 40x30 (hall)."
     )
     test_every: int | None = option(None, "Hold out every n-th view (room); default 5, which is 15 of 75 views.")
     exposure: Literal["auto", "fixed"] | None = option(
-        None,
-        "Exposure and white balance (capture): automatic and drifting (auto, the default), or the same for all.",
+        None, "Exposure and white balance (capture): automatic and drifting (auto, the default), or the same for all."
     )
     wall: Literal["white", "paper"] | None = option(
-        None,
-        "Wall behind the table (capture): white without texture (default), or papered.",
+        None, "Wall behind the table (capture): white without texture (default), or papered."
     )
     shadow: bool = option(
-        True,
-        "Add the photographer's shadow to some photographs (capture), unless --no-shadow is given.",
+        True, "Add the photographer's shadow to some photographs (capture), unless --no-shadow is given."
     )
     passer_by: bool = option(True, "Add a passer-by to some photographs (capture), unless --no-passer-by is given.")
     pose_error: str | None = option(
-        None,
-        "DEGREES,METERS of simulated errors of training poses (capture); default 0.4,0.006; 0,0 for none.",
+        None, "DEGREES,METERS of simulated errors of training poses (capture); default 0.4,0.006; 0,0 for none."
     )
 
 
@@ -895,14 +855,10 @@ class Reproduce(Clustered):
         positional=True,
     )
     output: Path = option(
-        help="Folder for scenes, runs, rows.jsonl, tables and figures; finished fits there are kept.",
-        short="o",
+        help="Folder for scenes, runs, rows.jsonl, tables and figures; finished fits there are kept.", short="o"
     )
     data: tuple[Path, ...] = option(
-        (),
-        "Data set instead of the synthetic scenes; may be repeated.",
-        repeat=True,
-        metavar="DATA",
+        (), "Data set instead of the synthetic scenes; may be repeated.", repeat=True, metavar="DATA"
     )
     scale: StudyScale = option(
         "small",
@@ -910,8 +866,7 @@ class Reproduce(Clustered):
         heading="Rendering",
     )
     seeds: int = option(
-        3,
-        "Number of sets of initial views of each static scene; dynamic: of kitchens, or of fits of each data set.",
+        3, "Number of sets of initial views of each static scene; dynamic: of kitchens, or of fits of each data set."
     )
     protocol: ProtocolName = option(
         "paper",
@@ -927,13 +882,10 @@ class Reproduce(Clustered):
     test_every: int = option(8, "Hold out every n-th view of --data, by name, unless its files state a split.")
     test_offset: int = option(0, "Index of the first held-out view.")
     lpips_weights: Path | None = option(
-        None,
-        "torchvision's AlexNet or VGG16, to measure LPIPS, too; needs pip install 'drgs[lpips]'.",
-        heading="Data",
+        None, "torchvision's AlexNet or VGG16, to measure LPIPS, too; needs pip install 'drgs[lpips]'.", heading="Data"
     )
     config: Path | None = option(
-        None,
-        "Configuration that replaces that of --scale: a TOML or JSON file, or a run (docs/configuration.md).",
+        None, "Configuration that replaces that of --scale: a TOML or JSON file, or a run (docs/configuration.md)."
     )
     figures: bool = option(True, "Draw the comparison sheet and the maps at the end, unless --no-figures is given.")
 

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from drgs.codecs.ply import save_ply
+from drgs.commands.orbits import Wish
 from drgs.commands.painters import OPAQUE
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewpoints import check_counts, check_lenses, seen_views
+from drgs.commands.viewpoints import check_lenses, seen_views
 from drgs.data.camera_lists import described
 from drgs.data.checks import read_npy
 from drgs.display import pictures
@@ -38,8 +39,8 @@ __all__ = ["read_embeddings", "run"]
 
 def run(args: Query) -> None:
     """`drgs query SCENE`."""
-    check_counts(args)
-    settings = args.settings()  # refuses what cannot be, before anything is read
+    Wish.of(args)  # refuses what cannot be, before anything is read, as settings do
+    settings = args.settings()
     if bool(args.classes) == (args.text_embedding is not None):
         got = "both" if args.classes else "neither"
         raise ValueError(f"one of --class and --text-embedding must be given, got {got}; say what to look for")

@@ -35,7 +35,7 @@ from drgs.commands.moments import at_times, named_view, ply_names, write_plys
 from drgs.commands.orbits import Wish
 from drgs.commands.painters import PAINTINGS, painters
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewpoints import MAX_SIDE, captured_cameras, check_lenses, drawn_views
+from drgs.commands.viewpoints import captured_cameras, check_lenses, drawn_views
 from drgs.data.camera_lists import described, save_cameras_json
 from drgs.data.capture import middle_camera
 from drgs.display import pictures
@@ -71,7 +71,8 @@ def run(args: Render) -> None:
     if alone is not None:
         args = dataclasses.replace(args, output=alone.folder, format=alone.format)
     formats = _formats("png" if args.format is None else args.format)
-    _check_numbers(args)
+    Wish.of(args)
+    check_flight_options(args)
     if args.moving and "ply" not in formats:
         raise ValueError("render: --moving must have ply among --format, which only it means; add it or drop --moving")
     if args.panorama:
@@ -294,22 +295,6 @@ def _formats(text: str) -> tuple[str, ...]:
         got = unknown[0] if unknown else text
         raise ValueError(f"render: --format must be a list of {', '.join(_FORMATS)}, got {got!r}")
     return names
-
-
-def _check_numbers(args: Render) -> None:
-    """Raise ValueError unless the numbers among the options, and those of orbits, are in their ranges."""
-    for option, value, high in (
-        ("--width", args.width, MAX_SIDE),
-        ("--height", args.height, MAX_SIDE),
-        ("--frames", args.frames, 100_000),
-        ("--limit", args.limit, 10**9),
-    ):
-        if value is not None and not 1 <= value <= high:
-            raise ValueError(f"render: {option} must be in [1, {high}], got {value}")
-    if args.fps is not None and not 0 < args.fps <= 240:
-        raise ValueError(f"render: --fps must be in (0, 240], got {args.fps}")
-    Wish.of(args)
-    check_flight_options(args)
 
 
 def _movie_of(video: str, kind: str, end: str) -> str:

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import torch
 
 from drgs.commands.clustered import workers_of
+from drgs.commands.orbits import Wish
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewpoints import check_counts, check_lenses, known_views, other_views, timed
+from drgs.commands.viewpoints import check_lenses, known_views, other_views, timed
 from drgs.data.camera_lists import described
 from drgs.display import tables
 from drgs.display.progress import Bar
@@ -34,8 +35,8 @@ _SHORT = {
 
 def run(args: Select) -> None:
     """`drgs select SCENE --candidates ...`."""
-    check_counts(args)
-    settings = args.settings()  # refuses what cannot be, before anything is read
+    Wish.of(args)  # refuses what cannot be, before anything is read, as settings do
+    settings = args.settings()
     refine = _refine(args)
     check_file(args.output, "select", [args.scene, args.train or "", args.candidates])
     policy_named(args.policy)

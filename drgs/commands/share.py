@@ -30,15 +30,12 @@ if TYPE_CHECKING:
 __all__ = ["is_page", "run", "shared_of"]
 
 _VIEW = 960, 640  # pixels of a view of what has no photographs: its shape is a screen's
-_MOST_MOMENTS = 200  # each is as large as the Gaussians that move
 
 _log = logging.getLogger(__name__)
 
 
 def run(args: Share) -> None:
     """`drgs share SCENE`."""
-    if not 2 <= args.moments <= _MOST_MOMENTS:
-        raise ValueError(f"share: --moments must be in [2, {_MOST_MOMENTS}], got {args.moments}; correct it")
     path = _output(args)
     is_inside = args.output is None and is_run(args.scene)
     with lock_run(Run(args.scene), "share") if is_inside else contextlib.nullcontext() as held:

@@ -29,8 +29,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from drgs import runtime
+from drgs.commands.orbits import Wish
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewpoints import check_counts, seen_views
+from drgs.commands.viewpoints import seen_views
 from drgs.data.camera_lists import described
 from drgs.display import tables
 from drgs.display.progress import Bar
@@ -66,11 +67,7 @@ def run(args: Tradeoff) -> None:
     if not args.max_error or not all(0 < x < math.inf for x in args.max_error):
         got = " ".join(f"{x:g}" for x in args.max_error) or "none"
         raise ValueError(f"--max-error must be finite numbers > 0, got {got}; correct it")
-    if not 1 <= args.seconds <= 1e6:
-        raise ValueError(f"--seconds must be in [1, 1000000], got {args.seconds:g}; correct it")
-    if not 1 <= args.repeats <= 1000:
-        raise ValueError(f"--repeats must be in [1, 1000], got {args.repeats}; correct it")
-    check_counts(args)
+    Wish.of(args)  # refuses what cannot be, before anything is read
     names = ["tradeoff.json", "tradeoff.md", "tradeoff.png"]
     lock_folder(args.output, "tradeoff", names, inputs=[args.scene, args.cameras or ""])
     given = SceneInput.of(args)

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 from drgs.commands.orbits import Wish
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewed import subject_of, watched_files
-from drgs.commands.viewpoints import check_counts
 from drgs.display.progress import Bar, quietly
 from drgs.io import interrupts
 
@@ -25,8 +24,6 @@ __all__ = ["run"]
 
 _EVERY = 2.0  # seconds between two looks at the files
 _LAST = 0.5  # seconds that what is being computed is given to end
-_LEAST = 100  # pixels of our pictures
-_MOST = 1 << 24  # and at most so many
 
 
 def run(args: View) -> None:
@@ -34,10 +31,7 @@ def run(args: View) -> None:
     if importlib.util.find_spec("viser") is None:
         raise ValueError("view: viser must be installed, is not; pip install 'drgs[view]'")
     args.settings()  # refuses what cannot be, before anything is read
-    check_counts(args)
     Wish.of(args)
-    if not _LEAST <= args.max_pixels <= _MOST:
-        raise ValueError(f"view: --max-pixels must be in [{_LEAST}, {_MOST}], got {args.max_pixels}; correct it")
     from drgs.viewing.server import Viewer
 
     # A browser may be closed while something is on its way to it: that is no news.

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Literal
 from drgs import data
 from drgs.codecs.folders import cameras_of_model
 from drgs.commands.nerfstudio_frame import DATAPARSER_TRANSFORMS
+from drgs.commands.options import SIDE
 from drgs.commands.orbits import Wish, capture_orbit, dome, scene_orbit
 from drgs.commands.values import UP
 from drgs.data.camera_lists import is_camera_list, load_cameras_json
@@ -43,11 +44,9 @@ if TYPE_CHECKING:
     from drgs.settings import RenderSettings
 
 __all__ = [
-    "MAX_SIDE",
     "Known",
     "Source",
     "captured_cameras",
-    "check_counts",
     "check_lenses",
     "drawn_views",
     "evenly",
@@ -58,9 +57,7 @@ __all__ = [
     "timed",
 ]
 
-MAX_SIDE = 16384  # pixels; a mistyped size shall not ask for terabytes
 _PIXELS = 130_000  # of a view where there is no fit that says
-_MAX_COUNT = 10_000
 # To find out whether cameras see any of the scene at all, at most so many of each are looked at.
 _LOOKED_AT = 20_000
 _LOOKED_FROM = 50
@@ -258,8 +255,8 @@ def captured_cameras(given: SceneInput) -> list[Camera]:
 def frame_size(width: int | None, height: int | None, shape: float) -> tuple[int, int]:
     """Width and height of an orbit's frames, the missing ones by their shape (height / width)."""
     if width is None:
-        width = 640 if height is None else max(1, min(MAX_SIDE, round(height / shape)))
-    return width, height or max(1, min(MAX_SIDE, round(width * shape)))
+        width = 640 if height is None else max(1, min(SIDE[1], round(height / shape)))
+    return width, height or max(1, min(SIDE[1], round(width * shape)))
 
 
 # ----------------------------------------------------------------- views that are compared with known ones
@@ -460,16 +457,6 @@ def check_lenses(command: str, settings: RenderSettings, cameras: Iterable[Camer
             f"pinhole's image plane, and {bent} cameras have a lens; use --preset exact, fast or 3dgut, or "
             "--undistort on"
         )
-
-
-def check_counts(args: Crossval | Fisher | Query | Select | Tradeoff) -> None:
-    """Raise ValueError unless the options that count views or pixels, and those of orbits, are in their ranges."""
-    for option, high in (("count", _MAX_COUNT), ("limit", _MAX_COUNT), ("max_pixels", 10**9), ("info_pixels", 10**9)):
-        value = getattr(args, option, None)
-        if value is not None and not 1 <= value <= high:
-            name = "--" + option.replace("_", "-")
-            raise ValueError(f"{name} must be in [1, {high}], got {value}; correct it")
-    Wish.of(args)
 
 
 def _say(args: Render | Crossval | Query | Tradeoff, text: str) -> None:

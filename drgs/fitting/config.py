@@ -184,29 +184,17 @@ class DensityConfig(Record):
     max_gaussians: int = option(30_000, "Largest number of Gaussians, at the start and later.", within=COUNT)
     initial_opacity: float = option(0.1, "Opacity of every Gaussian at the start.", within=OPACITY, rare=True)
     dense_opacity: float = option(
-        0.3,
-        "Opacity at the start of Gaussians at points of depth maps.",
-        within=OPACITY,
-        rare=True,
+        0.3, "Opacity at the start of Gaussians at points of depth maps.", within=OPACITY, rare=True
     )
     dense_scale: float = option(
-        0.5,
-        "Factor of the scales of Gaussians at points of depth maps.",
-        within=(1e-6, 1e6),
-        rare=True,
+        0.5, "Factor of the scales of Gaussians at points of depth maps.", within=(1e-6, 1e6), rare=True
     )
     refine_start: float = option(
-        1 / 30,
-        "Fraction of the steps at which density control begins.",
-        within=FRACTION,
-        rare=True,
+        1 / 30, "Fraction of the steps at which density control begins.", within=FRACTION, rare=True
     )
     refine_stop: float = option(0.8, "Fraction of the steps at which density control ends.", within=FRACTION, rare=True)
     refine_every: float = option(
-        1 / 30,
-        "Fraction of the steps between two steps of density control.",
-        within=FRACTION,
-        rare=True,
+        1 / 30, "Fraction of the steps between two steps of density control.", within=FRACTION, rare=True
     )
     min_opacity: float = option(0.005, "A Gaussian below this opacity is moved elsewhere.", within=FRACTION, rare=True)
     grow_until: float = option(
@@ -216,16 +204,10 @@ class DensityConfig(Record):
         rare=True,
     )
     noise: float = option(
-        0.0,
-        "Strength of the exploration noise of MCMC; 0 is none, 5e5 is that of the paper.",
-        within=WEIGHT,
-        rare=True,
+        0.0, "Strength of the exploration noise of MCMC; 0 is none, 5e5 is that of the paper.", within=WEIGHT, rare=True
     )
     jitter: float = option(
-        0.1,
-        "Displacement of copied Gaussians, in their own standard deviations.",
-        within=(0.0, 1e3),
-        rare=True,
+        0.1, "Displacement of copied Gaussians, in their own standard deviations.", within=(0.0, 1e3), rare=True
     )
     where: ClassVar[str] = "fit"
     heading: ClassVar[str] = "Quality"
@@ -282,16 +264,10 @@ class LossConfig(Record):
         rare=True,
     )
     opacity_weight: float = option(
-        0.01,
-        "Weight of the mean opacity, which lets Gaussians of no use fade (MCMC).",
-        within=WEIGHT,
-        rare=True,
+        0.01, "Weight of the mean opacity, which lets Gaussians of no use fade (MCMC).", within=WEIGHT, rare=True
     )
     scale_weight: float = option(
-        0.01,
-        "Weight of the mean scale, which keeps Gaussians small (MCMC).",
-        within=WEIGHT,
-        rare=True,
+        0.01, "Weight of the mean scale, which keeps Gaussians small (MCMC).", within=WEIGHT, rare=True
     )
     transients: TransientUse = option(
         "keep",
@@ -339,15 +315,10 @@ class FeatureConfig(Record):
         rare=True,
     )
     decoder_rate: float = option(
-        1e-4,
-        "Learning rate of the decoder, usually a tenth of that of the features.",
-        within=RATE,
-        rare=True,
+        1e-4, "Learning rate of the decoder, usually a tenth of that of the features.", within=RATE, rare=True
     )
     couple_features: bool = option(
-        False,
-        "Let gradients of the features change the geometry, too, not only those of colors.",
-        rare=True,
+        False, "Let gradients of the features change the geometry, too, not only those of colors.", rare=True
     )
     feature_resolution: FeatureSize = option(
         "image",
@@ -400,16 +371,10 @@ class MotionConfig(Record):
         rare=True,
     )
     grid_rate: tuple[float, float] = option(
-        (1.6e-2, 1.6e-3),
-        "First and last learning rate of the field's planes.",
-        within=FADING,
-        rare=True,
+        (1.6e-2, 1.6e-3), "First and last learning rate of the field's planes.", within=FADING, rare=True
     )
     field_rate: tuple[float, float] = option(
-        (1.6e-3, 1.6e-4),
-        "First and last learning rate of the field's MLP.",
-        within=FADING,
-        rare=True,
+        (1.6e-3, 1.6e-4), "First and last learning rate of the field's MLP.", within=FADING, rare=True
     )
     motion_rate: float = option(
         120.0,
@@ -419,17 +384,11 @@ class MotionConfig(Record):
         rare=True,
     )
     motion_weight: float = option(
-        0.03,
-        "Weight of the mean gate in the loss: the larger, the fewer Gaussians move.",
-        within=WEIGHT,
-        rare=True,
+        0.03, "Weight of the mean gate in the loss: the larger, the fewer Gaussians move.", within=WEIGHT, rare=True
     )
     smooth_weight: float = option(1e-3, "Weight of the smoothness of the field along time.", within=WEIGHT, rare=True)
     plane_weight: float = option(
-        2e-4,
-        "Weight of the smoothness of the field's spatial planes (xy, xz, yz).",
-        within=WEIGHT,
-        rare=True,
+        2e-4, "Weight of the smoothness of the field's spatial planes (xy, xz, yz).", within=WEIGHT, rare=True
     )
     l1_time_weight: float = option(
         1e-4,
@@ -465,10 +424,7 @@ class SavingConfig(Record):
 
     save_every: int = option(1000, "Steps between checkpoints.", within=COUNT, rare=True)
     save_minutes: float = option(
-        10.0,
-        "Minutes between checkpoints, if --save-every takes longer.",
-        within=(1e-3, 1e9),
-        rare=True,
+        10.0, "Minutes between checkpoints, if --save-every takes longer.", within=(1e-3, 1e9), rare=True
     )
     where: ClassVar[str] = "fit"
 
@@ -516,9 +472,7 @@ class SelectionConfig(Record):
         rare=True,
     )
     start: Start = option(
-        "first",
-        "First of the initial views: the first training view by name, or a random one by the seed.",
-        rare=True,
+        "first", "First of the initial views: the first training view by name, or a random one by the seed.", rare=True
     )
     add: int | None = option(
         None,

@@ -41,9 +41,7 @@ class Nuisances(Record):
         metavar="UNKNOWN,UNKNOWN|none",
     )
     exposure_std: float | None = option(
-        None,
-        "Prior standard deviation of a log gain of a view; default unknown.",
-        rare=True,
+        None, "Prior standard deviation of a log gain of a view; default unknown.", rare=True
     )
     pose_std: tuple[float, float] | None = option(
         None,

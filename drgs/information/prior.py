@@ -41,10 +41,7 @@ class Prior:
         flag="relative_prior",
     )
     groups: Mapping[str, float] = option(
-        {},
-        "Group -> lambda in place of `value`.",
-        name="prior_groups",
-        file_only=True,
+        {}, "Group -> lambda in place of `value`.", name="prior_groups", file_only=True
     )
     heading: ClassVar[str] = "Views"
 

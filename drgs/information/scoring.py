@@ -79,9 +79,7 @@ class Scoring(Record):
     )
     prior: Prior | None = part(None)
     weights: Mapping[str, float] = option(
-        {},
-        "Group -> factor of its part of the score; 1 where none is given.",
-        file_only=True,
+        {}, "Group -> factor of its part of the score; 1 where none is given.", file_only=True
     )
     groups: tuple[str, ...] | None = option(
         None,
@@ -109,9 +107,7 @@ class Scoring(Record):
         rare=True,
     )
     probes: int = option(
-        16,
-        "Number of random probes of each view, for block deformation and for --method probes.",
-        rare=True,
+        16, "Number of random probes of each view, for block deformation and for --method probes.", rare=True
     )
     nuisances: Nuisances = part(Nuisances())
     where: ClassVar[str] = "select"

@@ -23,13 +23,10 @@ class MeshOptions(Record):
     where: ClassVar[str] = "mesh"
 
     depth: DepthKind = option(
-        "median",
-        "Depth of a ray: where transmittance falls to one half (median), or the mean (expected).",
+        "median", "Depth of a ray: where transmittance falls to one half (median), or the mean (expected)."
     )
     voxel: float | None = option(
-        None,
-        "Size of a voxel in scene units; default two pixels wide on the surface.",
-        within=(1e-30, 1e30),
+        None, "Size of a voxel in scene units; default two pixels wide on the surface.", within=(1e-30, 1e30)
     )
     trunc: float = option(4.0, "Truncation distance of the signed distance field, in voxels.", within=(1.0, 64.0))
     max_voxels: int = option(
@@ -44,9 +41,7 @@ class MeshOptions(Record):
         within=(0.0, 1e9),
     )
     min_piece: float = option(
-        0.01,
-        "Remove loose pieces with less than this fraction of the largest one's area.",
-        within=(0.0, 1.0),
+        0.01, "Remove loose pieces with less than this fraction of the largest one's area.", within=(0.0, 1.0)
     )
 
     def __post_init__(self) -> None:
