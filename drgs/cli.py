@@ -47,7 +47,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         args = _parse_arguments(argv)
     except (ValueError, OSError) as error:
-        _complain(name, f"{error} (see `drgs {name} --help`)" if name else str(error))
+        _complain(name, str(error))
         return 2
     logging.basicConfig(format="%(message)s", handlers=[_Stderr()])
     logging.getLogger("drgs").setLevel(logging.WARNING if args.quiet else logging.INFO)

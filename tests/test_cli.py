@@ -93,7 +93,7 @@ def test_version(capsys):
         ("", "drgs: the command must be one of info, render,"),
         ("frobnicate", "got 'frobnicate'; none has a name like it"),
         ("rendr x", "got 'rendr'; did you mean render?"),
-        ("fit DATA", "drgs fit: --output must be given, is missing; add --output (see `drgs fit --help`)"),
+        ("fit DATA", "drgs fit: --output must be given, is missing; add --output PATH"),
         ("render", "drgs render: SCENE must be given, is missing; add SCENE"),
         ("render x --widht 3", "drgs render: options must be those of the command, got --widht; did you mean --width?"),
         ("render x --width a", "drgs render: --width must be a whole number, got 'a'; correct it"),

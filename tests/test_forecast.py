@@ -9,7 +9,6 @@ import torch
 
 from drgs import cli
 from drgs.cameras import orbit
-from drgs.commands import forecast
 from drgs.commands import render as render_command
 from drgs.files import save_ply
 from drgs.settings import RenderSettings
@@ -23,11 +22,11 @@ def test_forecast_is_right_where_time_is_linear(monkeypatch):
         clock[0] += 2 + 1e-3 * camera.width * camera.height
         return types.SimpleNamespace(rgb=torch.zeros(1))
 
-    monkeypatch.setattr(forecast, "render", render)
-    monkeypatch.setattr(forecast, "time", types.SimpleNamespace(perf_counter=lambda: clock[0]))
+    monkeypatch.setattr(render_command, "render", render)
+    monkeypatch.setattr(render_command, "time", types.SimpleNamespace(perf_counter=lambda: clock[0]))
     cameras = [*orbit((0, 0, 0), 3.0, 3, width=64, height=48), *orbit((0, 0, 0), 3.0, 1, width=7, height=1)]
     expected = 4 * 2 + 1e-3 * (3 * 64 * 48 + 7)
-    assert forecast.forecast(None, cameras, RenderSettings()) == pytest.approx(expected)
+    assert render_command.forecast(None, cameras, RenderSettings()) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from drgs.capturing.next_views import rank_next
 from drgs.capturing.places import Place, length_in_words, meters_of, places_around
 from drgs.commands.options import View
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewed import subject_of
+from drgs.commands.view import subject_of
 from drgs.data import load
 from drgs.data.capture import level_frame, upright
 from drgs.fitting.config import FitConfig
@@ -165,7 +165,7 @@ def test_bad_options(half_seen, tmp_path, capsys):
         (["--length", "IMG_00 1 m"], "--length must be two photographs and a length"),
         (["--length", "IMG_00 IMG_99 1 m"], "--length must name photographs with a pose, got 'IMG_99'"),
         (["--length", "IMG_00 IMG_00 1 m"], "must be between two places"),
-        (["-k", "0"], "-k must be at least 1"),
+        (["-k", "0"], "-k must be in [1, 1000000000], got 0"),
         (["photos"], "--more must have no photographs"),
     ):
         assert cli.main(["capture", *line[:1], *line[1:], "--more", "-o", str(half_seen)]) == 2

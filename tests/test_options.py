@@ -84,7 +84,7 @@ def test_one_field_is_an_option_everywhere():
 @pytest.mark.parametrize(
     ("line", "told"),
     [
-        ("x", "--output must be given, is missing; add --output"),
+        ("x", "--output must be given, is missing; add --output PATH"),
         ("-o y", "PLACE must be given"),
         ("x -o y --cuont 3", "options must be those of the command, got --cuont; did you mean --count"),
         ("x -o y --zzzz", "got --zzzz; none has a name like it"),

@@ -13,7 +13,7 @@ import torch
 import drgs
 from drgs import cli
 from drgs.cameras import Camera, intrinsics_from_fov, look_at
-from drgs.commands.flown import level_panorama
+from drgs.commands.films import level_panorama
 from drgs.data.camera_lists import save_cameras_json
 from drgs.display.mp4 import Mp4
 from drgs.files import save_ply

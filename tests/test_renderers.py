@@ -11,7 +11,7 @@ from test_train import SIZE, config, dataset, trainer_of  # noqa: F401
 
 from drgs import cli, metrics
 from drgs.commands.eval import print_table
-from drgs.commands.repeat import fit_command
+from drgs.commands.report import fit_command
 from drgs.evaluation import evaluate_run
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import load_frames

@@ -22,8 +22,7 @@ from test_train import config as short_config
 
 from drgs import cli
 from drgs.cameras import orbit
-from drgs.commands.repeat import fit_command
-from drgs.commands.report import report_of
+from drgs.commands.report import fit_command, report_of
 from drgs.display.pictures import file_names
 from drgs.files import Run
 from drgs.fitting.config import FitConfig, SelectionConfig

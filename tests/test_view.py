@@ -31,7 +31,7 @@ from drgs import cli, fisher, gain
 from drgs.cameras import Camera, intrinsics, look_at, orbit
 from drgs.commands.options import View
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewed import subject_of, watched_files
+from drgs.commands.view import subject_of, watched_files
 from drgs.data import load
 from drgs.data.flight_files import read_flight
 from drgs.display.pictures import map_colors

@@ -27,7 +27,7 @@ from drgs.cameras import Camera, intrinsics_from_fov, look_at
 from drgs.commands import view
 from drgs.commands.options import View
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewed import subject_of, watched_files
+from drgs.commands.view import subject_of, watched_files
 from drgs.data.flight import rotation_of
 from drgs.data.flight_files import read_flight
 from drgs.files import load_state, save_state

@@ -13,7 +13,7 @@ from viewing_client import Client
 from drgs.commands import view
 from drgs.commands.options import View
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewed import subject_of
+from drgs.commands.view import subject_of
 from drgs.train import Trainer, fit
 
 ADVICE = ("must have a time", "the span of the field", "Error", "None")

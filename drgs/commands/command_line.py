@@ -54,12 +54,12 @@ def parsed_options(kind: type[Common], words: Sequence[str]) -> Any:
     """
     options = options_in(kind)
     line = _read(options, words)
-    given = {**_of_file(kind, line), **line}
-    for name in line.keys() & given.keys():
-        if options[name].spec.repeat:
-            given[name] = (*_of_file(kind, line).get(name, ()), *line[name])
-    if missing := [option.flag for name, option in options.items() if _is_required(option) and name not in given]:
-        raise ValueError(f"{missing[0]} must be given, is missing; add {' and '.join(missing)}")
+    given = _of_file(kind, line)
+    for name, value in line.items():
+        given[name] = (*given.get(name, ()), *value) if options[name].spec.repeat else value
+    if missing := [option for name, option in options.items() if _is_required(option) and name not in given]:
+        names = " and ".join(_flags(option).split(", ")[-1] for option in missing)
+        raise ValueError(f"{missing[0].flag} must be given, is missing; add {names}")
     return nested(kind, None, kind.values(given, line))
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
-from drgs.commands.clustered import workers_of
 from drgs.commands.eval import print_table
 from drgs.commands.report import report_of
 from drgs.data.backgrounds import default_background
@@ -42,7 +41,7 @@ def run(args: Fit) -> None:
     )
     if args.background is None:
         config = _on_background(dataset, config, args, is_active)
-    with workers_of(args) as workers:
+    with args.cluster() as workers:
         result = fit(dataset, args.output, config, resume=args.resume, progress=not args.quiet, workers=workers)
     page = result.run.path / FILE
     if args.report:

@@ -8,10 +8,12 @@ line, its help and configuration files are read from these alone (`command_line.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Collection, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from drgs.cluster.options import check_options
 from drgs.commands.values import ORBIT_KEYS, check_color, parsed
@@ -22,6 +24,9 @@ from drgs.information.scoring import Scoring
 from drgs.meshing.options import MeshOptions
 from drgs.settings import Preset, RenderSettings
 from drgs.studies.protocols import ExperimentName, ProtocolName, StudyScale
+
+if TYPE_CHECKING:
+    from drgs.cluster.workers import Cluster
 
 __all__ = [
     "COMMANDS",
@@ -271,6 +276,14 @@ class Clustered(Common):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_options(self.scheduler, self.workers)
+
+    def cluster(self) -> AbstractContextManager[Cluster | None]:
+        """The workers that they name, for the length of a block; None where they name none: then Dask is not loaded."""
+        if self.scheduler is None and self.workers is None:
+            return contextlib.nullcontext()
+        from drgs.cluster.connect import opened
+
+        return opened(self.scheduler, self.workers)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

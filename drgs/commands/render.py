@@ -16,22 +16,24 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 
 from drgs import runtime
-from drgs.commands.flown import (
+from drgs.commands.films import (
     Film,
+    at_times,
     check_flight_options,
     check_panorama,
     film_of,
     flight_cameras,
     level_panorama,
+    named_view,
     panorama_size,
+    ply_names,
     up_of,
+    write_plys,
 )
-from drgs.commands.forecast import forecast
-from drgs.commands.lone_file import lone_file
-from drgs.commands.moments import at_times, named_view, ply_names, write_plys
 from drgs.commands.orbits import Wish
 from drgs.commands.painters import PAINTINGS, painters
 from drgs.commands.scene_input import SceneInput
@@ -46,6 +48,7 @@ from drgs.guards import memory
 from drgs.integrator import render
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import lock_folder, write_json
+from drgs.sizes import cropped
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -54,7 +57,8 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians, Scene
     from drgs.settings import RenderSettings
 
-__all__ = ["render_views", "run"]
+__all__ = ["forecast", "render_views", "run"]
+
 
 _log = logging.getLogger(__name__)
 
@@ -62,14 +66,18 @@ _MANY_PIXELS = 500_000  # of all views; below, finding out would take as long as
 _LONG = 10.0  # seconds that are worth a word
 _FORMATS = ("png", "jpg", "exr", "webm", "mp4", "ply")
 _FILMS: Mapping[str, Any] = {"webm": pictures.Video, "mp4": Mp4}
+_PICTURES = ("png", "jpg", "exr")
+_MORE = ("depth", "features", "labels", "overlay", "moving")  # options that write more files than one
+_BANDS = (0.125, 0.375, 0.625, 0.875)  # places of the bands in parts of the height: one in each quarter
+_SHARE = 1 / 32  # height of each band, in parts of the view's
 
 
 def run(args: Render) -> None:
     """`drgs render SCENE`."""
     settings = args.settings()  # refuses what cannot be, before anything is read
-    alone = lone_file(args)
-    if alone is not None:
-        args = dataclasses.replace(args, output=alone.folder, format=alone.format)
+    single = single_file(args)
+    if single is not None:
+        args = dataclasses.replace(args, output=single.folder, format=single.format)
     formats = _formats("png" if args.format is None else args.format)
     Wish.of(args)
     check_flight_options(args)
@@ -82,19 +90,19 @@ def run(args: Render) -> None:
     film = film_of(args)
     views = _views_of(args)
     movie = "flight" if args.path is not None else "turntable" if views == "orbit" else "video"
-    if alone is not None:
-        movie = alone.stem
+    if single is not None:
+        movie = single.stem
     kinds = [kind for kind in PAINTINGS if getattr(args, kind)]
     movies = [_movie_of(movie, kind, end) for end in _FILMS if end in formats for kind in ("", *kinds)]
-    fixed = ["render.json", "cameras.json", *movies] if alone is None else [alone.name]
+    fixed = ["render.json", "cameras.json", *movies] if single is None else [single.name]
     output = lock_folder(args.output, "render", fixed, inputs=[args.scene, views, *([args.path] if args.path else [])])
     given = SceneInput.of(args)
     paint = painters(kinds, given, args.scene)
     gaussians = given.gaussians if paint else given.colors
     settings = given.over_background(settings)
     cameras, source = _cameras_of(args, views, film, given, settings)
-    if alone is not None:
-        cameras = alone.named(cameras)
+    if single is not None:
+        cameras = single.named(cameras)
     _check_memory(cameras, settings, formats, 0 if gaussians.features is None else gaussians.features.shape[1])
     ends = [*(kind for kind in formats if kind not in (*_FILMS, "ply")), *(["depth.png"] * args.depth)]
     ends += [f"{kind}.png" for kind in kinds]
@@ -117,8 +125,8 @@ def run(args: Render) -> None:
             advance=bar.advance,
         )
     report = {"scene": str(args.scene), "cameras": source, "gaussians": len(gaussians)} | report
-    if alone is not None:
-        _say(args, _summary(report, alone.path))
+    if single is not None:
+        _say(args, _summary(report, single.path))
         return
     if film.flight is not None:
         report["flight"] = {
@@ -218,7 +226,7 @@ def render_views(
         and views (camera, files, seconds, rays, redone).
     """
     outputs = ("depth",) if depth or "exr" in formats else ()
-    views = []
+    views: list[dict[str, Any]] = []
     seen = False
     with contextlib.ExitStack() as stack:
         movies: dict[str, list] = {
@@ -235,32 +243,19 @@ def render_views(
                 out = render(scene if paint else colors_only(scene, camera.time), camera, settings, outputs)
             rgb, alpha = out.rgb.cpu().numpy(), out.alpha.cpu().numpy()
             seconds = time.perf_counter() - began
-            files = []
-            if "png" in formats:
-                pictures.write_png(out_dir / f"{name}.png", rgb)
-                files.append(f"{name}.png")
-            if "jpg" in formats:
-                pictures.write_jpg(out_dir / f"{name}.jpg", rgb, is_panorama=_is_whole(camera))
-                files.append(f"{name}.jpg")
-            if outputs:
-                distance = out.depth.cpu().numpy()
-            if "exr" in formats:
-                pictures.write_exr(out_dir / f"{name}.exr", rgb, A=alpha, Z=distance)
-                files.append(f"{name}.exr")
-            if depth:
-                pictures.write_png(out_dir / f"{name}.depth.png", pictures.depth_picture(distance, alpha))
-                files.append(f"{name}.depth.png")
+            distance = out.depth.cpu().numpy() if out.depth is not None and outputs else None
+            files = _write_pictures(out_dir, name, camera, rgb, alpha, distance, (*formats, *["depth"] * depth))
             for kind, painter in paint.items():
                 painted = painter(out)
-                pictures.write_png(out_dir / f"{name}.{kind}.png", painted)
                 files.append(f"{name}.{kind}.png")
+                pictures.write_png(out_dir / files[-1], painted)
                 for movie in movies[kind]:
                     movie.write(painted)
             for movie in movies[""]:
                 movie.write(rgb)
             seen = seen or bool(alpha.any())
-            made = {key: _number(out.certificate.get(key)) for key in ("rays", "redone")}
-            views.append({"camera": described(camera), "files": files, "seconds": seconds, **made})
+            counts = {key: _number(out.certificate.get(key)) for key in ("rays", "redone")}
+            views.append({"camera": described(camera), "files": files, "seconds": seconds, **counts})
             if advance:
                 advance()
     if not seen:
@@ -270,17 +265,47 @@ def render_views(
             settings.near,
             settings.extent,
         )
+    return _report(settings, views, [movie.path.name for some in movies.values() for movie in some], fps)
+
+
+def _write_pictures(
+    folder: Path,
+    name: str,
+    camera: Camera,
+    rgb: np.ndarray,
+    alpha: np.ndarray,
+    distance: np.ndarray | None,
+    kinds: tuple[str, ...],
+) -> list[str]:
+    """Write the pictures of a view that are among its kinds; the names of their files."""
+    files = []
+    if "png" in kinds:
+        files.append(f"{name}.png")
+        pictures.write_png(folder / files[-1], rgb)
+    if "jpg" in kinds:
+        files.append(f"{name}.jpg")
+        pictures.write_jpg(folder / files[-1], rgb, is_panorama=_is_whole(camera))
+    if "exr" in kinds:
+        files.append(f"{name}.exr")
+        pictures.write_exr(folder / files[-1], rgb, A=alpha, Z=distance)
+    if "depth" in kinds:
+        files.append(f"{name}.depth.png")
+        pictures.write_png(folder / files[-1], pictures.depth_picture(distance, alpha))
+    return files
+
+
+def _report(settings: RenderSettings, views: list[dict[str, Any]], movies: list[str], fps: float) -> dict[str, Any]:
+    """What `render_views` returns."""
     times = [view["seconds"] for view in views]
-    total = {key: _total(view[key] for view in views) for key in ("rays", "redone")}
     return {
         "settings": dataclasses.asdict(settings),
         "backend": runtime.backend().variant,
         "threads": runtime.backend().threads,
         "seconds": {"first": times[0], "median": statistics.median(times[1:] or times), "total": sum(times)},
-        **total,
-        "video": movies[""][0].path.name if movies[""] else None,
-        "videos": [movie.path.name for some in movies.values() for movie in some],
-        "fps": fps if movies[""] else None,
+        **{key: _total(view[key] for view in views) for key in ("rays", "redone")},
+        "video": movies[0] if movies else None,
+        "videos": movies,
+        "fps": fps if movies else None,
         "views": views,
     }
 
@@ -312,7 +337,7 @@ def _is_whole(camera: Camera) -> bool:
 
 
 def _resized(camera: Camera, width: int | None, height: int | None) -> Camera:
-    """The camera at the size asked for; one side alone keeps the shape."""
+    """The camera at the size asked for; one side single keeps the shape."""
     if width is None and height is None:
         return camera
     if width is None:
@@ -374,3 +399,113 @@ def _say_how_long(args: Render, gaussians: Gaussians, cameras: list[Camera], set
 def _say(args: Render, text: str) -> None:
     if not args.quiet:
         print(text, flush=True)
+
+
+# ---------------------------------------------------------------------------------------------------- how long it takes
+
+
+def forecast(gaussians: Gaussians, cameras: list[Camera], settings: RenderSettings) -> float:
+    """Seconds that all views will take, kernels compiled; finding out takes about a fifth of one view.
+
+    Args:
+        gaussians: Gaussians to be rendered.
+        cameras: Views to be rendered, at least one.
+        settings: Settings that they are rendered by.
+    """
+    first = cameras[0]
+    rows = max(2, round(first.height * _SHARE))
+
+    def seconds(place: float, height: int) -> float:
+        band = cropped(first, 0, int(place * max(first.height - height, 0)), first.width, height)
+        began = time.perf_counter()
+        with torch.no_grad():  # as views are drawn: a graph would take time of its own
+            render(gaussians, band, settings, ()).rgb.cpu().numpy()
+        return time.perf_counter() - began
+
+    with Bar("how long it will take", len(_BANDS)) as bar:
+        seconds(0.5, rows)  # compiles the kernels
+        view = row = 0.0
+        for place in _BANDS:
+            # What projecting and sorting all Gaussians takes, however small the image is, and what its rows take.
+            least = seconds(place, 1)
+            each = max(seconds(place, rows) - least, 0.0) / (rows - 1)
+            view += max(least - each, 0.0) / len(_BANDS)
+            row += each / len(_BANDS)
+            bar.advance()
+    pixels = sum(camera.width * camera.height for camera in cameras)
+    return view * len(cameras) + row * pixels / first.width
+
+
+# --------------------------------------------------------------------------------------- one file and nothing beside it
+
+
+@dataclasses.dataclass(frozen=True)
+class SingleFile:
+    """A film, or a picture, that is written single.
+
+    Attributes:
+        path: Path of the file, as it was given.
+    """
+
+    path: Path
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the file."""
+        return self.path.parent
+
+    @property
+    def name(self) -> str:
+        """Name of the file in its folder."""
+        return self.path.name
+
+    @property
+    def stem(self) -> str:
+        """Name of the film, or of the view, without its suffix."""
+        return self.path.stem
+
+    @property
+    def format(self) -> str:
+        """What it is written as."""
+        return self.path.suffix[1:]
+
+    def named(self, cameras: list[Camera]) -> list[Camera]:
+        """The cameras, the one of a picture by the name of the file.
+
+        Raises:
+            ValueError: If a picture would be of several cameras.
+        """
+        if self.format in _FILMS:
+            return cameras
+        if len(cameras) != 1:
+            raise ValueError(
+                f"{self.path}: must be a folder for {len(cameras)} views, a file holds one; name a folder, or choose "
+                "with --view or --limit 1"
+            )
+        return [dataclasses.replace(cameras[0], name=self.stem)]
+
+
+def single_file(args: Render) -> SingleFile | None:
+    """The file that `-o` names; None where it names a folder: one that is there, or a name without such a suffix.
+
+    Raises:
+        ValueError: If `--format`, or an option that writes more files, says otherwise; or for a picture's name that
+            would be written otherwise.
+    """
+    path = args.output
+    known = (*_FILMS, *_PICTURES)
+    if path.suffix[1:].lower() not in known or path.is_dir():
+        return None
+    if path.suffix[1:] not in known:
+        raise ValueError(f"{path}: must end in {path.suffix.lower()} in small letters; rename it")
+    found = SingleFile(path)
+    if args.format not in (None, found.format):
+        raise ValueError(
+            f"render: --format must be left out with -o {path}, got {args.format!r}; drop it, or name a folder"
+        )
+    for name in _MORE:
+        if getattr(args, name):
+            raise ValueError(f"render: --{name} must have a folder to write into, -o {path} is one file; name a folder")
+    if found.format in _PICTURES and pictures.file_names([found.stem]) != [found.stem]:
+        raise ValueError(f"{path}: must have a name of letters, digits, - _ and . alone; rename it")
+    return found

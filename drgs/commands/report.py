@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import logging
+import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from drgs.commands.repeat import fit_command
+from drgs.commands.command_line import words_of
+from drgs.commands.options import Fit
+from drgs.commands.values import override
+from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import fit_record
+from drgs.fitting.renderers import own_preset
 from drgs.fitting.resume import lock_run
+from drgs.guards.records import options_in
 from drgs.io.outputs import check_file
 from drgs.io.run import Run
 from drgs.report.page import GENERATOR
@@ -19,7 +26,8 @@ if TYPE_CHECKING:
     from drgs.commands.options import Report
     from drgs.data import Dataset
 
-__all__ = ["report_of", "run"]
+__all__ = ["fit_command", "report_of", "run"]
+
 
 _log = logging.getLogger(__name__)
 
@@ -71,3 +79,41 @@ def is_report(path: Path) -> bool:
     """Whether a file says that `drgs report` wrote it."""
     with path.open("rb") as file:
         return f'<meta name="generator" content="{GENERATOR}">'.encode() in file.read(1000)
+
+
+# --------------------------------------------------------------------------------------- the command that repeats a fit
+
+
+def fit_command(config: FitConfig, data: Path, output: Path) -> tuple[str, list[str]]:
+    """`drgs fit ...` with every option that is not the default's.
+
+    Args:
+        config: Configuration of the fit.
+        data: Folder of the data set.
+        output: Folder of the run.
+    Returns:
+        The line for a shell, and the fields that no option sets, as `name=value`: these need a file (--config).
+    """
+    options = options_in(Fit)
+    nearest, differences = config.settings.nearest_preset()
+    given: dict[str, Any] = {"background": config.settings.background}  # photographs may suggest another one
+    if nearest != own_preset(config.renderers):
+        given["preset"] = nearest
+    if config.selection is not None:
+        given["views"] = "active"
+    for name, option in options.items():
+        if option.path[0] == "fit":
+            value: Any = config
+            for step in option.path[1:]:
+                value = None if value is None else getattr(value, step)
+            if value is not None:
+                given[name] = value
+    changed = {name: value for name, value in given.items() if value != options[name].default}
+    beyond = [f"{name}={json.dumps(x)}" for name, x in changed.items() if options[name].spec.file_only]
+    words = ["drgs", "fit", str(data), "-o", str(output)]
+    for name, value in changed.items():
+        if not options[name].spec.file_only:
+            words += words_of(options[name], value)
+    for name, value in differences.items():
+        words += [options["overrides"].flag, override(name, value)]
+    return shlex.join(words), beyond

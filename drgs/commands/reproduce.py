@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drgs.commands import fisher
-from drgs.commands.clustered import workers_of
 from drgs.commands.command_line import config_fields
 from drgs.commands.options import Fisher
 from drgs.display import tables
@@ -46,7 +45,7 @@ def run(args: Reproduce) -> None:
     if weights:
         Lpips(weights)  # which every fit would else find out at its end
     say = (lambda line: None) if args.quiet else print
-    with workers_of(args) as workers:  # before scenes are made: whether there are any
+    with args.cluster() as workers:  # before scenes are made: whether there are any
         plan = plan_of(
             args.what,
             args.scale,

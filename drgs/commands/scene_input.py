@@ -11,8 +11,10 @@ from drgs.codecs.folders import cameras_of_model, file_of_folder
 from drgs.commands.nerfstudio_frame import in_frame_of_data
 from drgs.data.camera_lists import is_camera_list
 from drgs.fitting.records import FitRecord, fit_record, is_run, load_run
+from drgs.io.foreign import refuse_foreign
 from drgs.io.run import Run
 from drgs.settings import RenderSettings
+from drgs.viewing.placed_views import NEXT, Ranking, read_ranking
 
 if TYPE_CHECKING:
     from drgs.commands.options import Crossval, Fisher, Query, Render, Select, Tradeoff
@@ -22,7 +24,10 @@ if TYPE_CHECKING:
     from drgs.information.nuisances import Nuisance
     from drgs.information.semantics import SemanticMetric
 
-__all__ = ["SceneInput"]
+__all__ = ["SELECTION", "SceneInput", "ranking_of"]
+
+SELECTION = "selection.json"
+"""File of a run that chose its views: their scores."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,3 +146,21 @@ def _data_of(args: Crossval | Fisher | Query | Render | Select | Tradeoff) -> Pa
         if cameras_of_model(path) is None and not is_camera_list(path):
             return path
     return None
+
+
+def ranking_of(selection: Path | None, given: SceneInput) -> Ranking | None:
+    """Scores of cameras: those of a file, else of a run that chose its views, or places of its next photographs.
+
+    Args:
+        selection: What `--selection` names.
+        given: What is looked at.
+    Raises:
+        FileNotFoundError, ValueError: If a file is not there, or damaged.
+    """
+    if selection is not None:
+        refuse_foreign(selection, "a selection")
+        return read_ranking(selection)
+    if given.record is None or given.run is None:
+        return None
+    path = given.run.path / (SELECTION if given.record.is_active else NEXT)
+    return read_ranking(path) if path.is_file() else None

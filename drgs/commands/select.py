@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from drgs.commands.clustered import workers_of
 from drgs.commands.orbits import Wish
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import check_lenses, known_views, other_views, timed
@@ -50,7 +49,7 @@ def run(args: Select) -> None:
     train = timed(known.cameras, args, given)
     check_lenses("select", settings, [*train, *candidates])
     views = len(known.cameras) + len(candidates)
-    with workers_of(args) as workers, Bar("information", views, not args.quiet) as bar:
+    with args.cluster() as workers, Bar("information", views, not args.quiet) as bar:
         selection = select(
             given.scene,
             candidates,

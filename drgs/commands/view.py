@@ -10,17 +10,39 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drgs.commands.orbits import Wish
-from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewed import subject_of, watched_files
+import numpy as np
+
+from drgs.commands.fisher import asked_blocks
+from drgs.commands.orbits import Wish, capture_orbit, scene_orbit
+from drgs.commands.painters import PAINTINGS, painters
+from drgs.commands.scene_input import SELECTION, SceneInput, ranking_of
+from drgs.commands.values import UP
+from drgs.commands.viewpoints import Known, Source, known_views
+from drgs.data import View as DataView
+from drgs.data.capture import Focus, upright
 from drgs.display.progress import Bar, quietly
+from drgs.ellipsoids import Gaussians
+from drgs.fitting.records import fitted_views
+from drgs.information.blocks import MAP_PRIOR
+from drgs.information.sums import together
 from drgs.io import interrupts
+from drgs.io.checkpoint import state_header
+from drgs.io.run import Run
+from drgs.meshing.depths import seen_distance
+from drgs.viewing.client import pose_of
+from drgs.viewing.layers import Uncertainty, layers_of
+from drgs.viewing.placed_views import NEXT, PlacedView, Ranking, placed_views_of
+from drgs.viewing.subject import FirstView, Subject
 
 if TYPE_CHECKING:
+    from drgs.cameras import Camera
     from drgs.commands.options import View
+    from drgs.commands.painters import Painter
+    from drgs.commands.scene_input import SELECTION, SceneInput, ranking_of
     from drgs.viewing.server import Viewer
 
-__all__ = ["run"]
+__all__ = ["run", "subject_of", "watched_files"]
+
 
 _EVERY = 2.0  # seconds between two looks at the files
 _LAST = 0.5  # seconds that what is being computed is given to end
@@ -78,3 +100,176 @@ def _stamps(paths: list[Path]) -> dict[Path, tuple[int, int, int]]:
             continue
         found[path] = seen.st_mtime_ns, seen.st_size, seen.st_ino
     return found
+
+
+# ---------------------------------------------------------------------------------------------------- what is looked at
+
+
+_FIRST_SIZE = 640, 480  # pixels of the view that a browser begins with: its shape says how much of the scene is in it
+
+
+def watched_files(args: View) -> list[Path]:
+    """The files that are read again when they change."""
+    named = [] if args.selection is None else [args.selection]
+    if not args.scene.is_dir():
+        return [args.scene, *named]
+    run = Run(args.scene)
+    return [run.state, run.point_cloud, *(named or [run.path / SELECTION, run.path / NEXT])]
+
+
+def subject_of(args: View, given: SceneInput, before: Subject | None = None) -> Subject:
+    """What is looked at.
+
+    Args:
+        args: The options of the command line.
+        given: The scene that they name.
+        before: What was looked at, where a file has changed: browsers stay where they are.
+    Raises:
+        FileNotFoundError, ValueError: If a file that was named is not there or damaged.
+    """
+    notes: list[str] = []
+    known = _known(args, given, notes)
+    ranking = ranking_of(args.selection, given)
+    placed_views = _placed_views(args, given, ranking, notes)
+    uncertainty = _uncertainty(args, given, known)
+    origin = np.array(given.gaussians.origin, np.float64)
+    first = before.first if before else _first(args, given.gaussians, known.cameras if known else [])
+    # What a network leaves uncertain takes tangents of all pixels; the rest of a map costs no more than a picture.
+    pixels = known.pixels if known and given.moving is not None else None
+    if before is not None and _same(before.placed_views, placed_views) and before.ranking == ranking:
+        placed_views = before.placed_views
+    return Subject(
+        name="/".join(args.scene.resolve().parts[-2:]),
+        state=_state(given),
+        count=len(given.gaussians),
+        scene=given.scene,
+        origin=origin,
+        times=_times(given),
+        settings=given.settings,
+        layers=layers_of(_paint(args, given), uncertainty, pixels),
+        placed_views=placed_views,
+        ranking=ranking,
+        uncertainty=uncertainty,
+        first=first,
+        background=given.background,
+        notes=tuple(notes),
+    )
+
+
+def _state(given: SceneInput) -> str:
+    """The step of the checkpoint, where there is one that can be read."""
+    if given.run is None:
+        return ""
+    try:
+        step = state_header(given.run.state).get("step")
+    except (OSError, ValueError):
+        return ""
+    return f"step {step:,} of {given.record.config.max_steps:,}" if isinstance(step, int) else ""
+
+
+def _times(given: SceneInput) -> tuple[float, ...]:
+    """Of what moves: those of the photographs, else the ends of the field's span; none where nothing does."""
+    if given.moving is None:
+        return ()
+    if given.record is not None and given.record.times:
+        return given.record.times
+    return tuple(dict.fromkeys(float(x) for x in given.moving.field.grid.span))
+
+
+def _paint(args: View, given: SceneInput) -> dict[str, Painter]:
+    """What draws features and labels, as far as there are any."""
+    found: dict[str, Painter] = {}
+    if given.gaussians.features is None:
+        return found
+    for kind in PAINTINGS:
+        try:
+            found |= painters([kind], given, args.scene)
+        except ValueError:  # no decoder, no classes: not offered
+            continue
+    return found
+
+
+def _known(args: View, given: SceneInput, notes: list[str]) -> Known | None:
+    """The views that it was fitted to; None where nobody says, or their data set has gone."""
+    if args.train is None and given.run is None:
+        return None
+    try:
+        return known_views(args.train, args, given, given.keeps_lenses())
+    except (OSError, ValueError) as error:
+        if args.train is not None:
+            raise
+        notes.append(f"no cameras: {error}")
+        return None
+
+
+def _placed_views(args: View, given: SceneInput, ranking: Ranking | None, notes: list[str]) -> tuple[PlacedView, ...]:
+    """Where photographs were taken or could be."""
+    if args.train is None and given.run is None:
+        return placed_views_of([], (), ranking)
+    source = Source.known(args.train, given)
+    if source.kind == "list":
+        views = [DataView(camera, camera.name) for camera in source.listed()]
+        return placed_views_of(views, [view.name for view in views], ranking)
+    try:
+        views = source.dataset(args, given).views
+        fitted = [view.name for view in views]
+        if source.kind == "run":
+            fitted = fitted_views(Run(Path(source.text)), source.record)
+    except (OSError, ValueError):
+        if args.train is not None:
+            raise
+        return placed_views_of([], (), ranking)  # `_known` has said why
+    return placed_views_of(views, fitted, ranking)
+
+
+def _uncertainty(args: View, given: SceneInput, known: Known | None) -> Uncertainty | None:
+    """What the photographs leave uncertain, by the fast settings, whose maps are those of the exact ones."""
+    if known is None or not known.cameras:
+        return None
+    cameras = known.cameras
+    if given.moving is not None:
+        cameras = [camera for camera in cameras if camera.time is not None]
+    if not cameras:
+        return None
+    blocks = asked_blocks(args, given, given.settings("fast"), cameras)
+    prior = args.scoring.prior or MAP_PRIOR
+    return Uncertainty(
+        cameras,
+        lambda camera: together(blocks.information(camera)),
+        lambda camera, weights: blocks.variance_map(camera, weights).numpy(),
+        prior,
+    )
+
+
+def _first(args: View, gaussians: Gaussians, captured: list[Camera]) -> FirstView:
+    """Where the photographs were taken, towards what they look at; of a bare PLY, so that all of it is seen."""
+    if not len(gaussians):
+        raise ValueError(f"{args.scene}: there must be at least one Gaussian, got none; fit longer, or name another")
+    wish = Wish.of(args)
+    distance_of = seen_distance(gaussians)
+    captured = sorted(captured, key=lambda camera: camera.name)  # an active run has them as they were picked
+    width, height = _FIRST_SIZE
+    made, _ = capture_orbit(captured, 1, width=width, height=height, wish=wish, distance_of=distance_of)
+    camera = (made or captured[:1] or scene_orbit(gaussians, 1, width=width, height=height, wish=wish))[0]
+    up = np.array(wish.up or (upright(captured) if captured else UP["minus-y"]), np.float64)
+    focus = Focus.of(captured, wish.center, distance_of) if made else None
+    pose = pose_of(camera, gaussians.origin)
+    axis = camera.c2w[:3, 2]
+    if focus is not None:
+        target = focus.center - gaussians.origin
+    else:
+        means = gaussians.means.detach().cpu().double().numpy() + gaussians.origin
+        ahead = (means - camera.center) @ axis
+        ahead = ahead[ahead > 0]
+        target = pose.position + axis * (float(np.median(ahead)) if len(ahead) else 1.0)
+    return FirstView(pose, target, up / np.linalg.norm(up))
+
+
+def _same(before: tuple[PlacedView, ...], after: tuple[PlacedView, ...]) -> bool:
+    """Whether both are the same places with the same names: then a browser need not draw them again."""
+    return [_key(placed) for placed in before] == [_key(placed) for placed in after]
+
+
+def _key(placed: PlacedView) -> tuple:
+    camera = placed.camera
+    return placed.kind, camera.name, np.asarray(camera.w2c).tobytes(), len(placed.sights)

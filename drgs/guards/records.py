@@ -197,7 +197,7 @@ def check_ranges(record: Any) -> None:
         value = getattr(record, field.name)
         low, high = spec.within
         if value is not None and not low <= value <= high:
-            flag = "--" + (spec.flag or field.name).replace("_", "-")
+            flag = f"-{field.name}" if spec.short == field.name else "--" + (spec.flag or field.name).replace("_", "-")
             raise ValueError(f"{flag} must be in [{low:.15g}, {high:.15g}], got {value:.15g}; correct it")
 
 
