@@ -153,8 +153,7 @@ def test_known_views(place, text):
         assert names == (list(NAMES) if text == "data" else [name for name in NAMES if int(name) % 3])
         assert known.data == (place / "data").resolve()
     assert {(camera.width, camera.height) for camera in known.cameras} == {(10, 10)}
-    other = dataclasses.replace(args, info_pixels=16)
-    assert known_views(text and str(place / text), other, shown).cameras[0].width == 4
+    assert known_views(text and str(place / text), args, shown, pixels=16).cameras[0].width == 4
 
 
 def test_a_split_is_the_runs_offset_included(place, tmp_path):

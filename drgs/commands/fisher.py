@@ -18,13 +18,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from drgs import fisher
-from drgs.commands.compared_maps import ComparedMaps
 from drgs.commands.orbits import Wish
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import check_lenses, evenly, known_views, other_views, timed
@@ -33,20 +33,27 @@ from drgs.display import pictures, tables
 from drgs.display.progress import Bar
 from drgs.gain import Information, Prior, check, information_gain, variances
 from drgs.information.blocks import MAP_PRIOR, SceneBlocks
+from drgs.information.maps import fisherrf_map, moments_map
 from drgs.information.sums import add, together
+from drgs.integrator import render
 from drgs.io.checkpoint import save_state
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import lock_folder, write_json
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from drgs.cameras import Camera
-    from drgs.commands.options import Fisher, View
+    from drgs.commands.options import Fisher
     from drgs.commands.viewpoints import Known
+    from drgs.ellipsoids import Scene
+    from drgs.gain import Prior
+    from drgs.information.scoring import Scoring
+    from drgs.io.outputs import LockedFolder
     from drgs.settings import RenderSettings
 
-__all__ = ["KINDS", "asked_blocks", "map_weights", "run"]
+__all__ = ["InformationMaps", "KINDS", "map_weights", "run"]
+
 
 KINDS = ("variance", "share")  # of maps
 
@@ -68,69 +75,105 @@ def run(args: Fisher) -> None:
                 "cameras.json"
             )
         text = args.cameras
-    known = known_views(text, args, given, given.keeps_lenses(args.undistort))
+    known = known_views(text, args, given, given.keeps_lenses(args.undistort), args.info_pixels)
     known = dataclasses.replace(known, cameras=timed(known.cameras, args, given))
     views, source = known.cameras, known.source
     if args.cameras is not None:
         views, source = other_views("--cameras", args.cameras, args, given, known, fresh=False)
     views = evenly(timed(views, args, given), args.limit)
     check_lenses("fisher", settings, [*known.cameras, *views])
-    names = pictures.file_names([camera.name for camera in views])
-    blocks = asked_blocks(args, given, settings, [*known.cameras, *views])
-    compared = ComparedMaps(given.scene, settings, prior) if args.maps else None
-    kinds = [*_map_kinds(blocks.names), *(["maps"] if compared else [])]
-    output.check(f"{name}.{kind}.png" for name in names for kind in kinds)
+    scoring = given.scoring(args.scoring, settings)
     with Bar("information", len(known.cameras) + len(views), not args.quiet) as bar:
+        maps = InformationMaps(args.scene, given, scoring, prior, known, views, source, args.pose, args.maps)
+        groups, rows = maps.write(output, bar.advance)
+    if not args.quiet:
+        _print(args, known, groups, rows, source)
+
+
+@dataclasses.dataclass(frozen=True)
+class InformationMaps:
+    """What known views say about every Gaussian, and maps of what other views would still find uncertain.
+
+    Attributes:
+        path: File or run that the scene is of.
+        given: The scene.
+        scoring: What counts, how it is computed, and the settings that views are rendered with.
+        prior: lambda.
+        known: Known views.
+        views: Views that maps are of.
+        source: Where they come from, in words.
+        pose: Whether to compute the information of each of these views about its own pose, too.
+        compare: Whether to write a picture of each view beside its maps of several rules, too.
+    """
+
+    path: Path
+    given: SceneInput
+    scoring: Scoring
+    prior: Prior
+    known: Known
+    views: list[Camera]
+    source: str
+    pose: bool = False
+    compare: bool = False
+
+    def write(
+        self, output: LockedFolder, advance: Callable[[], None] = lambda: None
+    ) -> tuple[dict[str, GroupSummary], list[MappedView]]:
+        """Write information.safetensors, fisher.json and the maps; what they hold of groups and views, in numbers.
+
+        Args:
+            output: The folder.
+            advance: Called after each view.
+        Raises:
+            ValueError: If a block is named that the scene does not have, or a file of another program is in the way.
+        """
+        settings, cameras = self.scoring.settings, self.known.cameras
+        blocks = SceneBlocks.of(self.given.scene, self.scoring, [*cameras, *self.views], "fisher")
+        compared = ComparedMaps(self.given.scene, settings, self.prior) if self.compare else None
+        names = pictures.file_names([camera.name for camera in self.views])
+        kinds = [*_map_kinds(blocks.names), *(["maps"] if compared else [])]
+        output.check(f"{name}.{kind}.png" for name in names for kind in kinds)
         by_block: dict[str, dict[str, torch.Tensor]] = {}
-        for camera in known.cameras:
+        for camera in cameras:
             for block, part in blocks.information(camera).items():
                 check(f"fisher: view {camera.name}", part)
                 add(by_block.setdefault(block, {}), part)
             if compared:
                 compared.know(camera)
-            bar.advance()
+            advance()
         H = together(by_block)
         rows = []
-        for camera, name in zip(views, names, strict=True):
-            rows.append(_view(args, blocks, camera, name, H, prior, compared))
-            bar.advance()
-    groups = {name: GroupSummary.of(x, by_block, name) for name, x in H.items()}
-    header = {"groups": list(H), "views": [camera.name for camera in known.cameras], "settings": settings}
-    header |= {"blocks": list(by_block)}
-    save_state(args.output / "information.safetensors", H, header)
-    report = {
-        "schema": SCHEMA,
-        "command": "fisher",
-        "scene": str(args.scene),
-        "gaussians": len(given.gaussians),
-        "method": args.scoring.method,
-        "prior": prior.to_json(),
-        "blocks": list(blocks.names),
-        "semantics": blocks.metric.to_json() if blocks.metric else None,
-        **blocks.scoring.nuisances.if_any(),
-        "probes": args.scoring.probes if "deformation" in blocks.names or args.scoring.method == "probes" else None,
-        "settings": dataclasses.asdict(settings),
-        "pixels": known.pixels,
-        "known": {"source": known.source, "names": [camera.name for camera in known.cameras]},
-        "groups": {name: dataclasses.asdict(row) for name, row in groups.items()},
-        "source": source,
-        "views": [row.to_json() for row in rows],
-    }
-    write_json(args.output / "fisher.json", report)
-    if not args.quiet:
-        _print(args, known, groups, rows, source)
+        for camera, name in zip(self.views, names, strict=True):
+            rows.append(_view(output.path, blocks, camera, name, H, self.prior, compared, self.pose))
+            advance()
+        groups = {name: GroupSummary.of(x, by_block, name) for name, x in H.items()}
+        header = {"groups": list(H), "views": [camera.name for camera in cameras], "settings": settings}
+        save_state(output.path / "information.safetensors", H, header | {"blocks": list(by_block)})
+        write_json(output.path / "fisher.json", self._report(blocks, groups, rows))
+        return groups, rows
 
-
-def asked_blocks(
-    args: Fisher | View, given: SceneInput, settings: RenderSettings, cameras: Sequence[Camera]
-) -> SceneBlocks:
-    """What the options ask of the images of all these cameras; of a run, features count in the metric of its decoder.
-
-    Raises:
-        ValueError: If a block is named that the scene does not have.
-    """
-    scoring = dataclasses.replace(args.scoring, settings=settings, semantics=given.semantics())
-    return SceneBlocks.of(given.scene, scoring.over(given.estimated), cameras, "fisher")
+    def _report(self, blocks: SceneBlocks, groups: dict[str, GroupSummary], rows: list[MappedView]) -> dict[str, Any]:
+        """What fisher.json holds."""
+        scoring = self.scoring
+        is_probed = "deformation" in blocks.names or scoring.method == "probes"
+        return {
+            "schema": SCHEMA,
+            "command": "fisher",
+            "scene": str(self.path),
+            "gaussians": len(self.given.gaussians),
+            "method": scoring.method,
+            "prior": self.prior.to_json(),
+            "blocks": list(blocks.names),
+            "semantics": blocks.metric.to_json() if blocks.metric else None,
+            **blocks.scoring.nuisances.if_any(),
+            "probes": scoring.probes if is_probed else None,
+            "settings": dataclasses.asdict(scoring.settings),
+            "pixels": self.known.pixels,
+            "known": {"source": self.known.source, "names": [camera.name for camera in self.known.cameras]},
+            "groups": {name: dataclasses.asdict(row) for name, row in groups.items()},
+            "source": self.source,
+            "views": [row.to_json() for row in rows],
+        }
 
 
 def _map_kinds(names: Sequence[str]) -> list[str]:
@@ -247,13 +290,14 @@ def map_weights(
 
 
 def _view(
-    args: Fisher,
+    folder: Path,
     asked: SceneBlocks,
     camera: Camera,
     name: str,
     H: Information,
     prior: Prior,
     compared: ComparedMaps | None,
+    has_pose: bool,
 ) -> MappedView:
     """Maps of one view, and what it says."""
     Hc = together(asked.information(camera))
@@ -270,12 +314,12 @@ def _view(
         shown = {"": totals[kind]} | ({f"{block}.": x for block, x in parts.items()} if len(parts) > 1 else {})
         for prefix, values in shown.items():
             files.append(f"{name}.{prefix}{kind}.png")
-            pictures.write_png(args.output / files[-1], pictures.map_picture(values))
+            pictures.write_png(folder / files[-1], pictures.map_picture(values))
     if compared:
         files.append(f"{name}.maps.png")
-        pictures.write_png(args.output / files[-1], compared.row(camera, maps["variance"]))
+        pictures.write_png(folder / files[-1], compared.row(camera, maps["variance"]))
     pose = None
-    if args.pose:
+    if has_pose:
         found = fisher.pose_information(asked.scene, camera, asked.scoring.settings)
         pose = PoseSummary(found.tolist(), torch.linalg.eigvalsh(found).tolist())
     gain = {criterion: information_gain(Hc, H, criterion, prior).total for criterion in ("logdet", "eig")}
@@ -319,3 +363,51 @@ def _parts(blocks: dict[str, float], several: tuple[str, ...]) -> tuple[str, ...
     """What share of a sum each block has, for those columns."""
     total = sum(blocks.values())
     return tuple(f"{100 * blocks[block] / total:.1f}" if total else "-" for block in several)
+
+
+# ---------------------------------------------------------------------------------- maps of several rules, side by side
+
+
+_SMALL = 200  # pixels of width, below which a picture is enlarged by a whole number
+
+
+class ComparedMaps:
+    """Maps of `moments`, of `fisherrf` and of every block, of views that are compared with known ones.
+
+    Args:
+        scene: The scene that is seen.
+        settings: Settings of the renderer.
+        prior: lambda.
+    """
+
+    def __init__(self, scene: Scene, settings: RenderSettings, prior: Prior) -> None:
+        self.scene = scene
+        self.settings = settings
+        self.prior = prior
+        self.known: dict[str, torch.Tensor] = {}  # as FisherRF's code computes it
+
+    def know(self, camera: Camera) -> None:
+        """Add a known view."""
+        add(self.known, fisher.diagonal(self.scene, camera, self.settings, "fisherrf"))
+
+    def row(self, camera: Camera, blocks: dict[str, np.ndarray]) -> np.ndarray:
+        """(H, W, 3) uint8: the view as it is rendered, then the maps, each on a scale of its own.
+
+        Args:
+            camera: The camera of the view.
+            blocks: Block -> (H, W) variance map.
+        """
+        with torch.no_grad():  # a picture
+            seen = self.scene.at(camera.time)
+        image = render(seen.replace(features=None), camera, self.settings, outputs=()).rgb.cpu().numpy()
+        maps = {
+            "moments": moments_map(seen, camera, self.settings).numpy(),
+            "fisherrf": fisherrf_map(seen, camera, self.known, self.prior, self.settings).numpy(),
+            **blocks,
+        }
+        times = max(1, -(-_SMALL // camera.width))
+        large = lambda x: np.repeat(np.repeat(x, times, 0), times, 1)  # noqa: E731
+        when = "" if camera.time is None else f" at {camera.time:g}"
+        panels = [pictures.caption(large(image), f"{camera.name or 'view'}{when}")]
+        panels += [pictures.caption(pictures.map_picture(large(x)), name) for name, x in maps.items()]
+        return np.concatenate(panels, axis=1)

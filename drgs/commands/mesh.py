@@ -44,8 +44,8 @@ def run(args: Mesh) -> None:
                 "a file of Gaussians does not say its views: --cameras must name a data set, a run or a cameras.json"
             )
         lenses = given.keeps_lenses(args.undistort)
-        known = known_views(args.cameras if given.run is None else None, args, given, lenses)
-        seen = known if args.cameras is None else known_views(args.cameras, args, given, lenses)
+        known = known_views(args.cameras if given.run is None else None, args, given, lenses, args.info_pixels)
+        seen = known if args.cameras is None else known_views(args.cameras, args, given, lenses, args.info_pixels)
         cameras = evenly(_places(seen.cameras), args.limit or len(seen.cameras))
         check_lenses("mesh", settings, cameras)
         with Bar("information" if args.meshing.crop else "depth", show=not args.quiet) as bar:

@@ -337,7 +337,7 @@ def _is_whole(camera: Camera) -> bool:
 
 
 def _resized(camera: Camera, width: int | None, height: int | None) -> Camera:
-    """The camera at the size asked for; one side single keeps the shape."""
+    """The camera at the size asked for; one side alone keeps the shape."""
     if width is None and height is None:
         return camera
     if width is None:
@@ -441,7 +441,7 @@ def forecast(gaussians: Gaussians, cameras: list[Camera], settings: RenderSettin
 
 @dataclasses.dataclass(frozen=True)
 class SingleFile:
-    """A film, or a picture, that is written single.
+    """A film, or a picture, that is written alone.
 
     Attributes:
         path: Path of the file, as it was given.

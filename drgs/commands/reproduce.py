@@ -8,16 +8,21 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drgs.commands import fisher
 from drgs.commands.command_line import config_fields
-from drgs.commands.options import Fisher
+from drgs.commands.fisher import InformationMaps
+from drgs.commands.options import Views
+from drgs.commands.scene_input import SceneInput
+from drgs.commands.viewpoints import check_lenses, held_out_views, known_views
 from drgs.display import tables
 from drgs.display.progress import Bar
+from drgs.information.blocks import MAP_PRIOR
+from drgs.information.scoring import Scoring
 from drgs.io.journal import SCHEMA
 from drgs.io.json_files import check_json, read_json
 from drgs.io.outputs import atomic_write, lock_folder, write_json
 from drgs.metrics import Lpips
 from drgs.runtime.machine import commit, cpu_model
+from drgs.settings import RenderSettings
 from drgs.studies.cells import run_cells
 from drgs.studies.plan import StudyPlan, plan_of
 from drgs.studies.results import results_page, results_rows
@@ -119,24 +124,26 @@ def _figures(plan: StudyPlan, out: Path, args: Reproduce) -> list[tuple[str, str
         )
     shown = f"{cell.scene}, {view}: what each policy's fit makes of a view that none has seen, the truth last"
     last = list(folders)[-1]
-    fisher.run(
-        Fisher(
-            scene=folders[last],
-            cameras=str(plan.study.folder(cell.scene, cell.split)),
-            split="test",
-            limit=1,
-            maps=True,
-            output=out / f"{args.what}-maps",
-            preset="fast",
-            quiet=True,
-        )
-    )
-    folder = out / f"{args.what}-maps"
-    listed = read_json(folder / "fisher.json", "the maps of a view", "repeat the command")["views"]
-    # Not what another data set has left there.
-    maps = [folder / name for view in listed for name in view["files"] if name.endswith(".maps.png")]
+    maps = _maps(folders[last], out / f"{args.what}-maps")
     told = f"What moments, FisherRF and our blocks look at in a view of {cell.scene}, after `{last}`"
     return [(f"{args.what}.png", shown), *((f"{path.parent.name}/{path.name}", told) for path in maps)]
+
+
+def _maps(run: Path, folder: Path) -> list[Path]:
+    """Write maps of what rules look at in the first held-out view of a run; their files."""
+    given = SceneInput.at(run)
+    assert given.record is not None
+    settings = RenderSettings.preset("fast", background=given.record.config.settings.background)
+    reading = Views()
+    known = known_views(None, reading, given, given.keeps_lenses())
+    views = held_out_views(reading, given, known)[:1]
+    check_lenses("reproduce", settings, [*known.cameras, *views])
+    scoring = given.scoring(Scoring(), settings)
+    output = lock_folder(folder, "fisher", ["information.safetensors", "fisher.json"], [run])
+    maps = InformationMaps(run, given, scoring, MAP_PRIOR, known, views, f"{run} (test)", compare=True)
+    _, rows = maps.write(output)
+    # Not what another data set has left there.
+    return [folder / name for row in rows for name in row.files if name.endswith(".maps.png")]
 
 
 def _write(plan: StudyPlan, rows: list[dict], out: Path, args: Reproduce, pictures: list[tuple[str, str]]) -> None:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from drgs.features.decoder import Decoder
     from drgs.features.segmentation import Classes
     from drgs.information.nuisances import Nuisance
+    from drgs.information.scoring import Scoring
     from drgs.information.semantics import SemanticMetric
 
 __all__ = ["SELECTION", "SceneInput", "ranking_of"]
@@ -101,6 +102,13 @@ class SceneInput:
     def over_background(self, settings: RenderSettings) -> RenderSettings:
         """What --preset and --set say (`args.settings()`), over the background of the fit unless --set names one."""
         return settings if settings.background == self.background else settings.replace(background=self.background)
+
+    def scoring(self, scoring: Scoring, settings: RenderSettings) -> Scoring:
+        """A scoring for views of it: rendered with these settings, features in the metric of its decoder, and without
+        the unknowns that its fit has estimated, unless the scoring says which are eliminated.
+        """
+        scoring = dataclasses.replace(scoring, settings=settings, semantics=self.semantics())
+        return scoring.over(self.estimated)
 
     def semantics(self) -> SemanticMetric | None:
         """The metric of its decoder, in which features tell about the geometry; None without a decoder."""

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.commands.fisher import asked_blocks
 from drgs.commands.orbits import Wish, capture_orbit, scene_orbit
 from drgs.commands.painters import PAINTINGS, painters
 from drgs.commands.scene_input import SELECTION, SceneInput, ranking_of
@@ -23,7 +22,7 @@ from drgs.data.capture import Focus, upright
 from drgs.display.progress import Bar, quietly
 from drgs.ellipsoids import Gaussians
 from drgs.fitting.records import fitted_views
-from drgs.information.blocks import MAP_PRIOR
+from drgs.information.blocks import MAP_PRIOR, SceneBlocks
 from drgs.information.sums import together
 from drgs.io import interrupts
 from drgs.io.checkpoint import state_header
@@ -194,7 +193,7 @@ def _known(args: View, given: SceneInput, notes: list[str]) -> Known | None:
     if args.train is None and given.run is None:
         return None
     try:
-        return known_views(args.train, args, given, given.keeps_lenses())
+        return known_views(args.train, args, given, given.keeps_lenses(), args.info_pixels)
     except (OSError, ValueError) as error:
         if args.train is not None:
             raise
@@ -231,7 +230,8 @@ def _uncertainty(args: View, given: SceneInput, known: Known | None) -> Uncertai
         cameras = [camera for camera in cameras if camera.time is not None]
     if not cameras:
         return None
-    blocks = asked_blocks(args, given, given.settings("fast"), cameras)
+    scoring = given.scoring(args.scoring, given.settings("fast"))
+    blocks = SceneBlocks.of(given.scene, scoring, cameras, "fisher")
     prior = args.scoring.prior or MAP_PRIOR
     return Uncertainty(
         cameras,

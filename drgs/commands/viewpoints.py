@@ -51,6 +51,7 @@ __all__ = [
     "drawn_views",
     "evenly",
     "frame_size",
+    "held_out_views",
     "known_views",
     "other_views",
     "seen_views",
@@ -283,14 +284,17 @@ class Known:
     lenses: bool = False
 
 
-def known_views(text: str | None, args: Select | Fisher, given: SceneInput, lenses: bool = False) -> Known:
+def known_views(
+    text: str | None, args: Views, given: SceneInput, lenses: bool = False, pixels: int | None = None
+) -> Known:
     """The views of `--train`, else those that the run was fitted to.
 
     Args:
         text: A data set (all its views), a run (those it was fitted to), a cameras.json, or None.
-        args: Options of the command, of which `info_pixels` and `strict` apply.
+        args: How data sets are read.
         given: What the command looks at, whose run is taken where `text` is None.
         lenses: Cameras keep their lenses, these and those that are compared with them.
+        pixels: They are reduced to at most so many; None: to those of the fit.
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If a file of Gaussians comes without `--train`, or a run's data set no longer has its views.
@@ -299,16 +303,16 @@ def known_views(text: str | None, args: Select | Fisher, given: SceneInput, lens
         raise ValueError(
             "a file of Gaussians has no record of its views: --train must name a data set, a run or a cameras.json"
         )
-    known = _known_views(text, args, given, lenses)
+    known = _known_views(text, args, given, lenses, pixels)
     if text is not None:
         _check_seen(given.gaussians, known.cameras)
     return known
 
 
-def _known_views(text: str | None, args: Select | Fisher, given: SceneInput, lenses: bool) -> Known:
+def _known_views(text: str | None, args: Views, given: SceneInput, lenses: bool, pixels: int | None) -> Known:
     """The views of `known_views`, whatever they show."""
     source = Source.known(text, given)
-    pixels = args.info_pixels or (_PIXELS if given.record is None else given.record.config.data.max_pixels)
+    pixels = pixels or (_PIXELS if given.record is None else given.record.config.data.max_pixels)
     where = str(Path(source.text))
     if source.kind == "list":
         cameras = [at_most(_seen(camera, lenses), pixels) for camera in source.listed()]
@@ -330,6 +334,22 @@ def _known_views(text: str | None, args: Select | Fisher, given: SceneInput, len
     sizes = {size(a): size(b) for a, b in zip(stated, checked, strict=True)}
     cameras = [_camera(view, {}, pixels, lenses) for view in checked]
     return Known(cameras, where, pixels, place.resolve(), sizes, lenses)
+
+
+def held_out_views(args: Views, given: SceneInput, known: Known) -> list[Camera]:
+    """Cameras of the views that a run was not fitted to, reduced as the known ones are.
+
+    Args:
+        args: How data sets are read.
+        given: What is looked at: a run.
+        known: The views that it was fitted to.
+    Raises:
+        FileNotFoundError, ValueError: If its data set has gone, or there is none.
+    """
+    assert given.run is not None
+    source = Source("--cameras", str(given.run.path), "run", given)
+    views = source.split(source.dataset(args, given), "test", given)
+    return [_camera(view, known.sizes, known.pixels, known.lenses) for view in views]
 
 
 def _check_seen(gaussians: Gaussians, cameras: list[Camera]) -> None:

@@ -61,6 +61,9 @@ class Scoring(Record):
     Criterion, method, groups and blocks are of policy `fisher`, method and groups not of `block_logdet`; weights are of
     `fisher` and `fisherrf`. Groups of a scene's network need method `columns` or `probes`.
 
+    Attributes:
+        settings: What `drgs.render` computes of a view.
+        semantics: Metric of the block semantic; None: that of features as they are stored, all channels alike.
     Raises:
         ValueError: If a criterion, method or block is unknown, blocks cannot be combined so, or something else is of
             the wrong kind.
