@@ -6,10 +6,11 @@ nothing in it is a Gaussian. Times are medians of interleaved runs with warm ker
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -37,7 +38,9 @@ from drgs.train import FitConfig, fit
 
 if TYPE_CHECKING:
     from drgs.commands.options import Demo
+    from drgs.data import Dataset
     from drgs.ellipsoids import Gaussians
+    from drgs.train import FitResult
 
 __all__ = ["Plan", "make_demo", "run"]
 
@@ -139,96 +142,140 @@ def make_demo(out_dir: Path, plan: Plan, progress: bool = False) -> dict:
 def _make_demo(out_dir: Path, run_folder: LockedFolder, plan: Plan, progress: bool) -> dict:
     """The tour, in folders that belong to it: six stages, each timed, and demo.json at the end."""
     run_folder.check_all(_OWN)
+    tour = _Tour(out_dir, plan, progress)
     began = time.perf_counter()
-    seconds = {}
-
-    def say(text: str) -> None:
-        if progress:
-            print(text, flush=True)
-
-    def lap(stage: str, start: float) -> float:
-        seconds[stage] = time.perf_counter() - start
-        return seconds[stage]
-
-    start = time.perf_counter()
-    still_life = maker_of("still_life")
-    size = {"views": plan.views, "width": plan.width, "height": plan.height, "spp": plan.spp}
-    with Bar("path tracing", plan.views, progress) as bar:
-        data = still_life.generate(out_dir / "still_life", **size, progress=lambda done, total: bar.update(done, total))
-    took = lap("still life", start)
-    say(f"1. Still life: {plan.views} views of {plan.width}x{plan.height}, path traced from meshes ({took:.0f} s)")
-
-    start = time.perf_counter()
-    dataset = load(data)
-    config = FitConfig().replace(
-        renderers=("fast",),  # the picture shows what others make of it; to take all in turn takes twice as long
-        max_steps=plan.steps,
-        max_gaussians=plan.gaussians,
-        max_pixels=plan.width * plan.height,
-        save_every=plan.steps,
-    )
+    dataset = load(tour.still_life())
     run_folder.clear(_OWN)
-    fitted = fit(dataset, out_dir / "run", config, progress=progress)
-    lap("fit", start)
-    g, mean = fitted.gaussians, fitted.metrics["mean"]
-    frames = frames_for(dataset.split()[1], config.data)
-    say(
-        f"2. Fit: {len(g)} Gaussians, {plan.steps} steps in {fitted.seconds:.0f} s; {len(frames)} views that it never "
-        f"saw: PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.3f}, FLIP {mean['flip']:.3f}"
-    )
-
-    start = time.perf_counter()
-    with Bar("presets compared", show=progress):
-        images, rows = _compare(g, frames, plan.repeats)
-    lap("comparison", start)
-    say(f"3. The same Gaussians by the rules of other renderers ({len(frames)} held-out views)")
-    if progress:
-        _table(rows)
-
-    start = time.perf_counter()
-    with Bar("float64 oracle", show=progress):
-        oracle = _check(g, frames[0], images["exact"][0], plan.crop)
-    lap("oracle", start)
-    say(
-        f"4. Float64 oracle, {oracle['width']}x{oracle['height']} pixels of view {oracle['view']}: `exact` is off by "
-        f"at most {oracle['max_error']:.1e} (claimed: 1e-5) where no two of {oracle['hits_a_ray']:.0f} hits a ray tie "
-        f"({100 * oracle['ties']:.0f} % of the pixels do)"
-    )
-
-    start = time.perf_counter()
-    with Bar("Mitsuba's integrator", show=progress):
-        peer = _race(g, frames[0].camera, plan.repeats)
-    lap("peer", start)
-    say(
-        f"5. Mitsuba's own volprim_rf_basic: {1e3 * peer['volprim_rf_basic']:.0f} ms a view, `fast`: "
-        f"{1e3 * peer['fast']:.0f} ms, {peer['ratio']:.1f} times as fast (interleaved, {plan.repeats} rounds)"
-    )
-
-    start = time.perf_counter()
-    known = [frame.camera for frame in frames_for(dataset.split()[0], config.data)]
-    pictures.write_png(out_dir / "overview.png", _overview(g, known, frames, images["exact"]))
-    pictures.write_png(out_dir / "comparison.png", _sheet(frames, images))
-    _turntable(g, out_dir / "turntable.webm", plan, progress)
-    page = fitted.run.path / FILE
-    report_of(fitted.run, page, dataset)
-    lap("pictures", start)
-    seconds["total"] = time.perf_counter() - began
-    names = ", ".join(str(out_dir / name) for name in ("overview.png", "comparison.png", "turntable.webm"))
-    say(f"6. Pictures: {names}; the fit's report: {page}")
-    say(f"All of it took {seconds['total']:.0f} s; numbers: {out_dir / 'demo.json'}")
+    fitted, frames = tour.fit(dataset)
+    g = fitted.gaussians
+    images, rows = tour.compare(g, frames)
+    oracle = tour.check(g, frames, images)
+    peer = tour.race(g, frames)
+    tour.draw(dataset, fitted, frames, images)
+    tour.seconds["total"] = time.perf_counter() - began
+    tour.say(f"All of it took {tour.seconds['total']:.0f} s; numbers: {out_dir / 'demo.json'}")
+    measured = fitted.metrics
     report = {
         "schema": SCHEMA,
         "command": "demo",
         "plan": dataclasses.asdict(plan),
-        "fit": {"gaussians": len(g), "seconds": fitted.seconds, "split": fitted.metrics["split_rule"], "mean": mean},
+        "fit": {
+            "gaussians": len(g),
+            "seconds": fitted.seconds,
+            "split": measured["split_rule"],
+            "mean": measured["mean"],
+        },
         "presets": [dataclasses.asdict(row) for row in rows],
         "oracle": oracle,
         "peer": peer,
-        "seconds": seconds,
+        "seconds": tour.seconds,
         "env": runtime.info(),
     }
     write_json(out_dir / "demo.json", report)
     return report
+
+
+@dataclasses.dataclass
+class _Tour:
+    """The stages of the demo; each says what comes out, and how long it took is in `seconds`."""
+
+    out_dir: Path
+    plan: Plan
+    progress: bool
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    @property
+    def config(self) -> FitConfig:
+        """The fit's configuration."""
+        return FitConfig().replace(
+            renderers=("fast",),  # the picture shows what others make of it; to take all in turn takes twice as long
+            max_steps=self.plan.steps,
+            max_gaussians=self.plan.gaussians,
+            max_pixels=self.plan.width * self.plan.height,
+            save_every=self.plan.steps,
+        )
+
+    def say(self, text: str) -> None:
+        """A line on stdout."""
+        if self.progress:
+            print(text, flush=True)
+
+    @contextlib.contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """The time of a stage."""
+        start = time.perf_counter()
+        yield
+        self.seconds[stage] = time.perf_counter() - start
+
+    def still_life(self) -> Path:
+        """1. The photographs; their folder."""
+        plan = self.plan
+        size = {"views": plan.views, "width": plan.width, "height": plan.height, "spp": plan.spp}
+        with self.timed("still life"), Bar("path tracing", plan.views, self.progress) as bar:
+            show = lambda done, total: bar.update(done, total)  # noqa: E731
+            data = maker_of("still_life").generate(self.out_dir / "still_life", **size, progress=show)
+        took = self.seconds["still life"]
+        size_text = f"{plan.views} views of {plan.width}x{plan.height}"
+        self.say(f"1. Still life: {size_text}, path traced from meshes ({took:.0f} s)")
+        return data
+
+    def fit(self, dataset: Dataset) -> tuple[FitResult, list[Frame]]:
+        """2. The fit, and its held-out views."""
+        plan = self.plan
+        with self.timed("fit"):
+            fitted = fit(dataset, self.out_dir / "run", self.config, progress=self.progress)
+        mean = fitted.metrics["mean"]
+        frames = frames_for(dataset.split()[1], self.config.data)
+        self.say(
+            f"2. Fit: {len(fitted.gaussians)} Gaussians, {plan.steps} steps in {fitted.seconds:.0f} s; {len(frames)} "
+            f"views that it never saw: PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.3f}, FLIP {mean['flip']:.3f}"
+        )
+        return fitted, frames
+
+    def compare(self, g: Gaussians, frames: list[Frame]) -> tuple[dict[str, list[torch.Tensor]], list[PresetRow]]:
+        """3. Images of the presets, and what they differ in."""
+        with self.timed("comparison"), Bar("presets compared", show=self.progress):
+            images, rows = _compare(g, frames, self.plan.repeats)
+        self.say(f"3. The same Gaussians by the rules of other renderers ({len(frames)} held-out views)")
+        if self.progress:
+            _table(rows)
+        return images, rows
+
+    def check(self, g: Gaussians, frames: list[Frame], images: dict[str, list[torch.Tensor]]) -> dict:
+        """4. `exact` against the float64 oracle."""
+        with self.timed("oracle"), Bar("float64 oracle", show=self.progress):
+            oracle = _check(g, frames[0], images["exact"][0], self.plan.crop)
+        self.say(
+            f"4. Float64 oracle, {oracle['width']}x{oracle['height']} pixels of view {oracle['view']}: `exact` is off "
+            f"by at most {oracle['max_error']:.1e} (claimed: 1e-5) where no two of {oracle['hits_a_ray']:.0f} hits a "
+            f"ray tie ({100 * oracle['ties']:.0f} % of the pixels do)"
+        )
+        return oracle
+
+    def race(self, g: Gaussians, frames: list[Frame]) -> dict:
+        """5. `fast` against Mitsuba's integrator."""
+        with self.timed("peer"), Bar("Mitsuba's integrator", show=self.progress):
+            peer = _race(g, frames[0].camera, self.plan.repeats)
+        self.say(
+            f"5. Mitsuba's own volprim_rf_basic: {1e3 * peer['volprim_rf_basic']:.0f} ms a view, `fast`: "
+            f"{1e3 * peer['fast']:.0f} ms, {peer['ratio']:.1f} times as fast (interleaved, {self.plan.repeats} rounds)"
+        )
+        return peer
+
+    def draw(
+        self, dataset: Dataset, fitted: FitResult, frames: list[Frame], images: dict[str, list[torch.Tensor]]
+    ) -> None:
+        """6. Pictures, and the report of the fit."""
+        page = fitted.run.path / FILE
+        g = fitted.gaussians
+        with self.timed("pictures"):
+            known = [frame.camera for frame in frames_for(dataset.split()[0], self.config.data)]
+            pictures.write_png(self.out_dir / "overview.png", _overview(g, known, frames, images["exact"]))
+            pictures.write_png(self.out_dir / "comparison.png", _sheet(frames, images))
+            _turntable(g, self.out_dir / "turntable.webm", self.plan, self.progress)
+            report_of(fitted.run, page, dataset)
+        names = ", ".join(str(self.out_dir / name) for name in ("overview.png", "comparison.png", "turntable.webm"))
+        self.say(f"6. Pictures: {names}; the fit's report: {page}")
 
 
 def _compare(g: Gaussians, frames: list[Frame], repeats: int) -> tuple[dict[str, list[torch.Tensor]], list[PresetRow]]:

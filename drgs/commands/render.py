@@ -79,14 +79,7 @@ def run(args: Render) -> None:
     if single is not None:
         args = dataclasses.replace(args, output=single.folder, format=single.format)
     formats = _formats("png" if args.format is None else args.format)
-    Wish.of(args)
-    check_flight_options(args)
-    if args.moving and "ply" not in formats:
-        raise ValueError("render: --moving must have ply among --format, which only it means; add it or drop --moving")
-    if args.panorama:
-        check_panorama(settings)
-    if "mp4" in formats:
-        need_mp4("render: --format mp4")
+    _check(args, settings, formats)
     film = film_of(args)
     views = _views_of(args)
     movie = "flight" if args.path is not None else "turntable" if views == "orbit" else "video"
@@ -128,6 +121,26 @@ def run(args: Render) -> None:
     if single is not None:
         _say(args, _summary(report, single.path))
         return
+    _write_lists(args, report, film, given, cameras, formats)
+    _say(args, _summary(report, args.output))
+
+
+def _check(args: Render, settings: RenderSettings, formats: tuple[str, ...]) -> None:
+    """Raise ValueError for options that contradict each other, before anything is read."""
+    Wish.of(args)
+    check_flight_options(args)
+    if args.moving and "ply" not in formats:
+        raise ValueError("render: --moving must have ply among --format, which only it means; add it or drop --moving")
+    if args.panorama:
+        check_panorama(settings)
+    if "mp4" in formats:
+        need_mp4("render: --format mp4")
+
+
+def _write_lists(
+    args: Render, report: dict[str, Any], film: Film, given: SceneInput, cameras: list[Camera], formats: tuple[str, ...]
+) -> None:
+    """Write what stands beside pictures and films: ply files, cameras.json, render.json."""
     if film.flight is not None:
         report["flight"] = {
             "path": str(args.path),
@@ -145,7 +158,6 @@ def run(args: Render) -> None:
             "no cameras.json: its layout has no lens and no skew; render.json holds the cameras, --cameras reads it",
         )
     write_json(args.output / "render.json", {"schema": SCHEMA, "command": "render"} | report)
-    _say(args, _summary(report, args.output))
 
 
 def _is_one_place(args: Render) -> bool:

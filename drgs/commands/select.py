@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -20,7 +20,10 @@ from drgs.io.outputs import check_file, write_json
 from drgs.select import Refine, Selection, policy_named, select
 
 if TYPE_CHECKING:
+    from drgs.cameras import Camera
     from drgs.commands.options import Select
+    from drgs.commands.viewpoints import Known
+    from drgs.information.scoring import Scoring
 
 __all__ = ["print_picks", "run"]
 
@@ -62,6 +65,22 @@ def run(args: Select) -> None:
             workers=workers,
             refine=refine,
         )
+    report = _report(args, given, scoring, selection, known, candidates, source)
+    write_json(args.output, report)
+    if not args.quiet:
+        print_picks(report, selection, args.output)
+
+
+def _report(
+    args: Select,
+    given: SceneInput,
+    scoring: Scoring,
+    selection: Selection,
+    known: Known,
+    candidates: list[Camera],
+    source: str,
+) -> dict[str, Any]:
+    """What the JSON file holds."""
     shown = [{"index": i, "name": camera.name} for i, camera in enumerate(candidates)]
     timely = [{**one, "time": camera.time} for one, camera in zip(shown, candidates, strict=True)]
     cameras = [{"camera": described(camera)} for camera in candidates]
@@ -69,7 +88,7 @@ def run(args: Select) -> None:
     for record, pick in zip(picks, selection.picks, strict=True):
         if pick.camera is not None:
             record |= {"camera": described(pick.camera), "start": pick.start}
-    report = {
+    return {
         "schema": SCHEMA,
         "command": "select",
         "scene": str(args.scene),
@@ -81,7 +100,7 @@ def run(args: Select) -> None:
         **selection.blocks_json(),
         **(scoring.nuisances.if_any() if args.policy == "fisher" else {}),
         "seed": args.seed,
-        "settings": dataclasses.asdict(settings),
+        "settings": dataclasses.asdict(scoring.settings),
         "pixels": known.pixels,
         "known": {"source": known.source, "names": [camera.name for camera in known.cameras]},
         "source": source,
@@ -92,9 +111,6 @@ def run(args: Select) -> None:
         "evaluations": selection.evaluations,
         "seconds": selection.seconds,
     }
-    write_json(args.output, report)
-    if not args.quiet:
-        print_picks(report, selection, args.output)
 
 
 def _refine(args: Select) -> Refine | None:
