@@ -65,7 +65,8 @@ def parsed_options(kind: type[Common], words: Sequence[str]) -> Any:
 
 def _read(options: Mapping[str, Option], words: Sequence[str]) -> dict[str, Any]:
     """Name of an option -> its value, of those that words name."""
-    flags = {option.flag: option for option in options.values() if not option.spec.file_only}
+    places = [option for option in options.values() if option.spec.positional]
+    flags = {option.flag: option for option in options.values() if not option.spec.file_only and option not in places}
     short = {f"-{option.spec.short}": option for option in options.values() if option.spec.short}
     given: dict[str, Any] = {}
     alone: list[str] = []
@@ -86,7 +87,7 @@ def _read(options: Mapping[str, Option], words: Sequence[str]) -> dict[str, Any]
         option = flags.get(flag) or short.get(flag)
         is_no = option is None and flag.startswith("--no-") and "--" + flag[5:] in flags
         option = flags["--" + flag[5:]] if is_no else option
-        if option is None or option.spec.positional or (is_no and option.hint is not bool):
+        if option is None or (is_no and option.hint is not bool):
             near = nearest(flag.lstrip("-"), [x[2:] for x in flags]).replace("did you mean ", "did you mean --")
             raise ValueError(f"options must be those of the command, got {flag}; {near}")
         if option.hint is bool:
@@ -96,7 +97,6 @@ def _read(options: Mapping[str, Option], words: Sequence[str]) -> dict[str, Any]
             continue
         value = _values(option, [value] if equals else _taken(option, left))
         given[option.name] = (*given.get(option.name, ()), value) if option.spec.repeat else value
-    places = [option for option in options.values() if option.spec.positional]
     for option in places:
         if alone:
             several = _kinds(option.hint)[-1:] == (Ellipsis,)
@@ -235,13 +235,13 @@ def config_fields(path: Path, line: Mapping[str, Any]) -> dict[str, Any]:
     try:
         if isinstance(value, dict) and isinstance(value.get("settings"), dict):
             value = value | {"settings": _settings(value["settings"])}
-        found = stated(FitConfig, value)
-        nested(FitConfig, None, found)
+        values = stated(FitConfig, value)
+        nested(FitConfig, None, values)
     except (ValueError, NotImplementedError) as error:
         text = str(error).removeprefix(f"{FitConfig.where}: ")
         raise ValueError(f"{path}: {text}" + ("" if ";" in text else f"; {_ADVICE}")) from None
     names = {way: name for name, way in ways_of(FitConfig).items()}
-    fields = {names[way]: x for way, x in found.items()}
+    fields = {names[way]: x for way, x in values.items()}
     for name in ("policy", "criterion"):
         # Importing runs a module: that is for the person at the command line to ask for, not for a file from elsewhere.
         if ":" in str(fields.get(name, "")) and name not in line:
@@ -333,12 +333,12 @@ def help_page(command: str, kind: type[Common], words: Sequence[str] = ()) -> st
 
 def _config_of(words: Sequence[str]) -> dict[str, Any]:
     """The file that words name by --config, whatever else they say: help is asked for."""
-    found: dict[str, Any] = {}
+    line: dict[str, Any] = {}
     for word, following in itertools.pairwise([*words, ""]):
         flag, equals, value = word.partition("=")
         if flag == "--config":
-            found["config"] = Path(value if equals else following)
-    return found
+            line["config"] = Path(value if equals else following)
+    return line
 
 
 def _width() -> int:

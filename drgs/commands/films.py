@@ -86,8 +86,8 @@ def film_of(args: Render) -> Film:
         FileNotFoundError, ValueError: If there is no such flight, or there would be too many frames.
     """
     flight = None if args.path is None else read_flight(args.path)
-    told = flight.fps if flight is not None else None
-    fps = args.fps if args.fps is not None else told or _FPS
+    stated = flight.fps if flight is not None else None
+    fps = args.fps if args.fps is not None else stated or _FPS
     if flight is not None and args.duration is not None:
         flight = dataclasses.replace(flight, duration=args.duration)
     if args.frames is not None:
@@ -198,12 +198,12 @@ def named_view(cameras: list[Camera], name: str | None, where: str) -> list[Came
     """
     if name is None:
         return cameras
-    found = [camera for camera in cameras if camera.name == name or camera.name.startswith(f"{name}/")]
-    if not found:
+    named = [camera for camera in cameras if camera.name == name or camera.name.startswith(f"{name}/")]
+    if not named:
         known = list(dict.fromkeys(camera.name.rpartition("/")[0] or camera.name for camera in cameras))
         shown = ", ".join(known[:3]) + (", ..." if len(known) > 3 else "")
         raise ValueError(f"--view must name one of the {len(cameras)} views of {where}: {shown}; got {name!r}")
-    return found[:1]
+    return named[:1]
 
 
 def at_times(

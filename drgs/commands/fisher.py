@@ -291,7 +291,7 @@ def map_weights(
 
 def _view(
     folder: Path,
-    asked: SceneBlocks,
+    scene_blocks: SceneBlocks,
     camera: Camera,
     name: str,
     H: Information,
@@ -300,11 +300,11 @@ def _view(
     has_pose: bool,
 ) -> MappedView:
     """Maps of one view, and what it says."""
-    Hc = together(asked.information(camera))
-    rows = together(asked.with_unknowns().information(camera)) if asked.scoring.nuisances.names else None
+    Hc = together(scene_blocks.information(camera))
+    rows = together(scene_blocks.with_unknowns().information(camera)) if scene_blocks.scoring.nuisances.names else None
     weights = dict(zip(KINDS, map_weights(H, Hc, prior, rows), strict=True))
     maps = {
-        kind: {block: x.numpy() for block, x in asked.variance_maps(camera, of_kind).items()}
+        kind: {block: x.numpy() for block, x in scene_blocks.variance_maps(camera, of_kind).items()}
         for kind, of_kind in weights.items()
     }
     files = []
@@ -320,10 +320,10 @@ def _view(
         pictures.write_png(folder / files[-1], compared.row(camera, maps["variance"]))
     pose = None
     if has_pose:
-        found = fisher.pose_information(asked.scene, camera, asked.scoring.settings)
-        pose = PoseSummary(found.tolist(), torch.linalg.eigvalsh(found).tolist())
+        information = fisher.pose_information(scene_blocks.scene, camera, scene_blocks.scoring.settings)
+        pose = PoseSummary(information.tolist(), torch.linalg.eigvalsh(information).tolist())
     gain = {criterion: information_gain(Hc, H, criterion, prior).total for criterion in ("logdet", "eig")}
-    blocks = {block: {kind: MapSummary.of(maps[kind][block]) for kind in KINDS} for block in asked.names}
+    blocks = {block: {kind: MapSummary.of(maps[kind][block]) for kind in KINDS} for block in scene_blocks.names}
     return MappedView(camera.name, camera, files, gain, *(MapSummary.of(totals[kind]) for kind in KINDS), blocks, pose)
 
 

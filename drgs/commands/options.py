@@ -459,18 +459,18 @@ class Fit(Clustered, Data):
     @classmethod
     def values(cls, given: Mapping[str, Any], line: Collection[str]) -> dict[tuple[str, ...], Any]:
         """As for every command, with the render settings of the fit, and its selection with --views active alone."""
-        found = super().values(given, line)
+        values = super().values(given, line)
         if any(text.startswith("background=") for text in given.get("overrides", ())):
             raise ValueError("--set background: must be --background here, which photographs are composited on as well")
         background = given.get("background") or RenderSettings.background
         check_color("--background", background)
         renderers, preset = given.get("renderers", AUTO), given.get("preset")
         if renderers == AUTO and preset == "fast":
-            found["fit", "renderers"] = ("fast",)  # named, it is not what `auto` means
+            values["fit", "renderers"] = ("fast",)  # named, it is not what `auto` means
         settings = RenderSettings.preset(preset or own_preset(renderers), **parsed(given.get("overrides", ())))
-        found["fit", "settings"] = settings.replace(background=background)
+        values["fit", "settings"] = settings.replace(background=background)
         if given.get("views") == "active":
-            return {("fit", "selection"): SelectionConfig(), **found}
+            return {("fit", "selection"): SelectionConfig(), **values}
         if given.get("scheduler") is not None or given.get("workers") is not None:
             raise ValueError(
                 "fit: --scheduler and --workers must have --views active, got --views all; workers compute what "
@@ -482,7 +482,7 @@ class Fit(Clustered, Data):
                 raise ValueError(
                     f"fit: {one.flag} must have --views active, got --views all; add it or drop {one.flag}"
                 )
-        return {path: value for path, value in found.items() if path[:2] != ("fit", "selection")}
+        return {path: value for path, value in values.items() if path[:2] != ("fit", "selection")}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -510,14 +510,14 @@ def single_file(args: Render) -> SingleFile | None:
         return None
     if path.suffix[1:] not in known:
         raise ValueError(f"{path}: must end in {path.suffix.lower()} in small letters; rename it")
-    found = SingleFile(path)
-    if args.format not in (None, found.format):
+    single = SingleFile(path)
+    if args.format not in (None, single.format):
         raise ValueError(
             f"render: --format must be left out with -o {path}, got {args.format!r}; drop it, or name a folder"
         )
     for name in _MORE:
         if getattr(args, name):
             raise ValueError(f"render: --{name} must have a folder to write into, -o {path} is one file; name a folder")
-    if found.format in _PICTURES and pictures.file_names([found.stem]) != [found.stem]:
+    if single.format in _PICTURES and pictures.file_names([single.stem]) != [single.stem]:
         raise ValueError(f"{path}: must have a name of letters, digits, - _ and . alone; rename it")
-    return found
+    return single

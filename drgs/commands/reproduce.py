@@ -115,9 +115,9 @@ def _figures(plan: StudyPlan, out: Path, args: Reproduce) -> list[tuple[str, str
             units.setdefault((cell.scene, cell.split, cell.camera, cell.seed), {})[cell.policy] = cell
     if not units:
         return []
-    found = max(units.values(), key=len)
-    folders = {label: out / "runs" / plan.study.name / cell.name for label, cell in found.items()}
-    cell = next(iter(found.values()))
+    cells = max(units.values(), key=len)
+    folders = {label: out / "runs" / plan.study.name / cell.name for label, cell in cells.items()}
+    cell = next(iter(cells.values()))
     with Bar("comparison sheet"):
         view = comparison_sheet(
             {plan.experiment.policies[x]: path for x, path in folders.items()}, out / f"{args.what}.png"
@@ -190,15 +190,15 @@ def _command(args: Reproduce) -> str:
 
 def _print(plan: StudyPlan, rows: list[dict], out: Path, what: str) -> None:
     """The means on stdout."""
-    found = results_rows(plan.study, plan.experiment, rows)
-    metrics = [metric for metric in plan.study.metrics if any(row[metric.key] is not None for row in found)]
+    results = results_rows(plan.study, plan.experiment, rows)
+    metrics = [metric for metric in plan.study.metrics if any(row[metric.key] is not None for row in results)]
     lines = [
         (
             row["name"],
             *("-" if row[m.key] is None else f"{row[m.key]:.{m.digits}f}" for m in metrics),
             f"{row['best']['units']}/{row['best']['of']}",
         )
-        for row in found
+        for row in results
     ]
     tables.show(plan.experiment.title, ("policy", *(m.title for m in metrics), "best"), lines)
     print(f"tables and figures: {out / what}.md")

@@ -70,10 +70,10 @@ def check_color(option: str, color: tuple[float, ...]) -> None:
 
 def parsed_size(option: str, text: str) -> tuple[int, int]:
     """(width, height) of a WIDTHxHEIGHT; ValueError if it is none."""
-    found = re.fullmatch(r"(\d{1,9})x(\d{1,9})", text)
-    if not found:
+    sides = re.fullmatch(r"(\d{1,9})x(\d{1,9})", text)
+    if not sides:
         raise ValueError(f"{option}: must be WIDTHxHEIGHT, got {text!r}; say e.g. 320x240")
-    return int(found[1]), int(found[2])
+    return int(sides[1]), int(sides[2])
 
 
 def _setting(key: str, hint: Any, text: str) -> Any:

@@ -77,9 +77,9 @@ def _watch(args: View, viewer: Viewer, stamps: dict[Path, tuple[int, int, int]])
     """Look at the files now and then, and read them again when one has changed."""
     never = threading.Event()
     while not never.wait(_EVERY):
-        found = _stamps(watched_files(args))
-        if found != stamps and not viewer.worker.has("files"):
-            stamps = found
+        now = _stamps(watched_files(args))
+        if now != stamps and not viewer.worker.has("files"):
+            stamps = now
             viewer.worker.put("files", _reading(args, viewer))
 
 
@@ -91,14 +91,14 @@ def _reading(args: View, viewer: Viewer) -> Iterator[None]:
 
 def _stamps(paths: list[Path]) -> dict[Path, tuple[int, int, int]]:
     """What changes of a file when another one takes its place; those that are not there are left out."""
-    found = {}
+    stamps = {}
     for path in paths:
         try:
             seen = path.stat()
         except OSError:
             continue
-        found[path] = seen.st_mtime_ns, seen.st_size, seen.st_ino
-    return found
+        stamps[path] = seen.st_mtime_ns, seen.st_size, seen.st_ino
+    return stamps
 
 
 # ---------------------------------------------------------------------------------------------------- what is looked at
@@ -177,15 +177,15 @@ def _times(given: SceneInput) -> tuple[float, ...]:
 
 def _paint(args: View, given: SceneInput) -> dict[str, Painter]:
     """What draws features and labels, as far as there are any."""
-    found: dict[str, Painter] = {}
+    painters_of_kinds: dict[str, Painter] = {}
     if given.gaussians.features is None:
-        return found
+        return painters_of_kinds
     for kind in PAINTINGS:
         try:
-            found |= painters([kind], given, args.scene)
+            painters_of_kinds |= painters([kind], given, args.scene)
         except ValueError:  # no decoder, no classes: not offered
             continue
-    return found
+    return painters_of_kinds
 
 
 def _known(args: View, given: SceneInput, notes: list[str]) -> Known | None:
@@ -249,10 +249,10 @@ def _first(args: View, gaussians: Gaussians, captured: list[Camera]) -> FirstVie
     distance_of = seen_distance(gaussians)
     captured = sorted(captured, key=lambda camera: camera.name)  # an active run has them as they were picked
     width, height = _FIRST_SIZE
-    made, _ = capture_orbit(captured, 1, width=width, height=height, wish=wish, distance_of=distance_of)
-    camera = (made or captured[:1] or scene_orbit(gaussians, 1, width=width, height=height, wish=wish))[0]
+    orbit, _ = capture_orbit(captured, 1, width=width, height=height, wish=wish, distance_of=distance_of)
+    camera = (orbit or captured[:1] or scene_orbit(gaussians, 1, width=width, height=height, wish=wish))[0]
     up = np.array(wish.up or (upright(captured) if captured else UP["minus-y"]), np.float64)
-    focus = Focus.of(captured, wish.center, distance_of) if made else None
+    focus = Focus.of(captured, wish.center, distance_of) if orbit else None
     pose = pose_of(camera, gaussians.origin)
     axis = camera.c2w[:3, 2]
     if focus is not None:

@@ -154,11 +154,11 @@ def options_in(kind: type) -> Mapping[str, Option]:
     """Name -> option, of a record or a command's options and all records nested in it; those that a class declares
     itself come before those that it inherits.
     """
-    found: dict[str, Option] = {}
-    for each in _options(kind, (), None, _Part(None, False)):
-        assert each.name not in found, f"{kind.__name__}: {each.name} is the name of two options"
-        found[each.name] = each
-    return types.MappingProxyType(found)
+    options: dict[str, Option] = {}
+    for one in _options(kind, (), None, _Part(None, False)):
+        assert one.name not in options, f"{kind.__name__}: {one.name} is the name of two options"
+        options[one.name] = one
+    return types.MappingProxyType(options)
 
 
 def _options(kind: Any, path: tuple[str, ...], record: Any, shown: _Part) -> Iterable[Option]:
@@ -294,20 +294,20 @@ def _renamed(message: str, inner: Any, kind: Any) -> str:
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """What to do about a name that is unknown: `did you mean max_gaussians?`."""
-    found = difflib.get_close_matches(name, list(known), 1, 0.5)
-    return f"did you mean {found[0]}?" if found else "none has a name like it"
+    near = difflib.get_close_matches(name, list(known), 1, 0.5)
+    return f"did you mean {near[0]}?" if near else "none has a name like it"
 
 
 @functools.cache
 def hints_of(kind: type) -> Mapping[str, Any]:
     """Field -> its type, in their order; of records without those that are `TRANSIENT`."""
     space = vars(sys.modules[kind.__module__])
-    found: dict[str, Any] = {}
+    hints: dict[str, Any] = {}
     for field in dataclasses.fields(kind):
         if not field.metadata.get("transient"):
             alone = types.SimpleNamespace(__annotations__={field.name: field.type})
-            found |= typing.get_type_hints(alone, space)
-    return types.MappingProxyType(found)
+            hints |= typing.get_type_hints(alone, space)
+    return types.MappingProxyType(hints)
 
 
 @functools.cache
@@ -315,15 +315,15 @@ def ways_of(kind: type) -> Mapping[str, tuple[str, ...]]:
     """Field, of the record and of those nested in it -> the names that lead to it: max_pixels -> (data, max_pixels)."""
     hints = hints_of(kind)
     specs = {field.name: field.metadata.get(_OPTION) for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    found: dict[str, tuple[str, ...]] = {
+    ways: dict[str, tuple[str, ...]] = {
         (spec and spec.name) or name: (name,) for name, spec in specs.items() if name in hints
     }
     for name, hint in hints.items():
         if part := part_of(hint):
             for inner, way in ways_of(part).items():
-                assert inner not in found, f"{kind.__name__}: {inner} is the name of two fields"
-                found[inner] = (name, *way)
-    return types.MappingProxyType(found)
+                assert inner not in ways, f"{kind.__name__}: {inner} is the name of two fields"
+                ways[inner] = (name, *way)
+    return types.MappingProxyType(ways)
 
 
 @functools.cache
@@ -353,7 +353,7 @@ def stated(kind: Any, value: Any, where: str | None = None) -> dict[tuple[str, .
     where = kind.where if where is None else where
     must_be(where, "config", value, dict, f"as {kind.__name__}.to_json() makes it")
     hints, ways = hints_of(kind), ways_of(kind)
-    found: dict[tuple[str, ...], Any] = {}
+    values: dict[tuple[str, ...], Any] = {}
     for name, x in value.items():
         if name not in hints and name not in ways:
             raise ValueError(
@@ -365,16 +365,16 @@ def stated(kind: Any, value: Any, where: str | None = None) -> dict[tuple[str, .
         inner = part_of(hint)
         may_be_none = type(None) in typing.get_args(hint)
         if inner is None:
-            found[way] = _converted(where, name, x, hint)
+            values[way] = _converted(where, name, x, hint)
         elif x is None and may_be_none:
-            found[way] = None
+            values[way] = None
         elif isinstance(x, dict):
             if may_be_none:
-                found[way] = inner()
-            found |= {(*way, *rest): y for rest, y in stated(inner, x, where).items()}
+                values[way] = inner()
+            values |= {(*way, *rest): y for rest, y in stated(inner, x, where).items()}
         else:
             raise ValueError(f"{where}: {name} must be an object with fields of {inner.__name__}, got {kind_of(x)}")
-    return found
+    return values
 
 
 def _hint(kind: Any, way: tuple[str, ...]) -> Any:
@@ -416,8 +416,8 @@ def first_difference(mine: dict, theirs: dict) -> tuple[str, Any, Any] | None:
     for name, x in mine.items():
         y = theirs[name]
         if isinstance(x, dict) and isinstance(y, dict):
-            if found := first_difference(x, y):
-                return found
+            if inner := first_difference(x, y):
+                return inner
         elif x != y:
             return name, x, y
     return None
