@@ -241,12 +241,9 @@ def render_views(
     views: list[dict[str, Any]] = []
     seen = False
     with contextlib.ExitStack() as stack:
+        films = {end: film for end, film in _FILMS.items() if end in formats}
         movies: dict[str, list] = {
-            kind: [
-                stack.enter_context(film(out_dir / _movie_of(video, kind, end), fps))
-                for end, film in _FILMS.items()
-                if end in formats
-            ]
+            kind: [stack.enter_context(film(out_dir / _movie_of(video, kind, end), fps)) for end, film in films.items()]
             for kind in ("", *paint)
         }
         for camera, name in zip(cameras, pictures.file_names([camera.name for camera in cameras]), strict=True):
@@ -271,12 +268,8 @@ def render_views(
             if advance:
                 advance()
     if not seen:
-        _log.warning(
-            "none of the %d views shows anything of the scene: do the cameras belong to it? (near is %g, extent %s)",
-            len(views),
-            settings.near,
-            settings.extent,
-        )
+        text = "none of the %d views shows anything of the scene: do the cameras belong to it? (near is %g, extent %s)"
+        _log.warning(text, len(views), settings.near, settings.extent)
     return _report(settings, views, [movie.path.name for some in movies.values() for movie in some], fps)
 
 
