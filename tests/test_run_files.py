@@ -174,7 +174,7 @@ _OTHERS = {
     "codecs/glb.py",  # the header of a .glb
     "codecs/sog.py",  # the index in a .sog
     "commands/info.py",  # stdout
-    "commands/repeat.py",  # options on a line of a report
+    "commands/report.py",  # options on a line of a report
     "data/flight_files.py",  # flight.json: docs/view.md
     "data/reader_process.py",  # between processes
     "io/checkpoint.py",  # the header of a checkpoint
