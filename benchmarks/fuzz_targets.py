@@ -145,7 +145,7 @@ def _scene(folder: Path) -> None:
 
 
 def _points(folder: Path) -> None:
-    from drgs.data.points import read_point_ply
+    from drgs.data.point_ply import read_point_ply
 
     read_point_ply(folder / "points.ply")
 

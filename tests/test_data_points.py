@@ -15,7 +15,7 @@ from drgs.data import Dataset, View, added_points, initial_points, kept_matches,
 from drgs.data.guesses import points_beside
 from drgs.data.guided import Matches
 from drgs.data.matching import nearby_pairs, sequential_pairs
-from drgs.data.points import read_point_ply
+from drgs.data.point_ply import read_point_ply
 from drgs.fitting.active import ActiveViews
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import load_frames

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from drgs import files
-from drgs.data.points import read_point_ply
+from drgs.data.point_ply import read_point_ply
 from drgs.ellipsoids import Gaussians
 from drgs.files import Run, load_ply, load_state, save_ply, save_state
 

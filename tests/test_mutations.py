@@ -18,7 +18,7 @@ from drgs.cameras import orbit
 from drgs.data import load
 from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.data.checks import read_image
-from drgs.data.points import read_point_ply
+from drgs.data.point_ply import read_point_ply
 from drgs.files import SCHEMA, Run, load_ply, load_state, save_ply, save_state
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import Frame

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from drgs.cameras import Camera
 
-__all__ = ["Focus", "level_frame", "middle_camera", "path", "upright"]
+__all__ = ["Focus", "level_frame", "middle_camera", "path", "scene_extent", "upright"]
 
 _ROUNDS = 30  # of reweighting; the median of lines settles in about ten
 _MEETING = 0.02  # smallest mean squared sine between the axes and their mean: 8 degrees
@@ -33,6 +33,7 @@ _TURN = 75.0  # degrees between photographs of one path
 _SMOOTH = 0.75  # standard deviation of the smoothing in steps between photographs, at least
 _STEEPEST = 80.0  # degrees above or below the horizon, beyond which an axis does not say what is ahead
 _SMOOTHED = 40  # and in parts of the whole path, of which a video has many photographs
+_EXTENT_MARGIN = 1.1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,6 +154,29 @@ def level_frame(camera: Camera, up: np.ndarray) -> tuple[np.ndarray, np.ndarray,
         ahead = ahead - (ahead @ up) * up
     ahead /= np.linalg.norm(ahead)
     return np.cross(ahead, up), up, ahead
+
+
+def scene_extent(cameras: list[Camera], points: np.ndarray | None = None) -> float:
+    """1.1 x the largest distance of a camera center to their mean (3DGS), in scene units.
+
+    Where that is 0 (one camera, or all at one place), 1.1 x the median distance of the points to
+    it; 1.0 without points.
+
+    Args:
+        cameras: Cameras, at least one.
+        points: (P,3) world points, used only in that case.
+    """
+    if not cameras:
+        raise ValueError("scene_extent: there must be at least one camera, got none; pass the training views' cameras")
+    centers = np.stack([camera.center for camera in cameras])
+    middle = centers.mean(axis=0)
+    spread = float(np.linalg.norm(centers - middle, axis=1).max())
+    # Below it, cameras that stand in one place differ by rounding alone.
+    if spread > 1e-9 * max(1.0, float(np.abs(middle).max())):
+        return _EXTENT_MARGIN * spread
+    if points is not None and len(points):
+        return _EXTENT_MARGIN * float(np.median(np.linalg.norm(points - middle, axis=1)))
+    return 1.0
 
 
 def middle_camera(cameras: list[Camera]) -> Camera:

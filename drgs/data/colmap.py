@@ -18,7 +18,7 @@ from drgs.data.colmap_files import MODEL_FILES, MODEL_FOLDERS, find_model, image
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
 from drgs.data.masks import mask_file
-from drgs.data.points import read_point_ply
+from drgs.data.point_ply import read_point_ply
 from drgs.data.resizing import fit_to_image
 from drgs.data.view_checks import go_on_without, make_unique
 from drgs.data.views import View

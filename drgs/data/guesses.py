@@ -1,4 +1,4 @@
-"""Points where nothing is triangulated, guessed: beside what is, or anywhere that cameras look; the scene extent."""
+"""Points where nothing is triangulated, guessed: beside what is, or anywhere that cameras look."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from drgs.cameras import Camera
-from drgs.data.capture import Focus
+from drgs.data.capture import Focus, scene_extent
 from drgs.data.views import View
 
 __all__ = [
@@ -18,7 +18,6 @@ __all__ = [
     "points_along_rays",
     "points_anywhere",
     "points_beside",
-    "scene_extent",
     "subset",
 ]
 
@@ -26,35 +25,11 @@ FEWEST = 3
 """Triangulated points of a view that say how far away its other pixels may be."""
 MASK_KEEP = 0.5
 """Weight in a mask from which on a pixel counts."""
-_EXTENT_MARGIN = 1.1
 _MOST = 1_000  # triangulated points of a view that are looked at
 _NEAREST = 4  # of these in the image, one of which says how far away a pixel is: on this side of an edge or on that
 _CELLS = 16  # along each side of an image
 _JITTER = 0.05  # relative standard deviation of that distance: surfaces are slanted
 _CHUNK = 2_000  # pixels at a time
-
-
-def scene_extent(cameras: list[Camera], points: np.ndarray | None = None) -> float:
-    """1.1 x the largest distance of a camera center to their mean (3DGS), in scene units.
-
-    Where that is 0 (one camera, or all at one place), 1.1 x the median distance of the points to
-    it; 1.0 without points.
-
-    Args:
-        cameras: Cameras, at least one.
-        points: (P,3) world points, used only in that case.
-    """
-    if not cameras:
-        raise ValueError("scene_extent: there must be at least one camera, got none; pass the training views' cameras")
-    centers = np.stack([camera.center for camera in cameras])
-    middle = centers.mean(axis=0)
-    spread = float(np.linalg.norm(centers - middle, axis=1).max())
-    # Below it, cameras that stand in one place differ by rounding alone.
-    if spread > 1e-9 * max(1.0, float(np.abs(middle).max())):
-        return _EXTENT_MARGIN * spread
-    if points is not None and len(points):
-        return _EXTENT_MARGIN * float(np.median(np.linalg.norm(points - middle, axis=1)))
-    return 1.0
 
 
 def points_beside(

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.data.checks import image_size, list_images
+from drgs.data.feature_masks import ALPHA_MASKS, feature_mask, masked_photo, masks_of
 from drgs.data.gathering import fill, named_files, recorded_frames, usable_files
 from drgs.data.mapping import PhotoGroups, map_photos, write_model
-from drgs.data.masks import ALPHA_MASKS, feature_mask, masked_photo, masks_of
 from drgs.data.pairing import choose_pairs
 from drgs.data.photo_files import check_names, readable_photos, usable_photos
 from drgs.data.videos import list_videos
