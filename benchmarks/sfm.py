@@ -34,11 +34,11 @@ import pycolmap  # noqa: E402
 from studies import write_csv  # noqa: E402
 from where import DATA, add_row, ran, read_rows  # noqa: E402
 
-from drgs.data import matching  # noqa: E402
 from drgs.data.checks import list_images  # noqa: E402
-from drgs.data.mapping import map_photos  # noqa: E402
-from drgs.data.matching import extract, match, quiet  # noqa: E402
-from drgs.data.pairing import choose_pairs  # noqa: E402
+from drgs.sfm import matching  # noqa: E402
+from drgs.sfm.mapping import map_photos  # noqa: E402
+from drgs.sfm.matching import extract, match, quiet  # noqa: E402
+from drgs.sfm.pairing import choose_pairs  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "sfm.jsonl"
 TABLE = ROOT / "docs" / "data" / "datasets-sfm.csv"

@@ -23,13 +23,14 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 from where import DATA, ran  # noqa: E402
 
-from drgs.data import initial_points, load, scene_extent  # noqa: E402
+from drgs.data import load, scene_extent  # noqa: E402
 from drgs.files import atomic_write, load_state, save_state  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.fitting.frames import load_frames  # noqa: E402
 from drgs.fitting.rows import GaussianRows  # noqa: E402
 from drgs.fitting.timetable import initial_views  # noqa: E402
 from drgs.fitting.trainer import Trainer  # noqa: E402
+from drgs.sfm.points import initial_points  # noqa: E402
 from drgs.studies.cells import Metric, Study, run_cells  # noqa: E402
 from drgs.studies.rows import append_row, read_study  # noqa: E402
 from drgs.studies.statistics import differences, estimate, unit_of, values_of  # noqa: E402

@@ -90,6 +90,7 @@ _MODULES = {
     "select": "select",
     "selection": "selection",
     "settings": "settings",
+    "sfm": "sfm",
     "sharing": "sharing",
     "shutters": "shutters",
     "splats": "splats",
@@ -165,6 +166,7 @@ if TYPE_CHECKING:
     from drgs import report as report
     from drgs import selection as selection
     from drgs import settings as settings
+    from drgs import sfm as sfm
     from drgs import sharing as sharing
     from drgs import shutters as shutters
     from drgs import splats as splats

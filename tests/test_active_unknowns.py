@@ -184,9 +184,9 @@ def test_photographs_look_as_before_when_another_joins(uneven):
 
 def begun(folder, **fields):
     """A trainer of two views, with gains of 0 where exposure is asked for."""
-    from drgs.data import initial_points
     from drgs.fitting.frames import load_frames
     from drgs.fitting.parts import parts_of, with_exposure
+    from drgs.sfm.points import initial_points
 
     views = lazily(folder).split()[0][:2]
     settings = config(deterministic=True, **fields)

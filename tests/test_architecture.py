@@ -54,6 +54,7 @@ FLOORS: list[tuple[set[str], str]] = [
     ({"selection"}, "what chooses among views, by information or by poses"),
     ({"select"}, "policies, for users"),
     ({"data"}, "photographs and their cameras, from disk"),
+    ({"sfm"}, "poses and points of photographs: it reads them by data, which knows nothing of it"),
     ({"fitting"}, "the parts of a fit"),
     ({"metrics"}, "pictures against photographs"),
     ({"train", "evaluation"}, "fits, for users, and what they are worth"),

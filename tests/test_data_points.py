@@ -11,14 +11,16 @@ import pytest
 
 import drgs
 from drgs.cameras import Camera, intrinsics, look_at
-from drgs.data import Dataset, View, added_points, initial_points, kept_matches, load, shared_points
-from drgs.data.guesses import points_beside
-from drgs.data.guided import Matches
-from drgs.data.matching import nearby_pairs, sequential_pairs
+from drgs.data import Dataset, View, load
 from drgs.data.point_ply import read_point_ply
 from drgs.fitting.active import ActiveViews
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import load_frames
+from drgs.sfm import match_cache
+from drgs.sfm.guided import Matches
+from drgs.sfm.matching import nearby_pairs, sequential_pairs
+from drgs.sfm.points import added_points, initial_points, shared_points
+from drgs.sfm.proposals import points_beside
 
 cv2 = pytest.importorskip("cv2")
 WIDTH, HEIGHT = 320, 240
@@ -211,8 +213,8 @@ def test_kept_matches_are_bounded(tmp_path, rng, cache, monkeypatch):
         os.utime(path, (1000 - age, 1000 - age))
     os.utime(used, (1, 1))
     assert not matched(views)[0]  # used last now
-    monkeypatch.setattr(kept_matches, "_LARGEST", used.stat().st_size + 2000)
-    kept_matches._bound(cache)
+    monkeypatch.setattr(match_cache, "_LARGEST", used.stat().st_size + 2000)
+    match_cache._bound(cache)
     assert sorted(cache.iterdir()) == sorted([used, *others[:2], cache / "notes.npz"])
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "0.png"))  # a file
     assert matched(views)[0]
@@ -269,7 +271,7 @@ def test_points_do_not_depend_on_how_many_views_came_at_once(tmp_path, rng, monk
     """Where cameras are matched with the nearest ones only, those that were nearest before others came do not count:
     a fit that was killed and resumed, which matches all views at once, has the points of one that was not.
     """
-    monkeypatch.setattr("drgs.data.points._NEIGHBORS", 1)
+    monkeypatch.setattr("drgs.sfm.points._NEIGHBORS", 1)
     views, matches = plane_views(tmp_path, rng, count=5), Matches()
     for count in (2, 4):
         added_points([views[i] for i in (0, 4, 1, 3, 2)[:count]], 0, matches)
@@ -343,7 +345,7 @@ def test_a_sure_start_asks_for_no_guesses(tmp_path, rng, monkeypatch):
     assert again
     assert record["restarted"]
     assert record["triangulated"] > 100
-    monkeypatch.setattr("drgs.data.points.points_beside", None)
+    monkeypatch.setattr("drgs.sfm.points.points_beside", None)
     assert told("auto", 1000) == (False, record | {"restarted": False})
 
 

@@ -14,10 +14,11 @@ import torch
 
 from drgs import cli
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, look_at
-from drgs.data import decoding, initial_points, load, transforms
+from drgs.data import decoding, load, transforms
 from drgs.data.videos import VideoFrame, read_video
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import load_frames, warn_of_late_cameras
+from drgs.sfm.points import initial_points
 
 WIDTH, HEIGHT, FRAMES = 32, 24, 6
 FOCAL = 30.0

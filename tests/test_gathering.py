@@ -17,8 +17,8 @@ from test_sfm import write_photo
 from drgs import cli
 from drgs.data import load
 from drgs.data.checks import list_images
-from drgs.data.gathering import FRAMES, gather, joined_frames, named_files, recorded_frames, usable_files
 from drgs.io.outputs import lock_folder
+from drgs.sfm.image_folder import FRAMES, gather, joined_frames, named_files, recorded_frames, usable_files
 
 
 @pytest.fixture(scope="module")

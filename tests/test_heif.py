@@ -16,7 +16,7 @@ from test_sfm import corner  # noqa: F401 (a fixture)
 from drgs.cli import main
 from drgs.data import heif, load
 from drgs.data.checks import image_size, list_images, read_image
-from drgs.data.sfm import run_sfm
+from drgs.sfm.reconstruction import run_sfm
 
 pillow_heif = pytest.importorskip("pillow_heif")
 

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from drgs.cameras import Camera, intrinsics, look_at
-from drgs.data import View, initial_points
-from drgs.data.hull import Hull
+from drgs.data import View
+from drgs.sfm.hull import Hull
+from drgs.sfm.points import initial_points
 
 RADIUS = 1.0
 DISTANCE = 60.0
@@ -114,7 +115,7 @@ def test_matches_that_a_third_photograph_denies_are_left_out(tmp_path, monkeypat
     wrong *= 1.8 * RADIUS / np.linalg.norm(wrong, axis=1, keepdims=True)
     found = np.concatenate([right, wrong])
     monkeypatch.setattr(
-        "drgs.data.points._triangulated",
+        "drgs.sfm.points._triangulated",
         lambda views, *_: (found, np.ones((120, 3), np.float32), np.ones((len(views), 120), bool)),
     )
     points, _, source = initial_points(around(tmp_path), max_points=3000)

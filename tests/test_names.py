@@ -15,8 +15,8 @@ from test_sfm import corner  # noqa: F401 (a fixture)
 from drgs.cli import main
 from drgs.data import load
 from drgs.data.checks import list_images
-from drgs.data.sfm import run_sfm
 from drgs.display.pictures import file_names
+from drgs.sfm.reconstruction import run_sfm
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -74,7 +74,7 @@ def test_from_photographs_to_a_report(named, tmp_path, capsys):
 def test_commands_that_are_proposed_can_be_typed(corner, tmp_path, monkeypatch, capsys):  # noqa: F811
     """Quoted as a shell wants it."""
     from drgs.commands import sfm
-    from drgs.data.sfm import SfmSummary
+    from drgs.sfm.reconstruction import SfmSummary
 
     out = tmp_path / "my scene (1)"
     monkeypatch.setattr(sfm, "run_sfm", lambda *_, **__: SfmSummary(7, 7, 10, 0.5, 1, {"features": 1.0}, ()))

@@ -14,12 +14,12 @@ import pytest
 from drgs import cli, fisher, gain, runtime, select
 from drgs.commands import options
 from drgs.commands.command_line import help_page, parsed_options, words_of
-from drgs.data import sfm
 from drgs.fitting.config import FitConfig, SelectionConfig
 from drgs.fitting.renderers import own_preset
 from drgs.guards.records import Record, option, options_in, part
 from drgs.information.choices import CRITERION_NAMES, POLICY_NAMES
 from drgs.settings import PRESETS, RenderSettings
+from drgs.sfm import reconstruction
 
 pytestmark = pytest.mark.core
 
@@ -146,9 +146,9 @@ def test_choices_are_what_there_is():
         assert options_in(command)["criterion"].spec.metavar == "{" + ",".join(CRITERION_NAMES) + "}|TEXT"
         assert _choices(command, "method") == fisher.METHODS
     assert _choices(options.Info, "variant") == ("auto", *runtime.VARIANTS)
-    parameters = inspect.signature(sfm.run_sfm).parameters
-    assert _choices(options.Sfm, "camera_model") == sfm.CAMERA_MODELS
-    assert _choices(options.Sfm, "matcher") == sfm.MATCHING
+    parameters = inspect.signature(reconstruction.run_sfm).parameters
+    assert _choices(options.Sfm, "camera_model") == reconstruction.CAMERA_MODELS
+    assert _choices(options.Sfm, "matcher") == reconstruction.MATCHING
     assert options.Sfm.camera_model == parameters["camera_model"].default
     assert options.Sfm.matcher == parameters["matching"].default
     assert options.Sfm.seed == parameters["seed"].default

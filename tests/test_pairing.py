@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drgs.data.pairing import MAX_EXHAUSTIVE, choose_new_pairs, choose_pairs, global_descriptors, nearest_pairs
+from drgs.sfm.pairing import MAX_EXHAUSTIVE, choose_new_pairs, choose_pairs, global_descriptors, nearest_pairs
 
 pycolmap = pytest.importorskip("pycolmap")
 

@@ -16,9 +16,9 @@ from test_sfm import (
 
 from drgs.data import load
 from drgs.data.checks import list_images
-from drgs.data.gathering import FRAMES
-from drgs.data.registering import register
-from drgs.data.sfm import run_sfm
+from drgs.sfm.image_folder import FRAMES
+from drgs.sfm.reconstruction import run_sfm
+from drgs.sfm.registration import register
 
 pytest.importorskip("pycolmap")
 FIRST = (0, 1, 3, 5)

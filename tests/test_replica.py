@@ -11,7 +11,8 @@ from test_data import gradient, write_colmap, write_image
 from test_semantics import refused, write_maps
 
 from drgs.cameras import look_at
-from drgs.data import initial_points, load
+from drgs.data import load
+from drgs.sfm.points import initial_points
 
 WIDTH, HEIGHT = 32, 24
 NUMBERS = (0, 1, 2, 10, 11)

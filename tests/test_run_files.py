@@ -163,7 +163,7 @@ _WRITERS = {
     "commands/teach.py": {"teach.json", "classes.json"},
     "commands/tradeoff.py": {"tradeoff.json"},
     "data/camera_lists.py": {"cameras.json"},
-    "data/gathering.py": {"frames.json"},
+    "sfm/image_folder.py": {"frames.json"},
     "data/held_out.py": {"held_out.json"},
     "io/run.py": {"config.json", "env.json", "log.jsonl"},
     "fitting/active.py": {"selection.json"},

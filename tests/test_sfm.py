@@ -14,10 +14,10 @@ from test_data_points import HEIGHT, WIDTH, plane_views, render_plane, texture
 
 from drgs.cameras import Camera, intrinsics, look_at
 from drgs.data import load
-from drgs.data.mapping import _gaps, runs
-from drgs.data.matching import extract
-from drgs.data.photo_files import photo_fault
-from drgs.data.sfm import run_sfm
+from drgs.sfm.mapping import _gaps, runs
+from drgs.sfm.matching import extract
+from drgs.sfm.photo_files import photo_fault
+from drgs.sfm.reconstruction import run_sfm
 
 pytest.importorskip("pycolmap")
 cv2 = pytest.importorskip("cv2")

@@ -9,7 +9,7 @@ from made_videos import RATE, film, pictures, turn_cameras, walk_cameras
 from test_data_points import HEIGHT, WIDTH
 
 from drgs import cli
-from drgs.data.video_frames import examine, pick_frames
+from drgs.sfm.video_frames import examine, pick_frames
 
 
 def kinds(picked) -> list[str]:

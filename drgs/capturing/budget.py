@@ -22,8 +22,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.data.checks import image_size, read_image
-from drgs.data.matching import extract, match, quiet, start_extraction
-from drgs.data.pairing import MAX_EXHAUSTIVE
 from drgs.data.videos import VideoFrame, read_video
 from drgs.display.progress import Bar
 from drgs.fitting.config import FitConfig
@@ -31,6 +29,8 @@ from drgs.fitting.frames import frames_for
 from drgs.fitting.start import start
 from drgs.fitting.threads import fewer_torch_threads
 from drgs.io.atomic import temporary_folder
+from drgs.sfm.matching import extract, match, quiet, start_extraction
+from drgs.sfm.pairing import MAX_EXHAUSTIVE
 
 if TYPE_CHECKING:
     from drgs.data import Dataset, View

@@ -14,17 +14,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.data import shared_points
 from drgs.data.checks import read_image
-from drgs.data.mapping import runs
-from drgs.data.shooting import Finding
 from drgs.display.progress import Bar
 from drgs.fitting.exposure import estimate_exposure
 from drgs.fitting.frames import load_frames
+from drgs.sfm.findings import Finding
+from drgs.sfm.mapping import runs
+from drgs.sfm.points import shared_points
 
 if TYPE_CHECKING:
     from drgs.data import Dataset, View
-    from drgs.data.sfm import SfmSummary
+    from drgs.sfm.reconstruction import SfmSummary
 
 __all__ = ["of_exposure", "of_photographs", "of_poses", "of_views"]
 

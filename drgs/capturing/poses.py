@@ -11,15 +11,15 @@ from drgs.capturing import diagnosis
 from drgs.capturing.budget import plan_poses, planned_poses
 from drgs.data.checks import list_images
 from drgs.data.held_out import HELD_OUT, write_held_out
-from drgs.data.registering import register
-from drgs.data.sfm import run_sfm
 from drgs.display.progress import Bar
 from drgs.fitting.records import fit_record
 from drgs.io.outputs import lock_folder
+from drgs.sfm.reconstruction import run_sfm
+from drgs.sfm.registration import register
 
 if TYPE_CHECKING:
     from drgs.capturing.capture import Capture
-    from drgs.data.shooting import Finding
+    from drgs.sfm.findings import Finding
 
 __all__ = ["Outcome", "add_poses", "find_poses", "given_poses"]
 

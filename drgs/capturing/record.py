@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from drgs.data.shooting import Finding
 from drgs.io.journal import SCHEMA, check_schema
 from drgs.io.json_files import check_json, read_json
 from drgs.io.outputs import write_json
+from drgs.sfm.findings import Finding
 
 __all__ = ["FOLDER", "Batch", "CaptureRecord", "DoneStep", "inputs_of"]
 

@@ -27,7 +27,6 @@ from drgs.capturing.opening import new_files, open_record
 from drgs.capturing.poses import add_poses, find_poses, given_poses
 from drgs.capturing.record import FOLDER, CaptureRecord, DoneStep, inputs_of
 from drgs.data.checks import list_images
-from drgs.data.gathering import gather, named_files, usable_files
 from drgs.display.progress import Bar
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import is_run
@@ -37,6 +36,7 @@ from drgs.io.atomic import is_full
 from drgs.io.outputs import lock_folder
 from drgs.io.run import Run
 from drgs.report.write import FILE as REPORT
+from drgs.sfm.image_folder import gather, named_files, usable_files
 from drgs.sharing.scene import FILE as PAGE
 from drgs.sharing.scene import scene_of_run
 from drgs.sharing.write import write_page

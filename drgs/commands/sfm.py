@@ -5,8 +5,8 @@ from __future__ import annotations
 import shlex
 from typing import TYPE_CHECKING
 
-from drgs.data.sfm import run_sfm
 from drgs.display.progress import Bar
+from drgs.sfm.reconstruction import run_sfm
 
 if TYPE_CHECKING:
     from drgs.commands.options import Sfm

@@ -17,14 +17,6 @@ from drgs.data.formats import Format
 from drgs.data.held_out import apply_held_out
 from drgs.data.llff import POSES_BOUNDS
 from drgs.data.multicamera import frame_folders
-from drgs.data.points import (
-    added_points,
-    initial_points,
-    matched_points,
-    shared_points,
-    triangulated_count,
-    triangulated_points,
-)
 from drgs.data.replica import POSES
 from drgs.data.semantics import Semantics
 from drgs.data.sidecars import attach
@@ -40,14 +32,8 @@ __all__ = [
     "Format",
     "Semantics",
     "View",
-    "added_points",
-    "initial_points",
     "load",
-    "matched_points",
     "scene_extent",
-    "shared_points",
-    "triangulated_count",
-    "triangulated_points",
 ]
 
 _DEPTH = 3  # folders below the one that is named, down to which a data set is looked for

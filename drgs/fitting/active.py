@@ -23,7 +23,6 @@ import numpy as np
 import torch
 
 from drgs.data.camera_lists import described
-from drgs.data.guided import Matches
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
 from drgs.fitting.config import FitConfig
@@ -32,6 +31,7 @@ from drgs.fitting.timetable import Timetable
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import write_json
 from drgs.io.run import Run
+from drgs.sfm.guided import Matches
 from drgs.sizes import at_most, resized_alike
 
 if TYPE_CHECKING:
@@ -162,8 +162,8 @@ class ActiveViews:
         Returns:
             (P, 3) points and (P, 3) colors, at most an even share of the budget, and whether they are of a depth map.
         """
-        from drgs.data import added_points, initial_points
         from drgs.integrator import render
+        from drgs.sfm.points import added_points, initial_points
 
         nothing = torch.empty(0, 3), torch.empty(0, 3), False
         if not self._share:
@@ -212,7 +212,7 @@ class ActiveViews:
             (P, 3) points and, of those that are triangulated, which of the V photographs show which, (V, P) bool; else
             None.
         """
-        from drgs.data import initial_points, matched_points
+        from drgs.sfm.points import initial_points, matched_points
 
         if self.pool_leak and given is not None:
             return given, None
@@ -228,7 +228,7 @@ class ActiveViews:
 
     def _count_start(self, bar: Bar) -> int:
         """How many points are triangulated with the initial views alone; what is matched here is kept."""
-        from drgs.data import triangulated_count
+        from drgs.sfm.points import triangulated_count
 
         if self._began is None:
             start = [self.views[i] for i in self.chosen[: len(self.timetable.start)]]
@@ -242,7 +242,7 @@ class ActiveViews:
         What a few photographs put at wrong depths stays there: it explains these, and hides what comes later. But to
         begin again loses what was learned. So `auto` does it until a start has had enough triangulated points.
         """
-        from drgs.data import triangulated_count, triangulated_points
+        from drgs.sfm.points import triangulated_count, triangulated_points
 
         seen = [self.views[i] for i in self.chosen]
         restart = self.active.restart

@@ -3,7 +3,7 @@
 A camera that chooses its exposure, or its white balance, anew for each photograph multiplies what it sees by a number
 a channel. Where several photographs show one point, log c = log gain of the photograph + log color of the point +
 noise, on the values of the photographs as they are (sRGB), in which renderings are compared with them. Which
-photographs show a point must be known (`drgs.data.shared_points`): where half of the points are hidden by others, no
+photographs show a point must be known (`drgs.sfm.points`): where half of the points are hidden by others, no
 robust weight finds the gains. What depends on the direction, like the light on a thing that is turned, looks like a
 gain, too; so `auto` uses a gain only if it lowers the error of the half of its photograph that it was estimated
 without.

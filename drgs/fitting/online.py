@@ -18,7 +18,6 @@ import torch
 
 from drgs.cameras import Camera
 from drgs.data import scene_extent
-from drgs.data.guesses import points_along_rays, subset
 from drgs.data.resizing import resize_area
 from drgs.ellipsoids import Gaussians
 from drgs.fitting.config import FitConfig
@@ -28,6 +27,7 @@ from drgs.fitting.rows import GaussianRows
 from drgs.fitting.trainer import Trainer
 from drgs.integrator import render
 from drgs.io.json_files import check_json
+from drgs.sfm.proposals import points_along_rays, subset
 from drgs.sizes import at_most
 
 __all__ = ["OnlineFit"]

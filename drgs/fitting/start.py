@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from drgs.data import initial_points, scene_extent, shared_points
-from drgs.data.guided import Matches
+from drgs.data import scene_extent
 from drgs.display.progress import Bar
 from drgs.ellipsoids import Y_00
 from drgs.fitting.frames import frames_for
@@ -22,6 +21,8 @@ from drgs.fitting.skybox import RADIUS, SHARE, Skybox, SkyboxChoice, far_evidenc
 from drgs.fitting.stages import first_time, times_of
 from drgs.fitting.trainer import Trainer
 from drgs.integrator import render
+from drgs.sfm.guided import Matches
+from drgs.sfm.points import initial_points, shared_points
 
 if TYPE_CHECKING:
     from pathlib import Path

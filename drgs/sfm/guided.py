@@ -14,7 +14,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
-    from drgs.data.matching import Progress
+    from drgs.sfm.matching import Progress
 
 __all__ = ["Features", "Matches", "detect"]
 

@@ -148,7 +148,8 @@ def _code() -> bytes:
     import cv2
 
     found = hashlib.blake2b(cv2.__version__.encode(), digest_size=20)
-    package = Path(__file__).parent
-    for path in (*sorted(package.glob("*.py")), package.parent / "cameras.py", package.parent / "lenses.py"):
+    package = Path(__file__).parents[1]
+    rooms = (*sorted((package / "data").glob("*.py")), *sorted((package / "sfm").glob("*.py")))
+    for path in (*rooms, package / "cameras.py", package / "lenses.py"):
         found.update(_content(path))
     return found.digest()

@@ -19,8 +19,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from drgs.data.shooting import Finding
 from drgs.data.videos import VideoFile, VideoFrame, read_video
+from drgs.sfm.findings import Finding
 
 __all__ = ["ExaminedVideo", "Picked", "PickedFrame", "examine", "pick_frames"]
 

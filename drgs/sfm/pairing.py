@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.data.matching import sequential_pairs
+from drgs.sfm.matching import sequential_pairs
 
 __all__ = ["Pairing", "choose_new_pairs", "choose_pairs", "global_descriptors", "nearest_pairs"]
 

@@ -23,7 +23,7 @@ def extract_features(path: Path, names: list[str], options: dict[str, Any], tell
         path: The images, as messages name them; not read.
         names: Names of the images in their folder.
         options: `database`, `folder`, `camera_model`, `shared_camera`, `max_image_size`, `wide_baseline`, `masks`,
-            `camera` and `threads`, as `drgs.data.matching.extract` takes them.
+            `camera` and `threads`, as `drgs.sfm.matching.extract` takes them.
     Returns:
         Number of the camera that the images share; None where each has one of its own.
     """

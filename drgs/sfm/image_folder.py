@@ -14,15 +14,15 @@ import cv2
 import numpy as np
 
 from drgs.data.checks import IMAGE_SUFFIXES, list_images, read_image
-from drgs.data.photo_files import entry_fault, leave_out, link_or_copy, usable_photos
-from drgs.data.shooting import Finding
-from drgs.data.video_frames import Picked, examine
 from drgs.data.videos import VIDEO_SUFFIXES, list_videos, read_video
 from drgs.io.atomic import temporary_folder
 from drgs.io.foreign import refuse_foreign
 from drgs.io.journal import SCHEMA
 from drgs.io.json_files import check_json, read_json
 from drgs.io.outputs import LockedFolder
+from drgs.sfm.findings import Finding
+from drgs.sfm.photo_files import entry_fault, leave_out, link_or_copy, usable_photos
+from drgs.sfm.video_frames import Picked, examine
 
 __all__ = [
     "FRAMES",

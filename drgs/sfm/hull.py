@@ -11,8 +11,8 @@ import numpy as np
 
 from drgs.cameras import Camera
 from drgs.data.capture import Focus
-from drgs.data.guesses import MASK_KEEP
 from drgs.data.views import View
+from drgs.sfm.proposals import MASK_KEEP
 
 __all__ = ["Hull"]
 

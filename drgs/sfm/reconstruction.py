@@ -14,19 +14,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.data.checks import image_size, list_images
-from drgs.data.feature_masks import ALPHA_MASKS, feature_mask, masked_photo, masks_of
-from drgs.data.gathering import fill, named_files, recorded_frames, usable_files
-from drgs.data.mapping import PhotoGroups, map_photos, write_model
-from drgs.data.pairing import choose_pairs
-from drgs.data.photo_files import check_names, readable_photos, usable_photos
 from drgs.data.videos import list_videos
 from drgs.io.atomic import temporary_folder
 from drgs.io.outputs import lock_folder
+from drgs.sfm.feature_masks import ALPHA_MASKS, feature_mask, masked_photo, masks_of
+from drgs.sfm.image_folder import fill, named_files, recorded_frames, usable_files
+from drgs.sfm.mapping import PhotoGroups, map_photos, write_model
+from drgs.sfm.pairing import choose_pairs
+from drgs.sfm.photo_files import check_names, readable_photos, usable_photos
 
 if TYPE_CHECKING:
-    from drgs.data.matching import Progress
-    from drgs.data.shooting import Finding
     from drgs.io.outputs import LockedFolder
+    from drgs.sfm.findings import Finding
+    from drgs.sfm.matching import Progress
 
 __all__ = ["CAMERA_MODELS", "MATCHING", "SfmSummary", "run_sfm"]
 
@@ -253,7 +253,7 @@ def _reconstruct(
 ) -> SfmSummary:
     """Run the three stages; leaves `database.db` and `sparse/0` in `partial`."""
     from drgs.data.colmap_bindings import pycolmap
-    from drgs.data.matching import match, quiet, state_focal_lengths
+    from drgs.sfm.matching import match, quiet, state_focal_lengths
 
     database = partial / "database.db"
     marks = [time.perf_counter()]
@@ -349,7 +349,7 @@ def _extract(
     originals: Path,
 ) -> None:
     """Features of all photos, those of each lens with a camera of theirs; those that share it with no other at once."""
-    from drgs.data.matching import extract
+    from drgs.sfm.matching import extract
 
     alone = [lens[0] for lens in lenses if len(lens) == 1]
     groups = [*((lens, True) for lens in lenses if len(lens) > 1), *([(alone, False)] if alone else [])]

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.data.photo_files import own_file
 from drgs.data.reader_process import Child
 from drgs.io import interrupts
 from drgs.io.atomic import check_room, temporary_folder
 from drgs.runtime import thread_count
+from drgs.sfm.photo_files import own_file
 
 __all__ = ["extract", "match", "nearby_pairs", "quiet", "sequential_pairs", "start_extraction", "state_focal_lengths"]
 
@@ -26,7 +26,7 @@ _PAIRS_A_STEP = 16  # a thread: all of them are busy, and progress is seen
 _A_FEATURE, _A_MATCH = 2 * 152, 2 * 16
 _MOST_FEATURES = 8192  # of a photograph, as COLMAP has it
 
-_extractor = Child("drgs.data.extraction", "a photograph that COLMAP finds features in", "leave it out")
+_extractor = Child("drgs.sfm.extraction", "a photograph that COLMAP finds features in", "leave it out")
 
 
 @contextlib.contextmanager

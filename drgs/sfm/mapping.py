@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drgs.data.matching import Progress
 from drgs.io.atomic import check_room
 from drgs.runtime import thread_count
+from drgs.sfm.matching import Progress
 
 __all__ = ["PhotoGroups", "map_photos", "runs", "write_model"]
 

@@ -17,17 +17,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drgs.data.checks import IMAGE_SUFFIXES, image_size
-from drgs.data.gathering import FRAMES, joined_frames, recorded_frames, write_frames
-from drgs.data.mapping import PhotoGroups, map_photos, write_model
-from drgs.data.pairing import choose_new_pairs
-from drgs.data.photo_files import link_or_copy, photo_fault, readable_photos
-from drgs.data.sfm import SfmSummary
 from drgs.io.atomic import temporary_folder
 from drgs.io.outputs import lock_folder
+from drgs.sfm.image_folder import FRAMES, joined_frames, recorded_frames, write_frames
+from drgs.sfm.mapping import PhotoGroups, map_photos, write_model
+from drgs.sfm.pairing import choose_new_pairs
+from drgs.sfm.photo_files import link_or_copy, photo_fault, readable_photos
+from drgs.sfm.reconstruction import SfmSummary
 
 if TYPE_CHECKING:
-    from drgs.data.matching import Progress
     from drgs.io.outputs import LockedFolder
+    from drgs.sfm.matching import Progress
 
 __all__ = ["Registration", "register"]
 
@@ -157,7 +157,7 @@ def _registered(
 ) -> Registration:
     """Run the three stages; leaves `database.db`, `sparse/0` and the `photos` under their new names in `partial`."""
     from drgs.data.colmap_bindings import opened_database, pycolmap
-    from drgs.data.matching import extract, match, quiet
+    from drgs.sfm.matching import extract, match, quiet
 
     for folder in ("photos", "models", "sparse/0"):
         (partial / folder).mkdir(parents=True)

@@ -1,0 +1,4 @@
+"""Structure from motion by COLMAP, and points of photographs whose poses are known.
+
+It reads photographs by `drgs.data`, which knows nothing of it.
+"""
