@@ -31,7 +31,7 @@ from drgs.capturing.record import CaptureRecord
 from drgs.commands.capture import capture_photographs, run
 from drgs.commands.options import Capture
 from drgs.data import load
-from drgs.data.held_out import HELD_OUT, write_held_out
+from drgs.data.dataset import HELD_OUT, write_held_out
 from drgs.display.progress import Bar
 from drgs.files import Run, load_state
 from drgs.fitting.config import FitConfig

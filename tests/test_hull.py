@@ -8,8 +8,8 @@ import pytest
 
 from drgs.cameras import Camera, intrinsics, look_at
 from drgs.data import View
-from drgs.sfm.hull import Hull
 from drgs.sfm.points import initial_points
+from drgs.sfm.proposals import Hull
 
 RADIUS = 1.0
 DISTANCE = 60.0

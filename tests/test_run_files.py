@@ -164,7 +164,7 @@ _WRITERS = {
     "commands/tradeoff.py": {"tradeoff.json"},
     "data/camera_lists.py": {"cameras.json"},
     "sfm/image_folder.py": {"frames.json"},
-    "data/held_out.py": {"held_out.json"},
+    "data/dataset.py": {"held_out.json"},
     "io/run.py": {"config.json", "env.json", "log.jsonl"},
     "fitting/active.py": {"selection.json"},
     "metrics.py": {"metrics.json"},

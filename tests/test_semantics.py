@@ -13,7 +13,7 @@ from test_data import BARREL, HEIGHT, WIDTH, gradient, write_colmap, write_image
 
 from drgs.cameras import Camera, intrinsics
 from drgs.data import View, load
-from drgs.data.class_names import read_class_names
+from drgs.data.semantics import read_class_names
 
 WRITERS = {"transforms": write_transforms, "llff": write_llff, "colmap": write_colmap}
 NAMES = ("wall", "floor", "lamp")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from drgs.commands.eval import print_table
 from drgs.commands.report import report_of
-from drgs.data.backgrounds import default_background
+from drgs.data.view_checks import default_background
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import fit_record, is_run
 from drgs.fitting.resume import lock_run

@@ -21,7 +21,7 @@ import torch
 
 from drgs import data
 from drgs.commands.values import parsed_size
-from drgs.data.class_names import CLASS_FILES, read_class_names
+from drgs.data.semantics import CLASS_FILES, read_class_names
 from drgs.data.sidecars import LABEL_FOLDERS, TEACHER_FOLDERS
 from drgs.display.progress import Bar
 from drgs.features.encoders import TEMPLATES, ClipEncoder

@@ -19,7 +19,7 @@ from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
 from drgs.data.masks import mask_file
 from drgs.data.point_ply import read_point_ply
-from drgs.data.resizing import fit_to_image
+from drgs.data.resampling import fit_to_image
 from drgs.data.view_checks import go_on_without, make_unique
 from drgs.data.views import View
 from drgs.io.atomic import temporary_folder

@@ -12,7 +12,7 @@ from drgs.cameras import Camera, c2w_from_llff, intrinsics
 from drgs.data.checks import inverse_pose, list_images, read_npy
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
-from drgs.data.resizing import fit_to_image
+from drgs.data.resampling import fit_to_image
 from drgs.data.videos import list_videos
 from drgs.data.view_checks import make_unique
 from drgs.data.views import View

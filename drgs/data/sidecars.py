@@ -6,7 +6,7 @@ Found by their names beside the folder of the images, in this order:
   `NAME_fmap_CxHxW.pt` belongs to the image of that name without its suffix, or up to the first dot of its name.
 - Labels: `semantic_class/`, `semantic/`, `labels/`. `NAME.png` belongs to the image NAME, and as in Replica
   `semantic_class_7.png` to the image `rgb_7.png`. One channel of 8 or 16 bits, without loss (PNG, TIFF, BMP).
-- Numbers in the labels: `classes.json`, `classes.txt` or `info_semantic.json` (`drgs.data.class_names`). 0 and
+- Numbers in the labels: `classes.json`, `classes.txt` or `info_semantic.json` (`drgs.data.semantics`). 0 and
   the largest number, 255 or 65535, are no label unless they are named there.
 - Classes in the teacher's space: `text_embeddings.npy`, a row a class in the order of that file.
 - Classes of things that move: `moving_classes.json`, a list of names.
@@ -24,8 +24,7 @@ import re
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
-from drgs.data.class_names import CLASS_FILES
-from drgs.data.semantics import SEGMENTS, Semantics
+from drgs.data.semantics import CLASS_FILES, SEGMENTS, Semantics
 
 if TYPE_CHECKING:
     from drgs.data.dataset import Dataset

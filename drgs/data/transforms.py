@@ -25,7 +25,7 @@ from drgs.data.checks import (
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
 from drgs.data.point_ply import read_point_ply
-from drgs.data.resizing import fit_to_image
+from drgs.data.resampling import fit_to_image
 from drgs.data.synchronous import CAMERA_NAME
 from drgs.data.view_checks import go_on_without, make_unique
 from drgs.data.views import View

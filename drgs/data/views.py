@@ -13,9 +13,8 @@ import numpy as np
 from drgs.cameras import Camera
 from drgs.data.checks import read_image, read_npy, unit_range
 from drgs.data.masks import read_mask
-from drgs.data.resizing import fit_to_image, nearest_resized, resize_area
+from drgs.data.resampling import fit_to_image, lens_maps, nearest_resized, resize_area, undistorted_map
 from drgs.data.semantics import Semantics, plain_labels
-from drgs.data.undistortion import lens_maps, undistorted_map
 from drgs.data.videos import VideoFrame
 
 if TYPE_CHECKING:

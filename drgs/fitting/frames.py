@@ -13,8 +13,8 @@ import numpy as np
 import torch
 
 from drgs import data
-from drgs.data.clocks import late_cameras
-from drgs.data.resizing import resize_area
+from drgs.data.resampling import resize_area
+from drgs.data.synchronous import late_cameras
 from drgs.display.progress import Bar
 from drgs.sizes import reduced_size
 

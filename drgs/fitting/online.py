@@ -18,7 +18,7 @@ import torch
 
 from drgs.cameras import Camera
 from drgs.data import scene_extent
-from drgs.data.resizing import resize_area
+from drgs.data.resampling import resize_area
 from drgs.ellipsoids import Gaussians
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import Frame

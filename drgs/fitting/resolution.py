@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from drgs.data.resizing import resize_area
+from drgs.data.resampling import resize_area
 
 if TYPE_CHECKING:
     from drgs.fitting.frames import Frame

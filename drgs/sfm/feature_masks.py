@@ -9,7 +9,7 @@ import numpy as np
 
 from drgs.data.checks import image_size, read_image, unit_range
 from drgs.data.masks import mask_file, read_mask
-from drgs.data.resizing import nearest_resized
+from drgs.data.resampling import nearest_resized
 
 __all__ = ["ALPHA_MASKS", "feature_mask", "masked_photo", "masks_of"]
 

@@ -10,10 +10,18 @@ from drgs.data.dataset import Dataset
 from drgs.data.views import View
 from drgs.display.progress import Bar
 from drgs.sfm.guided import Matches, detect
-from drgs.sfm.hull import Hull
 from drgs.sfm.match_cache import found_once
 from drgs.sfm.matching import nearby_pairs
-from drgs.sfm.proposals import FEWEST, MASK_KEEP, back_project, empty_share, points_anywhere, points_beside, subset
+from drgs.sfm.proposals import (
+    FEWEST,
+    MASK_KEEP,
+    Hull,
+    back_project,
+    empty_share,
+    points_anywhere,
+    points_beside,
+    subset,
+)
 
 __all__ = [
     "added_points",
