@@ -34,7 +34,7 @@ from drgs.capturing import fit as capture_fit  # noqa: E402
 from drgs.commands.capture import capture_photographs  # noqa: E402
 from drgs.commands.options import Capture  # noqa: E402
 from drgs.data import load  # noqa: E402
-from drgs.data.checks import list_images  # noqa: E402
+from drgs.data.images import list_images  # noqa: E402
 from drgs.files import Run  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.train import fit  # noqa: E402

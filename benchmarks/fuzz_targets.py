@@ -186,7 +186,7 @@ def _classes(folder: Path) -> None:
 
 
 def _image(folder: Path) -> None:
-    from drgs.data.checks import image_size, read_image
+    from drgs.data.images import image_size, read_image
 
     for path in folder.iterdir():
         image_size(path)

@@ -34,7 +34,7 @@ import pycolmap  # noqa: E402
 from studies import write_csv  # noqa: E402
 from where import DATA, add_row, ran, read_rows  # noqa: E402
 
-from drgs.data.checks import list_images  # noqa: E402
+from drgs.data.images import list_images  # noqa: E402
 from drgs.sfm import matching  # noqa: E402
 from drgs.sfm.mapping import map_photos  # noqa: E402
 from drgs.sfm.matching import extract, match, quiet  # noqa: E402

@@ -29,8 +29,8 @@ from drgs.cameras import Camera, intrinsics
 from drgs.codecs import load_gaussians
 from drgs.data import load
 from drgs.data.camera_lists import load_cameras_json
-from drgs.data.checks import check_npz, file_inside, image_size, read_image, read_npy
-from drgs.data.image_headers import can_hold, is_whole, stated_size
+from drgs.data.checks import check_npz, file_inside, read_npy
+from drgs.data.images import can_hold, image_size, is_whole, read_image, stated_size
 from drgs.features.decoder import Decoder, load_decoder, save_decoder
 from drgs.features.teacher import read_map
 from drgs.files import Run

@@ -14,7 +14,7 @@ import drgs
 from drgs import cli
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, orbit
 from drgs.data import load
-from drgs.data.image_headers import stated_size
+from drgs.data.images import stated_size
 from drgs.data.view_checks import check_parallax
 from drgs.data.views import View
 from drgs.display import pictures
@@ -176,7 +176,7 @@ def test_png_whose_header_states_no_size(tmp_path, width, height):
     data = bytearray(path.read_bytes())
     data[16:24] = width.to_bytes(4, "big") + height.to_bytes(4, "big")
     path.write_bytes(data)
-    for read in (drgs.data.checks.image_size, drgs.data.checks.read_image):
+    for read in (drgs.data.images.image_size, drgs.data.images.read_image):
         with pytest.raises(ValueError, match=f"bytes can hold, its header says {width}x{height}"):
             read(path)
     write_transforms(tmp_path / "set", count=4, w=None, h=None)
@@ -191,7 +191,7 @@ def test_sizes_of_headers(tmp_path, suffix):
     """
     path = tmp_path / f"a{suffix}"
     write_image(path, gradient()[:5, :7])
-    height, width = drgs.data.checks.read_image(path).shape[:2]
+    height, width = drgs.data.images.read_image(path).shape[:2]
     assert stated_size(path) == (width, height) == (7, 5)
     if suffix == ".webp":  # 16,383 pixels a side at most, and no bound by bytes
         return
@@ -203,7 +203,7 @@ def test_sizes_of_headers(tmp_path, suffix):
         data = data.replace(old, (30_000).to_bytes(bytes_of, order))
     path.write_bytes(data)
     with pytest.raises(ValueError, match=r"as many as its \d+ bytes can hold, its header says 30000x30000"):
-        drgs.data.checks.read_image(path)
+        drgs.data.images.read_image(path)
 
 
 def test_truncated_photograph(tmp_path, capfd, caplog):
@@ -216,9 +216,9 @@ def test_truncated_photograph(tmp_path, capfd, caplog):
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
     with pytest.raises(ValueError, match="its data end early; it is truncated or damaged"):
-        drgs.data.checks.read_image(path)
+        drgs.data.images.read_image(path)
     path.write_bytes(data[:5] + bytes([data[5] - 6]) + data[6:])  # the first segment claims to end 6 bytes earlier
-    assert drgs.data.checks.read_image(path).shape == (64, 64, 3)
+    assert drgs.data.images.read_image(path).shape == (64, 64, 3)
     assert "is damaged, part of it may be wrong (Corrupt JPEG data" in caplog.text
     assert not capfd.readouterr().err
 

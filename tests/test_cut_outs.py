@@ -13,7 +13,7 @@ from drgs.cameras import orbit
 from drgs.commands.command_line import parsed_options
 from drgs.commands.options import Fit
 from drgs.data import Dataset, View, load
-from drgs.data.checks import read_image
+from drgs.data.images import read_image
 from drgs.data.view_checks import default_background
 from drgs.fitting.frames import load_frames
 

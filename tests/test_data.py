@@ -430,7 +430,7 @@ def test_scene_extent():
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".bmp"])
 def test_image_size_agrees_with_decoding(tmp_path, suffix):
     """Header and decoder agree."""
-    from drgs.data.checks import image_size
+    from drgs.data.images import image_size
 
     write_image(tmp_path / f"a{suffix}", gradient(37, 21))
     assert image_size(tmp_path / f"a{suffix}") == (37, 21)

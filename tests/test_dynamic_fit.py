@@ -17,7 +17,7 @@ import torch
 from drgs import cli
 from drgs.cameras import orbit
 from drgs.data import Dataset, View
-from drgs.data.checks import read_image
+from drgs.data.images import read_image
 from drgs.deform import DynamicGaussians, FieldConfig
 from drgs.display.pictures import to_bytes, write_png
 from drgs.ellipsoids import Gaussians

@@ -14,7 +14,7 @@ from drgs import cli
 from drgs.commands.scene_input import SceneInput
 from drgs.data import load
 from drgs.data.camera_lists import load_cameras_json
-from drgs.data.checks import read_image
+from drgs.data.images import read_image
 from drgs.files import load_ply, load_state
 
 pytestmark = pytest.mark.core

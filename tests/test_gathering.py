@@ -16,7 +16,7 @@ from test_sfm import write_photo
 
 from drgs import cli
 from drgs.data import load
-from drgs.data.checks import list_images
+from drgs.data.images import list_images
 from drgs.io.outputs import lock_folder
 from drgs.sfm.image_folder import FRAMES, gather, joined_frames, named_files, recorded_frames, usable_files
 

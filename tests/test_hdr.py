@@ -11,9 +11,8 @@ import pytest
 from PIL import Image
 
 from drgs.data import decoding
-from drgs.data.checks import read_image
 from drgs.data.hdr import HdrReader, hdr_transfer
-from drgs.data.heif import heif_as_jpeg
+from drgs.data.images import heif_as_jpeg, read_image
 from drgs.data.videos import VideoFrame
 
 av = pytest.importorskip("av")

@@ -14,8 +14,8 @@ from PIL import Image
 from test_sfm import corner  # noqa: F401 (a fixture)
 
 from drgs.cli import main
-from drgs.data import heif, load
-from drgs.data.checks import image_size, list_images, read_image
+from drgs.data import load
+from drgs.data.images import heif_as_jpeg, image_size, list_images, read_image
 from drgs.sfm.reconstruction import run_sfm
 
 pillow_heif = pytest.importorskip("pillow_heif")
@@ -184,7 +184,7 @@ def test_structure_from_motion(corner, tmp_path, suffix, masked):  # noqa: F811
 def test_without_exif(tmp_path, gradient, suffix):
     """What messengers leave of a photograph is one, too."""
     save(tmp_path / f"a.{suffix}", gradient)
-    (tmp_path / "b.jpg").write_bytes(heif.heif_as_jpeg(tmp_path / f"a.{suffix}", 98))
+    (tmp_path / "b.jpg").write_bytes(heif_as_jpeg(tmp_path / f"a.{suffix}", 98))
     assert np.abs(read_image(tmp_path / "b.jpg").astype(float) - gradient).max() < 8  # 2 and 4 here, of JPEG
     assert not Image.open(tmp_path / "b.jpg").getexif()
 
@@ -196,7 +196,7 @@ def test_focal_length_of_exif(tmp_path, suffix, rng):
     pixels = rng.integers(0, 255, (64, 96, 3)).astype(np.uint8)
     for orientation in (1, 6):
         save(tmp_path / f"a.{suffix}", pixels, exif=exif(orientation))
-        (tmp_path / f"b.{suffix}").write_bytes(heif.heif_as_jpeg(tmp_path / f"a.{suffix}", 95))
+        (tmp_path / f"b.{suffix}").write_bytes(heif_as_jpeg(tmp_path / f"a.{suffix}", 95))
         Image.fromarray(pixels).save(tmp_path / "c.jpg", exif=exif(orientation))
         found, expected = (pycolmap.infer_camera_from_image(tmp_path / name) for name in (f"b.{suffix}", "c.jpg"))
         assert found.has_prior_focal_length

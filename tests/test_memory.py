@@ -183,7 +183,7 @@ def test_photograph_that_does_not_fit(tmp_path, one_gigabyte):
     """A PNG whose header states 30,000^2 pixels is not decoded."""
     from test_data import gradient, write_image
 
-    from drgs.data.checks import read_image
+    from drgs.data.images import read_image
 
     write_image(tmp_path / "a.png", gradient())
     data = bytearray((tmp_path / "a.png").read_bytes())

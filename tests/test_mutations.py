@@ -17,7 +17,7 @@ from test_dynamic_data import cameras, coded, write_poses, write_train_meta, wri
 from drgs.cameras import orbit
 from drgs.data import load
 from drgs.data.camera_lists import load_cameras_json, save_cameras_json
-from drgs.data.checks import read_image
+from drgs.data.images import read_image
 from drgs.data.point_ply import read_point_ply
 from drgs.files import SCHEMA, Run, load_ply, load_state, save_ply, save_state
 from drgs.fitting.config import FitConfig

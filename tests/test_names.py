@@ -14,7 +14,7 @@ from test_sfm import corner  # noqa: F401 (a fixture)
 
 from drgs.cli import main
 from drgs.data import load
-from drgs.data.checks import list_images
+from drgs.data.images import list_images
 from drgs.display.pictures import file_names
 from drgs.sfm.reconstruction import run_sfm
 

@@ -15,7 +15,7 @@ from test_sfm import (
 )
 
 from drgs.data import load
-from drgs.data.checks import list_images
+from drgs.data.images import list_images
 from drgs.sfm.image_folder import FRAMES
 from drgs.sfm.reconstruction import run_sfm
 from drgs.sfm.registration import register

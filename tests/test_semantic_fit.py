@@ -15,7 +15,7 @@ from drgs.commands import render as render_command
 from drgs.commands.eval import run as run_eval
 from drgs.commands.options import Eval
 from drgs.commands.scene_input import SceneInput
-from drgs.data.checks import read_image
+from drgs.data.images import read_image
 from drgs.data.semantics import Semantics
 from drgs.display.pictures import write_png
 from drgs.features.pictures import label_colors

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.data.checks import image_size, read_image
+from drgs.data.images import image_size, read_image
 from drgs.data.videos import VideoFrame, read_video
 from drgs.display.progress import Bar
 from drgs.fitting.config import FitConfig

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drgs.capturing.record import FOLDER, Batch, CaptureRecord
-from drgs.data.checks import read_image
+from drgs.data.images import read_image
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import fit_record, is_run

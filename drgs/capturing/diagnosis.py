@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.data.checks import read_image
+from drgs.data.images import read_image
 from drgs.display.progress import Bar
 from drgs.fitting.exposure import estimate_exposure
 from drgs.fitting.frames import load_frames

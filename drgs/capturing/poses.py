@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from drgs.capturing import diagnosis
 from drgs.capturing.budget import plan_poses, planned_poses
-from drgs.data.checks import list_images
 from drgs.data.dataset import HELD_OUT, write_held_out
+from drgs.data.images import list_images
 from drgs.display.progress import Bar
 from drgs.fitting.records import fit_record
 from drgs.io.outputs import lock_folder

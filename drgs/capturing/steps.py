@@ -26,7 +26,7 @@ from drgs.capturing.fit import fit_photographs
 from drgs.capturing.opening import new_files, open_record
 from drgs.capturing.poses import add_poses, find_poses, given_poses
 from drgs.capturing.record import FOLDER, CaptureRecord, DoneStep, inputs_of
-from drgs.data.checks import list_images
+from drgs.data.images import list_images
 from drgs.display.progress import Bar
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import is_run

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from drgs.data.capture import scene_extent
-from drgs.data.checks import list_images
 from drgs.data.colmap_files import find_model
 from drgs.data.dataset import Dataset, apply_held_out
 from drgs.data.formats import Format
+from drgs.data.images import list_images
 from drgs.data.llff import POSES_BOUNDS
 from drgs.data.multicamera import frame_folders
 from drgs.data.replica import POSES

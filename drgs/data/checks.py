@@ -19,52 +19,30 @@ from typing import IO
 
 import numpy as np
 
-from drgs.data.heif import HEIF_SUFFIXES, heif_size, is_heif, read_heif
-from drgs.data.image_headers import can_hold, is_whole, stated_size
 from drgs.guards import memory
 from drgs.guards.camera_checks import check_distance
 from drgs.io.foreign import is_file, refuse_foreign
 
 __all__ = [
-    "IMAGE_SUFFIXES",
     "check_last_row",
     "check_npz",
-    "image_size",
-    "is_damaged",
     "file_inside",
     "inverse_pose",
-    "list_images",
     "names_of_here",
-    "native_stderr",
-    "read_image",
     "read_npy",
     "read_npz",
     "read_text",
     "repaired_pose",
-    "unit_range",
 ]
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", *HEIF_SUFFIXES)
 _MAX_NPY_HEADER = 65536
 _DEFLATE = 1032  # bytes that one byte of deflate can become
 _MAX_NAME = 1024  # characters, folders included
 _SHOWN = 120  # characters of a reader's own message
-_MAX_PIXELS = 2**31
 # Poses printed with a few digits are repaired up to this error; anything larger is no rotation.
 _ROUNDING = 1e-2
-# What OpenCV, libpng, libjpeg, libtiff and FFmpeg begin their lines with; OpenCV ends some with an empty one.
-_DECODER = re.compile(
-    rb"^\[ *(WARN|ERROR|INFO)|^\[[\w, ]+ @ 0x|^OpenCV|^Truncating packet|"  # OpenCV, FFmpeg
-    rb"^libpng|JPEG|TIFF|JFIF|SOS|marker|Huffman|^bogus|^\r?\n$",
-    re.IGNORECASE,
-)
 
 _log = logging.getLogger(__name__)
-
-
-def list_images(folder: Path) -> list[Path]:
-    """Image files directly in a folder, by name; hidden files are left out."""
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
 
 
 def file_inside(folder: Path, name: str, where: str) -> Path:
@@ -251,131 +229,6 @@ def _reading_archive(path: Path, what: str) -> Iterator[None]:
             raise
         text = " ".join(str(error).split())[:_SHOWN]
         raise ValueError(f"{path}: must hold {what}, got {text}; save it with numpy.savez") from None
-
-
-def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) of an image; only the header is read, where it says so, and whether a PNG or JPEG ends.
-
-    Raises:
-        ValueError: Not an image, of no or more than 2^31 pixels, or of more than its file can hold, or cut off.
-    """
-    if is_heif(path):
-        return heif_size(path)
-    if not is_whole(path):
-        raise _ends_early(path)
-    stated = stated_size(path)
-    width, height = stated or read_image(path).shape[1::-1]
-    if not 1 <= width * height <= _MAX_PIXELS or (stated and not can_hold(path, width, height)):
-        raise ValueError(
-            f"{path}: an image must have 1 to 2^31 pixels, as many as its {path.stat().st_size} bytes can hold, its "
-            f"header says {width}x{height}; it is damaged, copy it again"
-        )
-    return width, height
-
-
-def is_damaged(path: Path) -> bool:
-    """Whether an image file that is there can be no photograph of a data set: not an image, empty, or cut off.
-
-    Raises:
-        ValueError: The file is of another kind, of which it is said what to do, e.g. a Git LFS pointer.
-    """
-    if not is_heif(path):  # which is an image here
-        refuse_foreign(path, "an image")
-    try:
-        image_size(path)
-    except ValueError:
-        return True
-    return False
-
-
-def read_image(path: Path) -> np.ndarray:
-    """Decode an image as stored: (H,W) or (H,W,C), its own bit depth, channels in RGB order, EXIF
-    rotation ignored.
-
-    Poses and intrinsics belong to the stored pixels, hence no rotation. Of HEIC and AVIF, whose container says how
-    they are turned, these are the pixels that are shown, in 8 bits.
-
-    Raises:
-        FileNotFoundError: No such file.
-        ValueError: Not an image that can be decoded, or one whose data end early.
-    """
-    import cv2
-
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: must be an image, found none; check the path")
-    if is_heif(path):
-        return read_heif(path)
-    if not is_whole(path):
-        raise _ends_early(path)
-    if stated_size(path):
-        width, height = image_size(path)
-        what = f"its {width}x{height} pixels"  # 8 bits and 3 channels, decoded and in the order of RGB
-        memory.require(f"{path}", 6 * width * height, what, "reduce the image, and w, h, fl_x, ... with it")
-    with native_stderr() as complaints:
-        try:
-            data = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        except cv2.error:
-            data = None
-    if data is None:
-        refuse_foreign(path, "an image")
-        raise ValueError(f"{path}: must be an image, could not be decoded; copy or convert it again")
-    # The decoder fills with gray what is missing, and goes on.
-    for line in complaints:
-        if "premature end" in line.lower():
-            raise _ends_early(path)
-        if "corrupt" in line.lower():
-            _log.warning("%s: is damaged, part of it may be wrong (%s); copy it again", path, line.strip())
-            break
-    if data.ndim == 3:
-        order = {3: [2, 1, 0], 4: [2, 1, 0, 3]}.get(data.shape[2])
-        if order is None:
-            data = data[..., 0]
-        else:
-            data = np.ascontiguousarray(data[..., order])
-    return data
-
-
-def unit_range(data: np.ndarray, path: Path) -> np.ndarray:
-    """Image data as float32 in [0,1], by its bit depth."""
-    if data.dtype == np.uint8:
-        return data.astype(np.float32) / np.float32(255)
-    if data.dtype == np.uint16:
-        return data.astype(np.float32) / np.float32(65535)
-    if data.dtype.kind == "f":
-        # Images of floats may hold light beyond white, which no rendering is compared with.
-        return np.clip(data.astype(np.float32), 0.0, 1.0)
-    raise ValueError(f"{path}: an image must have 8 or 16 bits or floats a channel, got {data.dtype}; convert it")
-
-
-def _ends_early(path: Path) -> ValueError:
-    return ValueError(f"{path}: must be a whole image, its data end early; it is truncated or damaged, copy it again")
-
-
-@contextlib.contextmanager
-def native_stderr() -> Iterator[list[str]]:
-    """Collect the lines that decoders print on stderr, for one message of ours in their place.
-
-    What others print meanwhile, such as a progress line of another thread, is passed on.
-    """
-    lines: list[str] = []
-    try:
-        saved = os.dup(2)
-    except OSError:  # stderr is closed
-        yield lines
-        return
-    with tempfile.TemporaryFile() as file:
-        os.dup2(file.fileno(), 2)
-        try:
-            yield lines
-        finally:
-            os.dup2(saved, 2)
-            os.close(saved)
-            file.seek(0)
-            for raw in file.read().splitlines(keepends=True):
-                if _DECODER.search(raw):
-                    lines.append(raw.decode("utf-8", "replace"))
-                else:
-                    os.write(2, raw)
 
 
 def inverse_pose(where: str, c2w: np.ndarray) -> np.ndarray:

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera, intrinsics
-from drgs.data.checks import file_inside, is_damaged, names_of_here
+from drgs.data.checks import file_inside, names_of_here
 from drgs.data.colmap_files import MODEL_FILES, MODEL_FOLDERS, find_model, image_folder, model_suffix, point_ply
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
+from drgs.data.images import is_damaged
 from drgs.data.masks import mask_file
 from drgs.data.point_ply import read_point_ply
 from drgs.data.resampling import fit_to_image

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from drgs.data.checks import IMAGE_SUFFIXES
+from drgs.data.images import IMAGE_SUFFIXES
 from drgs.io.foreign import is_file
 
 __all__ = ["MODEL_FILES", "MODEL_FOLDERS", "find_model", "image_folder", "model_suffix", "point_ply"]

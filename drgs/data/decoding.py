@@ -19,8 +19,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from drgs.data.checks import native_stderr
 from drgs.data.hdr import HDR, HdrReader, hdr_transfer
+from drgs.data.images import native_stderr
 from drgs.data.reader_process import serve
 from drgs.guards import memory
 

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from drgs.cameras import Camera, c2w_from_llff, intrinsics
-from drgs.data.checks import inverse_pose, list_images, read_npy
+from drgs.data.checks import inverse_pose, read_npy
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
+from drgs.data.images import list_images
 from drgs.data.resampling import fit_to_image
 from drgs.data.videos import list_videos
 from drgs.data.view_checks import make_unique

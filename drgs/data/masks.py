@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.data.checks import IMAGE_SUFFIXES, read_image, unit_range
+from drgs.data.images import IMAGE_SUFFIXES, read_image, unit_range
 from drgs.io.foreign import is_file
 
 __all__ = ["mask_file", "read_mask"]

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera
-from drgs.data.checks import list_images
 from drgs.data.colmap import model_camera, model_points, read_model
 from drgs.data.colmap_files import find_model
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
+from drgs.data.images import list_images
 from drgs.data.synchronous import CAMERA_NAME, Recording, evenly_spaced, synchronous
 
 __all__ = ["CAMERA_FOLDERS", "add_model_points", "frame_folders", "frames_of", "load_cameras"]

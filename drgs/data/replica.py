@@ -18,9 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from drgs.cameras import Camera, intrinsics
-from drgs.data.checks import IMAGE_SUFFIXES, image_size, inverse_pose, read_text, repaired_pose
+from drgs.data.checks import inverse_pose, read_text, repaired_pose
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
+from drgs.data.images import IMAGE_SUFFIXES, image_size
 from drgs.data.views import View
 
 __all__ = ["POSES", "REPLICA", "load_replica"]

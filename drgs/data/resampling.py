@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.cameras import Camera
-from drgs.data.checks import image_size
+from drgs.data.images import image_size
 
 if TYPE_CHECKING:
     import torch

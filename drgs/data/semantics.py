@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.data.checks import read_image, read_npy, read_text
+from drgs.data.checks import read_npy, read_text
+from drgs.data.images import read_image
 from drgs.display.progress import Bar
 from drgs.io.json_files import check_json, read_json
 

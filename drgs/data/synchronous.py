@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.data.checks import image_size
 from drgs.data.dataset import Dataset
+from drgs.data.images import image_size
 from drgs.data.resampling import fit_to_image, resized_to
 from drgs.data.videos import VideoFile, VideoFrame
 from drgs.data.view_checks import go_on_without

@@ -12,18 +12,10 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera, c2w_from_opengl, intrinsics
-from drgs.data.checks import (
-    IMAGE_SUFFIXES,
-    check_last_row,
-    file_inside,
-    image_size,
-    inverse_pose,
-    is_damaged,
-    names_of_here,
-    repaired_pose,
-)
+from drgs.data.checks import check_last_row, file_inside, inverse_pose, names_of_here, repaired_pose
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
+from drgs.data.images import IMAGE_SUFFIXES, image_size, is_damaged
 from drgs.data.point_ply import read_point_ply
 from drgs.data.resampling import fit_to_image
 from drgs.data.synchronous import CAMERA_NAME

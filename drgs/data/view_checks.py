@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.data.checks import read_image, unit_range
-from drgs.data.image_headers import png_has_alpha
+from drgs.data.images import png_has_alpha, read_image, unit_range
 from drgs.data.resampling import resize_area
 from drgs.io.foreign import is_file
 

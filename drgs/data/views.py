@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.cameras import Camera
-from drgs.data.checks import read_image, read_npy, unit_range
+from drgs.data.checks import read_npy
+from drgs.data.images import read_image, unit_range
 from drgs.data.masks import read_mask
 from drgs.data.resampling import fit_to_image, lens_maps, nearest_resized, resize_area, undistorted_map
 from drgs.data.semantics import Semantics, plain_labels

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.data.checks import image_size, read_image, unit_range
+from drgs.data.images import image_size, read_image, unit_range
 from drgs.data.masks import mask_file, read_mask
 from drgs.data.resampling import nearest_resized
 

@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from drgs.data.checks import IMAGE_SUFFIXES, list_images, read_image
+from drgs.data.images import IMAGE_SUFFIXES, list_images, read_image
 from drgs.data.videos import VIDEO_SUFFIXES, list_videos, read_video
 from drgs.io.atomic import temporary_folder
 from drgs.io.foreign import refuse_foreign

@@ -15,8 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.data.checks import IMAGE_SUFFIXES, read_image
-from drgs.data.heif import MissingReader, heif_as_jpeg, is_heif
+from drgs.data.images import IMAGE_SUFFIXES, MissingReader, heif_as_jpeg, is_heif, read_image
 
 __all__ = [
     "check_names",

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.data.checks import image_size, list_images
+from drgs.data.images import image_size, list_images
 from drgs.data.videos import list_videos
 from drgs.io.atomic import temporary_folder
 from drgs.io.outputs import lock_folder

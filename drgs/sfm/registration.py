@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drgs.data.checks import IMAGE_SUFFIXES, image_size
+from drgs.data.images import IMAGE_SUFFIXES, image_size
 from drgs.io.atomic import temporary_folder
 from drgs.io.outputs import lock_folder
 from drgs.sfm.image_folder import FRAMES, joined_frames, recorded_frames, write_frames
