@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from drgs.data.capture import scene_extent
-from drgs.data.colmap_files import find_model
+from drgs.data.colmap import find_model
 from drgs.data.dataset import Dataset, apply_held_out
 from drgs.data.formats import Format
 from drgs.data.images import list_images

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera
-from drgs.data.colmap import model_camera, model_points, read_model
-from drgs.data.colmap_files import find_model
+from drgs.data.colmap import find_model
+from drgs.data.colmap_model import model_camera, model_points, read_model
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
 from drgs.data.images import list_images
