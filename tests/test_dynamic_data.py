@@ -14,7 +14,7 @@ import torch
 
 from drgs import cli
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, look_at
-from drgs.data import decoding, load, transforms
+from drgs.data import load, transforms, video_decoding
 from drgs.data.videos import VideoFrame, read_video
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import load_frames, warn_of_late_cameras
@@ -205,10 +205,10 @@ def test_packets_that_do_not_say_what_is_shown(neu3d, monkeypatch):
 
     monkeypatch.setattr(cv2, "VideoCapture", Shifted)
     file, told = (neu3d / "cam02.mp4", (0, 0), True), []
-    video = decoding.walk(*file, tell=told.append)
+    video = video_decoding.walk(*file, tell=told.append)
     assert (video["count"], video["stamps"]) == (FRAMES, [])
     for index in (4, 2, 5, 0, 3):
-        assert decoded(decoding.frame(*file, index, tell=told.append)) == (2, index)
+        assert decoded(video_decoding.frame(*file, index, tell=told.append)) == (2, index)
 
 
 def test_a_seek_that_ends_elsewhere_is_noticed(neu3d, monkeypatch):
@@ -226,9 +226,9 @@ def test_a_seek_that_ends_elsewhere_is_noticed(neu3d, monkeypatch):
             return getattr(self.real, name)
 
     monkeypatch.setattr(cv2, "VideoCapture", Careless)
-    monkeypatch.setattr(decoding, "_NEAR", 0)
+    monkeypatch.setattr(video_decoding, "_NEAR", 0)
     for index in (4, 2, 5, 0, 3):
-        found = decoding.frame(neu3d / "cam02.mp4", (0, 1), True, index, tell=lambda _: None)
+        found = video_decoding.frame(neu3d / "cam02.mp4", (0, 1), True, index, tell=lambda _: None)
         assert decoded(found) == (2, index)
 
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from drgs.cameras import c2w_to_opengl, look_at
-from drgs.data.flight import Flight, Keyframe, quaternion_of, rotation_of
-from drgs.data.flight_files import flight_json, read_flight
+from drgs.data.camera_path import Flight, Keyframe, flight_json, quaternion_of, read_flight, rotation_of
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 

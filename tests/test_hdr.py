@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from drgs.data import decoding
+from drgs.data import video_decoding
 from drgs.data.hdr import HdrReader, hdr_transfer
 from drgs.data.images import heif_as_jpeg, read_image
 from drgs.data.videos import VideoFrame
@@ -94,7 +94,7 @@ def test_without_pyav_it_is_said(tmp_path, monkeypatch, caplog, kind, suffix):
     path = write_hdr(tmp_path / f"a.{suffix}", kind)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert hdr_transfer(path, suffix != "mkv") == TRC[kind]
-    decoding._Reader(path, [], 4, suffix != "mkv")
+    video_decoding._Reader(path, [], 4, suffix != "mkv")
     assert caplog.messages == [
         f"{path}: is HDR video ({kind}), whose colors come out wrong without the package av; pip install "
         "'drgs[video]', or convert it to SDR"

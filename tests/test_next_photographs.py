@@ -22,7 +22,7 @@ from drgs.commands.options import View
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.view import subject_of
 from drgs.data import load
-from drgs.data.capture import level_frame, upright
+from drgs.data.camera_layout import level_frame, upright
 from drgs.fitting.config import FitConfig
 from drgs.train import fit
 from drgs.viewing import panel

@@ -8,7 +8,7 @@ import pytest
 import drgs
 from drgs.cameras import Camera, intrinsics_from_fov, look_at
 from drgs.commands.orbits import Wish, capture_orbit, scene_orbit
-from drgs.data.capture import Focus, path, upright
+from drgs.data.camera_layout import Focus, path, upright
 from drgs.meshing.depths import seen_distance
 
 CENTER = np.array([1.0, 2.0, 3.0])

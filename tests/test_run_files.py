@@ -175,7 +175,7 @@ _OTHERS = {
     "codecs/sog.py",  # the index in a .sog
     "commands/info.py",  # stdout
     "commands/report.py",  # options on a line of a report
-    "data/flight_files.py",  # flight.json: docs/view.md
+    "data/camera_path.py",  # flight.json: docs/view.md
     "data/reader_process.py",  # between processes
     "io/checkpoint.py",  # the header of a checkpoint
     "io/journal.py",  # lines of log.jsonl, rows.jsonl, .drgs.jsonl

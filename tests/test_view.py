@@ -33,7 +33,7 @@ from drgs.commands.options import View
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.view import subject_of, watched_files
 from drgs.data import load
-from drgs.data.flight_files import read_flight
+from drgs.data.camera_path import read_flight
 from drgs.display.pictures import map_colors
 from drgs.files import load_state, save_state
 from drgs.viewing import panel

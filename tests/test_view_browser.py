@@ -28,8 +28,7 @@ from drgs.commands import view
 from drgs.commands.options import View
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.view import subject_of, watched_files
-from drgs.data.flight import rotation_of
-from drgs.data.flight_files import read_flight
+from drgs.data.camera_path import read_flight, rotation_of
 from drgs.files import load_state, save_state
 from drgs.viewing.client import camera_of, pose_of
 from drgs.viewing.server import Viewer

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 
 from drgs.capturing.places import Place, meters_of, places_around
+from drgs.data.camera_layout import upright
 from drgs.data.camera_lists import described
-from drgs.data.capture import upright
 from drgs.display.progress import Bar
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import fitted_views, load_run

@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from drgs.cameras import Camera, look_at
-from drgs.data.capture import level_frame
+from drgs.data.camera_layout import level_frame
 
 __all__ = ["Place", "meters_of", "places_around", "length_in_words"]
 

@@ -12,15 +12,15 @@ import numpy as np
 from drgs.cameras import Camera, intrinsics
 from drgs.codecs.ply import save_ply
 from drgs.commands.viewpoints import frame_size
-from drgs.data.capture import level_frame, upright
-from drgs.data.flight_files import read_flight
+from drgs.data.camera_layout import level_frame, upright
+from drgs.data.camera_path import read_flight
 from drgs.display.progress import Bar
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.commands.options import Render
     from drgs.commands.scene_input import SceneInput
-    from drgs.data.flight import Flight
+    from drgs.data.camera_path import Flight
     from drgs.ellipsoids import Scene
     from drgs.settings import RenderSettings
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from drgs.data.flight import quaternion_of
+from drgs.data.camera_path import quaternion_of
 from drgs.ellipsoids import Gaussians
 from drgs.io.json_files import check_json, read_json
 

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from drgs.cameras import Camera, intrinsics_from_fov, look_at, orbit
 from drgs.commands.values import UP, parsed_orbit
-from drgs.data.capture import Focus, path, upright
+from drgs.data.camera_layout import Focus, path, upright
 
 if TYPE_CHECKING:
     from collections.abc import Callable

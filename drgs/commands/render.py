@@ -38,8 +38,8 @@ from drgs.commands.orbits import Wish
 from drgs.commands.painters import PAINTINGS, painters
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import captured_cameras, check_lenses, drawn_views
+from drgs.data.camera_layout import middle_camera
 from drgs.data.camera_lists import described, save_cameras_json
-from drgs.data.capture import middle_camera
 from drgs.display import pictures
 from drgs.display.mp4 import Mp4, need_mp4
 from drgs.display.progress import Bar

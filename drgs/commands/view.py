@@ -18,7 +18,7 @@ from drgs.commands.scene_input import SELECTION, SceneInput, ranking_of
 from drgs.commands.values import UP
 from drgs.commands.viewpoints import Known, Source, known_views
 from drgs.data import View as DataView
-from drgs.data.capture import Focus, upright
+from drgs.data.camera_layout import Focus, upright
 from drgs.display.progress import Bar, quietly
 from drgs.ellipsoids import Gaussians
 from drgs.fitting.records import fitted_views

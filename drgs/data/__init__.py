@@ -9,7 +9,7 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from drgs.data.capture import scene_extent
+from drgs.data.camera_layout import scene_extent
 from drgs.data.colmap import find_model
 from drgs.data.dataset import Dataset, apply_held_out
 from drgs.data.formats import Format

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera
-from drgs.data.capture import Focus
+from drgs.data.camera_layout import Focus
 from drgs.data.checks import file_inside, read_npz, repaired_pose
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format

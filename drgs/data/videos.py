@@ -1,4 +1,4 @@
-"""Videos, read a frame at a time by a process of its own (decoding.py)."""
+"""Videos, read a frame at a time by a process of its own (video_decoding.py)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["VIDEO_SUFFIXES", "VideoFile", "VideoFrame", "list_videos", "read_vid
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi")
 
-_decoder = Child("drgs.data.decoding", "a video that can be decoded", "convert it with ffmpeg, or leave it out")
+_decoder = Child("drgs.data.video_decoding", "a video that can be decoded", "convert it with ffmpeg, or leave it out")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drgs.cameras import Camera
-from drgs.data.capture import Focus, scene_extent
+from drgs.data.camera_layout import Focus, scene_extent
 from drgs.data.views import View
 
 __all__ = [

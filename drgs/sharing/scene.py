@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drgs.data.capture import Focus, upright
+from drgs.data.camera_layout import Focus, upright
 from drgs.fitting.records import fitted_views, load_run
 from drgs.fitting.renderers import VIEWERS, planar_of
 from drgs.information.nuisances import Nuisances

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drgs.codecs.clustering import morton_order
-from drgs.data.capture import middle_camera
+from drgs.data.camera_layout import middle_camera
 from drgs.display.progress import Bar
 from drgs.io.outputs import atomic_write
 from drgs.sharing.gaussians import archive_of

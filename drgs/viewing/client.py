@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from drgs.cameras import Camera, intrinsics
-from drgs.data.flight import quaternion_of, rotation_of
+from drgs.data.camera_path import quaternion_of, rotation_of
 from drgs.ellipsoids import Y_00, Gaussians, semi_axes
 
 __all__ = ["ClientGaussians", "Pose", "camera_of", "looking", "pose_of"]

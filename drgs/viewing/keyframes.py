@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drgs.data.flight import Flight, Keyframe
-from drgs.data.flight_files import flight_json
+from drgs.data.camera_path import Flight, Keyframe, flight_json
 from drgs.viewing import panel
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drgs.data.flight import Keyframe
+from drgs.data.camera_path import Keyframe
 from drgs.display.pictures import to_bytes
 from drgs.viewing import panel
 from drgs.viewing.client import ClientGaussians, Pose, camera_of, looking, pose_of
