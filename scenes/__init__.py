@@ -11,6 +11,7 @@ import json
 
 import numpy as np
 
+from drgs.display.srgb import linear_from_srgb, srgb_from_linear
 from drgs.scenes.output import DEPTH_UNIT, write_depth, write_png
 
 __all__ = [
@@ -213,8 +214,7 @@ def _lit(paint, factor):
     """A texture of the linear radiance that a picture stands for, times a factor."""
     import mitsuba as mi
 
-    srgb = np.clip(paint / 255.0, 0, 1)
-    linear = np.where(srgb < 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4) * factor
+    linear = linear_from_srgb(np.clip(paint / 255.0, 0, 1)) * factor
     bitmap = mi.Bitmap(np.ascontiguousarray(linear, np.float32))
     return {"type": "bitmap", "bitmap": bitmap, "raw": True}
 
@@ -311,8 +311,7 @@ def dome(views, seed, center, distance, arc, elevations):
 def encode_srgb(linear):
     """Linear radiance to 8-bit sRGB."""
     linear = np.clip(linear, 0, 1)  # what is brighter is overexposed
-    curve = np.where(linear < 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return (curve * 255 + 0.5).astype(np.uint8)
+    return (srgb_from_linear(linear) * 255 + 0.5).astype(np.uint8)
 
 
 # ------------------------------------------------------------------------------- data set

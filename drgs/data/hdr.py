@@ -18,6 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from drgs.display.srgb import srgb_from_linear
+
 __all__ = ["HDR", "HdrReader", "hdr_transfer", "in_srgb"]
 
 HDR = {16: "PQ", 18: "HLG"}
@@ -182,5 +184,4 @@ def _linear(transfer: int) -> np.ndarray:
 def _encoding() -> np.ndarray:
     """(65536,) uint8: the sRGB number of each share of 65535 of white."""
     light = np.linspace(0, 1, 1 << 16)
-    signal = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-    return np.round(255 * signal).astype(np.uint8)
+    return np.round(255 * srgb_from_linear(light)).astype(np.uint8)

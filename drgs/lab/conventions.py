@@ -18,6 +18,7 @@ import torch
 
 from drgs import reference
 from drgs.cameras import Camera, rigid
+from drgs.display.srgb import linear_from_srgb
 from drgs.ellipsoids import Y_00
 from drgs.integrator import render
 from drgs.lab.parameters import COLORS, gaussians_of, image_of, posed
@@ -215,7 +216,7 @@ class ReferenceModel:
             background = 0.0
             if self.transfer.endswith("behind"):
                 background = (1 - alpha[..., None]) * torch.tensor(self.settings.background, dtype=torch.float64)
-            image = _linear(image - background) + background
+            image = linear_from_srgb(image - background) + background
         return image, alpha
 
     def _flipped(self, picture: torch.Tensor) -> torch.Tensor:
@@ -337,12 +338,6 @@ def _compensation(raw: dict, camera: Camera, s: RenderSettings, floor: float) ->
     trace = (a * a + b * b).sum(-1)
     ratio = det / (det + s.dilation * (trace + s.dilation))
     return ratio.clamp_min(floor).sqrt()  # at 0 the root's derivative is infinite
-
-
-def _linear(x: torch.Tensor) -> torch.Tensor:
-    """Linear light of sRGB values."""
-    # The power is evaluated where it is not taken, too: below -0.055 it is NaN, and so would the gradient be.
-    return torch.where(x <= 0.04045, x / 12.92, ((x.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)
 
 
 # ----------------------------------------------------------------------------------------------------------- the search

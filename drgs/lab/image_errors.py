@@ -15,6 +15,8 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
+from drgs.display.srgb import linear_from_srgb, srgb_from_linear
+
 __all__ = ["OFF", "PATTERNS", "ErrorRow", "Pattern", "error_line", "error_row", "pattern_of"]
 
 PATTERNS = {
@@ -233,10 +235,8 @@ def _backgrounds(case: _Case) -> Iterator[tuple]:
 
 def _transfers(case: _Case) -> Iterator[tuple]:
     right = case.right.clip(0)  # a power of a negative color is NaN
-    low, high = right <= 0.0031308, right <= 0.04045
-    encoded = np.where(low, 12.92 * right, 1.055 * np.maximum(right, 1e-9) ** (1 / 2.4) - 0.055)
-    yield "transfer", "encoded as sRGB", encoded
-    yield "transfer", "decoded as if it were sRGB", np.where(high, right / 12.92, ((right + 0.055) / 1.055) ** 2.4)
+    yield "transfer", "encoded as sRGB", srgb_from_linear(right)
+    yield "transfer", "decoded as if it were sRGB", linear_from_srgb(right)
     usable = case.counts & ((right > 0.01) & (np.abs(right - 1) > 0.01) & (case.wrong > 0.01)).all(-1)
     if usable.any():
         power = float(np.median(np.log(case.wrong[usable]) / np.log(right[usable])))

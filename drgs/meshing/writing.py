@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.codecs.glb import glb_of
+from drgs.display.srgb import linear_from_srgb
 from drgs.io.outputs import replacing
 
 if TYPE_CHECKING:
@@ -78,8 +79,7 @@ def _write_obj(mesh: TriangleMesh, name: str) -> None:
 def _glb(mesh: TriangleMesh) -> bytes:
     """A GLB of one primitive of triangles: POSITION, COLOR_0 and indices, as glTF 2.0 has them."""
     positions = np.ascontiguousarray(mesh.vertices * _TURN, "<f4")
-    colors = mesh.colors.astype(np.float64)
-    linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+    linear = linear_from_srgb(mesh.colors.astype(np.float64))
     opaque = np.full((len(linear), 1), 65535)  # four channels: each vertex starts at a multiple of four bytes
     arrays = [
         (positions, {"componentType": 5126, "type": "VEC3"}, 34962),
