@@ -32,7 +32,7 @@ from drgs.commands.capture import capture_photographs, run
 from drgs.commands.options import Capture
 from drgs.data import load
 from drgs.data.dataset import HELD_OUT, write_held_out
-from drgs.display.progress import Bar
+from drgs.display.progress import Bar, duration
 from drgs.files import Run, load_state
 from drgs.fitting.config import FitConfig
 from drgs.sharing import npm
@@ -583,7 +583,7 @@ def test_a_budget_that_is_not_enough(photographs):
     assert told.startswith(
         "the budget is used up: the smallest fit has 100 steps at 12000 pixels with up to 8000 Gauss"
     )
-    assert told.endswith(f"about {budget.duration(299.0 + late.seconds + late.after)} in all")
+    assert told.endswith(f"about {duration(299.0 + late.seconds + late.after)} in all")
     assert late.line(5.0, 55.0).startswith("only 5 s of the budget are left: the smallest fit has 100 steps")
     assert (
         budget.FitPlan(12_000, 8_000, 600, 30.0, 9.0)

@@ -23,7 +23,7 @@ import numpy as np
 
 from drgs.data.images import image_size, read_image
 from drgs.data.videos import VideoFrame, read_video
-from drgs.display.progress import Bar
+from drgs.display.progress import Bar, duration
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import frames_for
 from drgs.fitting.start import start
@@ -41,7 +41,6 @@ __all__ = [
     "Pacer",
     "PosePlan",
     "Stopwatch",
-    "duration",
     "plan_fit",
     "plan_frames",
     "plan_poses",
@@ -214,13 +213,6 @@ def seconds_of_budget(text: str) -> float:
     if not _LEAST_BUDGET <= seconds <= 1e7:
         raise ValueError(f"--budget must be at least {_LEAST_BUDGET:.0f}s, got {text}; allow more time")
     return seconds
-
-
-def duration(seconds: float) -> str:
-    """A time in words, e.g. `40 s` or `12 min`."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 def plan_poses(

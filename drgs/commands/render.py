@@ -42,7 +42,7 @@ from drgs.data.camera_layout import middle_camera
 from drgs.data.camera_lists import described, save_cameras_json
 from drgs.display import pictures
 from drgs.display.mp4 import Mp4, need_mp4
-from drgs.display.progress import Bar
+from drgs.display.progress import Bar, duration
 from drgs.ellipsoids import colors_only
 from drgs.guards import memory
 from drgs.integrator import render
@@ -396,9 +396,11 @@ def _say_how_long(args: Render, gaussians: Gaussians, cameras: list[Camera], set
         return
     seconds = forecast(gaussians, cameras, settings)
     if seconds > _LONG:
-        took = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
         what = f"{args.preset}, {len(cameras)} views of {cameras[0].width}x{cameras[0].height}"
-        _say(args, f"{what} will take about {took} on this machine; --preset fast takes a small part of that")
+        _say(
+            args,
+            f"{what} will take about {duration(seconds)} on this machine; --preset fast takes a small part of that",
+        )
 
 
 def _say(args: Render, text: str) -> None:

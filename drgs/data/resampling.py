@@ -109,14 +109,15 @@ def lens_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray | None
     Raises:
         ValueError: The photo saw next to nothing of its own undistorted image.
     """
-    *maps, lost = _cached_lens_maps(camera.K.tobytes(), camera.width, camera.height, camera.model, camera.distortion)
+    lens = camera.K.tobytes(), camera.width, camera.height, camera.model, camera.distortion
+    columns, rows, unseen, lost = _cached_lens_maps(*lens)
     if lost > _LOST_MAX:
         raise ValueError(
             f"view {camera.name!r}: its lens must show what its undistorted image shows, {lost:.0%} of that lie "
             f"outside the photo or where the lens folds back, got {camera.model} {camera.distortion}; "
             "check the coefficients"
         )
-    return tuple(maps)
+    return columns, rows, unseen
 
 
 def undistorted_map(values: torch.Tensor, camera: Camera) -> torch.Tensor:

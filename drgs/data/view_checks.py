@@ -308,7 +308,7 @@ def default_background(dataset: Dataset, lazy: bool = False) -> tuple[tuple[floa
         RGB in [0, 1], and one line.
     """
     views = [view for view in dataset.split()[0] if view.image_path is not None]
-    views = [view for view in (views[:1] if lazy else views) if png_has_alpha(view.image_path)]
+    views = [view for view in (views[:1] if lazy else views) if view.image_path and png_has_alpha(view.image_path)]
     if not views:
         return _COLORS["black"], ""
     found = "" if lazy else _mixed_with(views[:: -(-len(views) // _PHOTOGRAPHS)])

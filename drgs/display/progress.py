@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-__all__ = ["Bar", "quietly"]
+__all__ = ["Bar", "duration", "quietly"]
 
 FIRST = 1.0  # seconds after which a stage is worth its first line
 EVERY = 10.0  # seconds between two lines at first; they become rarer, up to LEAST_OFTEN
@@ -23,6 +23,13 @@ LEAST_OFTEN = 30.0
 _TELLING = 24  # steps after which a rate is believed: kernels are compiled in a fit's first ones, of every renderer
 _bars: list[Bar] = []  # that are open, the innermost last
 _output: _Lines | _Terminal | Any = None  # None while none of them is shown
+
+
+def duration(seconds: float) -> str:
+    """A time in words, as exact as an estimate is: `40 s`, `12 min`, `1.5 h`."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 class Bar:

@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from drgs.display.progress import duration
 from drgs.fitting.config import FitConfig, SelectionConfig
 from drgs.metrics import MOVING, OBJECT, renderers_table
 from drgs.report.pictures import Picture
@@ -166,17 +167,11 @@ def _tiles(account: Account) -> list[tuple[str, str]]:
         tiles.append((f"{views} of {len(chosen['pool'])}", "views, the last ones picked"))
     else:
         tiles.append((str(len(account.record.train)), "views fitted to"))
-    return [*tiles, (_duration(_seconds(account)), "of steps")]
+    return [*tiles, (duration(_seconds(account)), "of steps")]
 
 
 def _seconds(account: Account) -> float:
     return max((row["seconds"] for row in account.events if row["event"] in ("train", "done")), default=0.0)
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
 def _shown(name: str, value: float | None) -> str:

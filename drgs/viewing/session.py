@@ -21,6 +21,7 @@ import numpy as np
 
 from drgs.data.camera_path import Keyframe
 from drgs.display.pictures import to_bytes
+from drgs.display.progress import duration
 from drgs.viewing import panel
 from drgs.viewing.client import ClientGaussians, Pose, camera_of, looking, pose_of
 from drgs.viewing.keyframes import KeyframeFolder
@@ -548,7 +549,7 @@ class Session:
             expected: Seconds that it takes by the pixels of a picture before it; 0 where there was none.
             show: Shows the rows that are done, now and then.
         """
-        self.say(f"{text}, about {_seconds(expected)} ..." if expected else f"{text} ...")
+        self.say(f"{text}, about {duration(max(expected, 1))} ..." if expected else f"{text} ...")
         began = shown = time.perf_counter()
         while True:
             try:
@@ -561,7 +562,7 @@ class Session:
                 if rows is not None and now - shown >= _ROWS_EVERY:
                     show(rows)
                     shown = now
-                self.say(f"{text}: {share:.0%}, about {_seconds(left)} left ...")
+                self.say(f"{text}: {share:.0%}, about {duration(max(left, 1))} left ...")
             yield
 
     def _lacks_uncertainty(self) -> bool:
@@ -573,8 +574,3 @@ class Session:
         """Pose of the client's camera and pixels of its window; None where it has said nothing that is one."""
         camera = self.client.camera
         return Pose.stated(camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height)
-
-
-def _seconds(seconds: float) -> str:
-    """How long, in words as exact as an estimate is."""
-    return f"{seconds / 60:.0f} min" if seconds >= 90 else f"{max(1, round(seconds))} s"
