@@ -266,6 +266,19 @@ class Camera:
                 break
         return pixels, local[:, 2]
 
+    def contains(self, pixels: np.ndarray, depth: np.ndarray | None = None, margin: float = 0.0) -> np.ndarray:
+        """(P,) bool: which pixels, as `project` gives them, lie in the image.
+
+        Args:
+            pixels: (P,2); NaN lies nowhere.
+            depth: (P,) camera z: what is not in front of the camera is not in its image. None, to leave that to the
+                lens: fisheyes and panoramas see behind themselves.
+            margin: Pixels that they must lie from the border; negative: that they may lie beyond it.
+        """
+        size = np.array([self.width, self.height])
+        inside = ((pixels >= margin) & (pixels < size - margin)).all(axis=1)
+        return inside if depth is None else (depth > 0) & inside
+
     def to_mitsuba(self, near: float = 1e-2, far: float = 1e4) -> dict:
         """A Mitsuba `perspective` sensor as a dictionary for `mi.load_dict` (box filter, one sample a pixel).
 

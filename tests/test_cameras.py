@@ -57,6 +57,16 @@ def test_projects_by_opencv_axes_with_centers_at_half():
     np.testing.assert_allclose(z, [2, 2, 2, -1])
 
 
+def test_which_pixels_lie_in_the_image():
+    """The image goes from 0 to its size, the end left out; NaN and what is behind the camera lie nowhere."""
+    camera = make()
+    pixels = np.array([[0.0, 0], [127.9, 79.9], [128, 40], [64, 80], [-0.1, 40], [np.nan, 40]])
+    assert camera.contains(pixels).tolist() == [True, True, False, False, False, False]
+    assert camera.contains(pixels, np.array([1.0, -1, 1, 1, 1, 1])).tolist() == [True] + 5 * [False]
+    assert camera.contains(pixels, margin=1.0).tolist() == 6 * [False]
+    assert camera.contains(pixels, margin=-1.0).tolist() == 5 * [True] + [False]
+
+
 def test_opengl_frame_by_projected_point():
     """A point right of and above a camera that looks along -z."""
     # A Blender camera at the origin looks along -z with +y up.

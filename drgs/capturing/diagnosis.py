@@ -282,7 +282,7 @@ def _depth(view: View, points: np.ndarray) -> float | None:
     """Median distance along the axis of the points in the picture; None without any."""
     camera = view.camera.undistorted()
     pixels, depth = camera.project(points)
-    inside = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+    inside = camera.contains(pixels, depth)
     return float(np.median(depth[inside])) if inside.any() else None
 
 

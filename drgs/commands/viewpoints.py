@@ -356,8 +356,7 @@ def _check_seen(gaussians: Gaussians, cameras: list[Camera]) -> None:
     """Say so if most of the cameras have no Gaussian's center before them: a file may be in another frame than they."""
     means = gaussians.means[:: max(1, len(gaussians) // _LOOKED_AT)].detach().cpu().numpy() + gaussians.origin
     looked = evenly(cameras, _LOOKED_FROM)
-    pixels = [(camera.project(means)[0], (camera.width, camera.height)) for camera in looked]
-    blind = sum(not ((at >= 0) & (at < size)).all(axis=1).any() for at, size in pixels)
+    blind = sum(not camera.contains(camera.project(means)[0]).any() for camera in looked)
     if blind > len(looked) / 2:
         _log.warning(
             "%d of %d known views show nothing of the scene: do the cameras belong to it? (a splat of ns-export is in "

@@ -169,8 +169,7 @@ def _seen(cameras: list[Camera], points: np.ndarray | None) -> float:
     if points is not None and len(points):
         shares = []
         for camera in cameras:
-            pixels, _ = camera.project(points)
-            shares.append(((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1).mean())
+            shares.append(camera.contains(camera.project(points)[0]).mean())
         return float(np.mean(shares))
     focus = Focus.of(cameras)
     if focus is None:

@@ -190,7 +190,7 @@ class ActiveViews:
             else:
                 points, colors, found = added_points(seen, seed, self._matches, bar.stage)
         pixels, depth = frame.camera.project(points)
-        inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < (frame.camera.width, frame.camera.height)).all(1)
+        inside = frame.camera.contains(pixels, depth)
         # What is triangulated goes in where Gaussians are, too: it knows where things are, and they may have begun at
         # random.
         guessed = np.flatnonzero(inside[found:]) + found

@@ -331,10 +331,8 @@ def _observed(frames: list[Frame], points: np.ndarray) -> tuple[np.ndarray, np.n
     square = np.ones((3, 3), np.uint8)
     for row, frame in enumerate(frames):
         image = frame.image().numpy()
-        height, width = image.shape[:2]
         pixels, depth = frame.camera.project(points)
-        inside = (depth > 0) & (pixels >= _MARGIN).all(axis=1)
-        inside &= (pixels < (width - _MARGIN, height - _MARGIN)).all(axis=1)
+        inside = frame.camera.contains(pixels, depth, _MARGIN)
         across[row] = pixels[:, 0]
         index = np.flatnonzero(inside)
         columns, rows = pixels[index].astype(int).T

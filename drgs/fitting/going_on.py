@@ -86,6 +86,5 @@ def _shown_points(frames: list[Frame], points: np.ndarray) -> np.ndarray:
     found = np.zeros(len(points), bool)
     for frame in frames:
         pixels, depth = frame.camera.project(points)
-        size = frame.camera.width, frame.camera.height
-        found |= (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)
+        found |= frame.camera.contains(pixels, depth)
     return np.flatnonzero(found)

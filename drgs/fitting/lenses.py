@@ -99,6 +99,5 @@ def lost_share(camera: Camera) -> float:
         # Where a lens has no inverse is said when its photographs are read.
         warnings.filterwarnings("ignore", message=".*cannot be inverted")
         rays = small.pixel_directions().reshape(-1, 3)
-    pixels, _ = small.undistorted().project(rays)
-    inside = ((pixels >= 0) & (pixels <= (small.width, small.height))).all(1)
-    return 1 - float(inside.mean())
+    plain = small.undistorted()
+    return 1 - float(plain.contains(plain.project(rays)[0]).mean())

@@ -267,10 +267,8 @@ def _seen(frames: list[Frame], points: np.ndarray) -> np.ndarray:
     """(P,) which points a photograph looks at, a little beyond its borders, too."""
     seen = np.zeros(len(points), bool)
     for frame in frames:
-        size = np.array([frame.camera.width, frame.camera.height])
         pixels, depth = frame.camera.project(points)
-        margin = _MARGIN * size.max()
-        seen |= (depth > 0) & ((pixels > -margin) & (pixels < size + margin)).all(axis=1)
+        seen |= frame.camera.contains(pixels, depth, -_MARGIN * max(frame.camera.width, frame.camera.height))
     return seen
 
 
@@ -286,8 +284,7 @@ def _colors_seen(frames: list[Frame], points: np.ndarray, blur: float = 0.0) -> 
         if blur:
             image = cv2.GaussianBlur(image, (0, 0), blur * frame.camera.width)
         pixels, depth = frame.camera.project(points)
-        inside = (depth > 0) & ((pixels >= 0) & (pixels < (frame.camera.width, frame.camera.height))).all(axis=1)
-        index = np.flatnonzero(inside)
+        index = np.flatnonzero(frame.camera.contains(pixels, depth))
         columns, lines = pixels[index].astype(int).T
         if frame.mask is not None:
             kept = frame.mask.numpy()[lines, columns] > 0.5

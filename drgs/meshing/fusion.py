@@ -97,8 +97,7 @@ def sampled(view: DepthView, points: np.ndarray, trunc: float) -> tuple[np.ndarr
     """
     height, width = view.depth.shape
     pixels, distance = _projected(view.camera, points)
-    with np.errstate(invalid="ignore"):
-        is_inside = (pixels >= 0).all(1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
+    is_inside = view.camera.contains(pixels)
     signed = np.full(len(points), np.nan)
     weight = np.zeros(len(points))
     at = pixels[is_inside]

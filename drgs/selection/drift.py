@@ -114,5 +114,4 @@ def change_of_view(
 def _inside(camera: Camera, points: torch.Tensor) -> torch.Tensor:
     """(P,) float32, 1 for points that are in a camera's image."""
     pixels, _ = camera.project(points.numpy())
-    inside = (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
-    return torch.from_numpy(inside).float()
+    return torch.from_numpy(camera.contains(pixels)).float()

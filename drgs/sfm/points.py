@@ -367,9 +367,7 @@ def _inside(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
     """Indices of the points in a view's picture, their pixels (N, 2) and depths (N,)."""
     camera = view.shown_camera
     pixels, depth = camera.project(points)
-    inside = np.flatnonzero(
-        (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
-    )
+    inside = np.flatnonzero(camera.contains(pixels, depth))
     return inside, pixels[inside], depth[inside]
 
 

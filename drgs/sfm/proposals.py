@@ -163,7 +163,7 @@ def points_along_rays(
     seen = np.zeros(len(points), dtype=np.int64)
     for camera, mask in zip(cameras, masks, strict=True):
         pixels, _ = camera.project(points)
-        inside = (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+        inside = camera.contains(pixels)
         if mask is not None:
             columns, rows = pixels[inside].astype(np.int64).T
             inside[inside] = mask[rows, columns] > MASK_KEEP
@@ -332,7 +332,7 @@ class Hull:
         camera = self.cameras[index]
         pixels, depth = camera.project(places)
         # A place behind a camera projects somewhere, too.
-        shown = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+        shown = camera.contains(pixels, depth)
         columns, rows = pixels[shown].astype(np.int64).T
         counted = self.counts[index][rows, columns]
         shown[shown] = counted
