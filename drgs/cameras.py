@@ -276,8 +276,8 @@ class Camera:
             margin: Pixels that they must lie from the border; negative: that they may lie beyond it.
         """
         size = np.array([self.width, self.height])
-        inside = ((pixels >= margin) & (pixels < size - margin)).all(axis=1)
-        return inside if depth is None else (depth > 0) & inside
+        inside = np.all((pixels >= margin) & (pixels < size - margin), axis=1)
+        return inside if depth is None else np.logical_and(depth > 0, inside)
 
     def to_mitsuba(self, near: float = 1e-2, far: float = 1e4) -> dict:
         """A Mitsuba `perspective` sensor as a dictionary for `mi.load_dict` (box filter, one sample a pixel).

@@ -52,7 +52,7 @@ class ExposureEstimate:
         errors: (V, 3) their standard errors.
         observations: How many colors of points were compared.
         components: Sets of photographs that share points; each is centered by itself, for nothing compares them.
-        labels: (V,) int64, the set of each photograph: the index of its first one.
+        labels: (V,) int32 number of the set of each photograph.
         lowered: Share of the error in halves of photographs that gains lower which were estimated without them;
             negative where they raise it.
         is_confirmed: (V,) bool, whose gains lower it.
@@ -367,16 +367,10 @@ def _solved(weights: np.ndarray, logs: np.ndarray, label: np.ndarray) -> tuple[n
 
 def _components(there: np.ndarray) -> np.ndarray:
     """(V,) label of the set of photographs that share points with each photograph, of (V, P, 3) observations."""
+    from scipy.sparse.csgraph import connected_components
+
     shown = np.asarray(there.any(axis=2), np.float32)
-    linked = shown @ shown.T >= _SUPPORT
-    label = np.arange(len(there))
-    for _ in range(len(there)):
-        lowest = np.where(linked, label[None, :], len(label)).min(axis=1, initial=len(label))
-        new = np.minimum(label, lowest)
-        if (new == label).all():
-            break
-        label = new
-    return label
+    return connected_components(shown @ shown.T >= _SUPPORT, directed=False)[1]
 
 
 def _three(values: np.ndarray) -> tuple[float, float, float]:

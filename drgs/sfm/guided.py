@@ -225,6 +225,9 @@ def _tracks(
     Returns:
         As `Matches.triangulate`.
     """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     pixels = np.concatenate([picture.pixels for picture in pictures])
     picture_of = np.repeat(np.arange(len(pictures)), np.diff(starts))
     # Every match's point against the features that its two are matched with, which are the two themselves as well.
@@ -251,7 +254,8 @@ def _tracks(
     kept = np.flatnonzero((support >= 3) | ((support == 2) & (most[edges] == 2).all(axis=1)))
     if not len(kept):
         return np.empty((0, 3)), np.empty((0, 3), np.float32), np.empty((len(pictures), 0), bool)
-    label = _components(edges[kept], len(pixels))[edges[kept, 0]]
+    links = coo_array((np.ones(len(kept), bool), tuple(edges[kept].T)), shape=(len(pixels), len(pixels)))
+    label = connected_components(links, directed=False)[1][edges[kept, 0]]
     order = np.lexsort((-support[kept], label))
     chosen = kept[order[np.append(True, np.diff(label[order]) > 0)]]
     # The point nearest to the rays of all that agree; they meet at an angle (_match), so that no system is singular.
@@ -272,16 +276,3 @@ def _tracks(
     shown = np.zeros((len(pictures), len(chosen)), bool)
     shown[picture_of[member], match] = True
     return made, color / np.bincount(match)[:, None].astype(np.float32), shown
-
-
-def _components(edges: np.ndarray, count: int) -> np.ndarray:
-    """(count,) label of each of `count` things: the same for those that edges (E, 2) connect."""
-    label = np.arange(count)
-    while True:
-        low = label[edges].min(axis=1)
-        new = label.copy()
-        np.minimum.at(new, edges.ravel(), np.repeat(low, 2))
-        new = new[new]
-        if (new == label).all():
-            return label
-        label = new

@@ -8,6 +8,7 @@ vocabulary is downloaded; pycolmap's wheel carries none.
 from __future__ import annotations
 
 import itertools
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -122,6 +123,8 @@ def global_descriptors(database: Path, names: list[str], seed: int = 0) -> np.nd
         Jegou et al., "Aggregating local descriptors into a compact image representation", CVPR 2010; Arandjelovic and
         Zisserman, "All about VLAD", CVPR 2013.
     """
+    from scipy.cluster.vq import vq
+
     rng = np.random.default_rng(seed)
     samples = []
     for features in _features(database, names):
@@ -130,11 +133,9 @@ def global_descriptors(database: Path, names: list[str], seed: int = 0) -> np.nd
     centers = _centers(np.concatenate(samples), rng)
     found = np.zeros((len(names), len(centers), 128), np.float32)
     for index, features in enumerate(_features(database, names)):
-        if not len(features):
-            continue
-        label = _nearest(features, centers)
-        sums, sizes = _sums(features, label, len(centers))
-        found[index] = sums - sizes[:, None] * centers
+        if len(features):
+            label, _ = vq(features, centers)
+            np.add.at(found[index], label, features - centers[label])
     found /= np.maximum(np.linalg.norm(found, axis=2, keepdims=True), 1e-12)
     flat = found.reshape(len(names), -1)
     flat = np.sign(flat) * np.sqrt(np.abs(flat))
@@ -153,26 +154,13 @@ def _features(database: Path, names: list[str]) -> Iterator[np.ndarray]:
 
 
 def _centers(features: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """(K, 128) by k-means (Lloyd 1982), begun at random features."""
+    """(K, 128) float32 by k-means (Lloyd 1982), begun at random features; one that no feature is nearest to stays."""
+    from scipy.cluster.vq import kmeans2
+
     count = min(_CENTERS, len(features))
     if not count:
         return np.zeros((0, 128), np.float32)
-    centers = features[np.sort(rng.choice(len(features), count, replace=False))].copy()
-    for _ in range(_ROUNDS):
-        sums, sizes = _sums(features, _nearest(features, centers), count)
-        centers[sizes > 0] = (sums[sizes > 0] / sizes[sizes > 0, None]).astype(np.float32)
-    return centers
-
-
-def _sums(features: np.ndarray, label: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """(count, 128) float64 sum of the features of each label, and (count,) how many these are."""
-    order = np.argsort(label, kind="stable")
-    sizes = np.bincount(label, minlength=count)
-    ends = np.concatenate([np.zeros((1, features.shape[1])), np.cumsum(features[order], axis=0, dtype=np.float64)])
-    bounds = np.concatenate([[0], np.cumsum(sizes)])
-    return np.diff(ends[bounds], axis=0), sizes
-
-
-def _nearest(features: np.ndarray, centers: np.ndarray) -> np.ndarray:
-    """(N,) index of the nearest center of each feature."""
-    return np.argmax(features @ centers.T - 0.5 * (centers**2).sum(axis=1), axis=1)
+    first = features[np.sort(rng.choice(len(features), count, replace=False))]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that there is such a center
+        return kmeans2(features, first, iter=_ROUNDS, minit="matrix")[0]
