@@ -23,6 +23,7 @@ import numpy as np
 
 from drgs.data.images import image_size, read_image
 from drgs.data.videos import VideoFrame, read_video
+from drgs.display.pictures import shrunk
 from drgs.display.progress import Bar, duration
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import frames_for
@@ -303,10 +304,8 @@ def _write_small(image: np.ndarray, target: Path) -> None:
     """A photograph as PNG of at most `_MEASURED_SIZE` pixels along the longer side."""
     import cv2
 
-    image = image[..., 2::-1] if image.ndim == 3 else image
-    scale = min(1.0, _MEASURED_SIZE / max(image.shape[:2]))
-    small = cv2.resize(np.ascontiguousarray(image), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    target.write_bytes(cv2.imencode(".png", small)[1].tobytes())
+    image = np.ascontiguousarray(image[..., 2::-1] if image.ndim == 3 else image)
+    target.write_bytes(cv2.imencode(".png", shrunk(image, _MEASURED_SIZE))[1].tobytes())
 
 
 def _pose_seconds(count: int, features: float, pair: float, scale: float) -> float:

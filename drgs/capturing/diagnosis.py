@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.data.images import read_image
+from drgs.display.pictures import shrunk
 from drgs.display.progress import Bar
 from drgs.fitting.exposure import estimate_exposure
 from drgs.fitting.frames import load_frames
@@ -62,10 +63,9 @@ def of_photographs(
         for name in names:
             image = decode(folder / name)
             plain = image if image.ndim == 2 else np.ascontiguousarray(image[..., :3]).mean(axis=2)
-            plain = (plain / (255.0 if image.dtype == np.uint8 else 65535.0)).astype(np.float32)
-            scale = _SHARPNESS_SIZE / max(plain.shape)
-            if scale < 1:
-                plain = cv2.resize(plain, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            plain = shrunk(
+                (plain / (255.0 if image.dtype == np.uint8 else 65535.0)).astype(np.float32), _SHARPNESS_SIZE
+            )
             sharp.append(float(cv2.Laplacian(plain, cv2.CV_32F).var()))
             gray.append(float(plain.mean()))
             bar.advance()

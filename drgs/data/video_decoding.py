@@ -22,6 +22,7 @@ import numpy as np
 from drgs.data.hdr import HDR, HdrReader, hdr_transfer
 from drgs.data.images import native_stderr
 from drgs.data.reader_process import serve
+from drgs.display.pictures import shrunk
 from drgs.guards import memory
 
 __all__ = ["frame", "gray", "walk"]
@@ -95,9 +96,7 @@ def gray(
     Raises:
         ValueError: It cannot be decoded.
     """
-    found = _reader(path, version, is_mp4, tell).frame(index, is_gray=True)
-    scale = longest / max(found.shape)
-    return found if scale >= 1 else cv2.resize(found, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return shrunk(_reader(path, version, is_mp4, tell).frame(index, is_gray=True), longest)
 
 
 def _walk(path: Path, is_mp4: bool, tell: Callable[[int], None]) -> dict[str, Any]:

@@ -30,6 +30,7 @@ __all__ = [
     "map_colors",
     "map_picture",
     "png_bytes",
+    "shrunk",
     "to_bytes",
     "write_exr",
     "write_jpg",
@@ -61,6 +62,21 @@ def to_bytes(image: np.ndarray) -> np.ndarray:
     """Float image in [0, 1] as uint8, clamped and rounded to nearest; NaN becomes 0."""
     clamped = np.clip(np.nan_to_num(np.asarray(image, np.float32)), 0.0, 1.0)
     return np.rint(clamped * 255).astype(np.uint8)
+
+
+def shrunk(picture: np.ndarray, longest: int) -> np.ndarray:
+    """A picture (H, W) or (H, W, C) with at most so many pixels along its longer side, averaged over areas; as it is if
+    it has no more.
+    """
+    import cv2
+
+    height, width = picture.shape[:2]
+    scale = longest / max(height, width)
+    if scale >= 1:
+        return picture
+    # By the scale and not by the size: sides need not be whole multiples. Of a line of pixels one is left.
+    size = None if scale * min(height, width) >= 1 else (max(1, round(width * scale)), max(1, round(height * scale)))
+    return cv2.resize(np.ascontiguousarray(picture), size, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
 
 
 def file_names(names: list[str]) -> list[str]:

@@ -63,9 +63,7 @@ def jpeg(image: np.ndarray, text: str, widest: int = _WIDEST) -> Picture:
 
     pixels = image if image.dtype == np.uint8 else pictures.to_bytes(image)
     height, width = pixels.shape[:2]
-    if width > widest:
-        size = widest, max(1, round(height * widest / width))
-        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    pixels = pictures.shrunk(pixels, round(widest * max(1.0, height / width)))
     _, data = cv2.imencode(".jpg", np.ascontiguousarray(pixels[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     return Picture(base64.b64encode(data.tobytes()).decode(), text, pixels.shape[1], pixels.shape[0])
 

@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 
 from drgs.data.videos import VideoFile, VideoFrame, read_video
+from drgs.display.pictures import shrunk
 from drgs.sfm.findings import Finding
 
 __all__ = ["ExaminedVideo", "Picked", "PickedFrame", "examine", "pick_frames"]
@@ -228,10 +229,7 @@ def _sharpest(path: Path, indices: Sequence[int]) -> tuple[float, int, np.ndarra
         sharpness = float(cv2.Laplacian(cv2.GaussianBlur(gray, (0, 0), 0.8), cv2.CV_32F).var())
         found.append((sharpness, index, gray))
     sharpness, index, gray = max(found, key=lambda one: one[0])
-    scale = _WIDTH / max(gray.shape)
-    if scale < 1:
-        gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return sharpness, index, gray
+    return sharpness, index, shrunk(gray, _WIDTH)
 
 
 def _moved(before: np.ndarray, after: np.ndarray) -> tuple[float, float, int]:
