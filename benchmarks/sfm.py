@@ -36,8 +36,8 @@ from where import DATA, add_row, ran, read_rows  # noqa: E402
 
 from drgs.data.images import list_images  # noqa: E402
 from drgs.sfm import matching  # noqa: E402
-from drgs.sfm.mapping import map_photos  # noqa: E402
-from drgs.sfm.matching import extract, match, quiet  # noqa: E402
+from drgs.sfm.mapping import MappingProgress, map_photos  # noqa: E402
+from drgs.sfm.matching import FeatureOptions, extract, match, quiet  # noqa: E402
 from drgs.sfm.pairing import choose_pairs  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "sfm.jsonl"
@@ -75,11 +75,8 @@ def own_features(scene: str, names: list[str], database: Path) -> Seconds:
             database,
             DATA / scene / "images",
             names,
-            camera_model="SIMPLE_RADIAL",
-            shared_camera=True,
-            max_image_size=SCENES[scene][1],
-            wide_baseline=True,
-            progress=said(scene),
+            FeatureOptions(is_shared=True, max_image_size=SCENES[scene][1]),
+            said(scene),
         )
         matching._extractor.end()
     return seconds
@@ -96,9 +93,8 @@ def by_drgs(scene: str, names: list[str], database: Path, matching: str, seed: i
         options.random_seed = seed
         folder = database.parent / "models"
         folder.mkdir()
-        models = map_photos(
-            database, DATA / scene / "images", folder, options, len(names), said(scene), lambda text: None
-        )
+        progress = MappingProgress(len(names), said(scene), lambda text: None)
+        models = map_photos(database, DATA / scene / "images", folder, options, progress)
     return seconds, len(pairs), largest(models)
 
 

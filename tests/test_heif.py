@@ -16,7 +16,7 @@ from test_sfm import corner  # noqa: F401 (a fixture)
 from drgs.cli import main
 from drgs.data import load
 from drgs.data.images import heif_as_jpeg, image_size, list_images, read_image
-from drgs.sfm.reconstruction import run_sfm
+from drgs.sfm.reconstruction import SfmOptions, run_sfm
 
 pillow_heif = pytest.importorskip("pillow_heif")
 
@@ -168,7 +168,7 @@ def test_structure_from_motion(corner, tmp_path, suffix, masked):  # noqa: F811
         for path in before:
             assert cv2.imwrite(str(tmp_path / f"white/{path.name}.png"), np.full((240, 320), 255, np.uint8))
     masks = tmp_path / "white" if masked else None
-    summary = run_sfm(photos, tmp_path / "out", progress=lambda stage, *_: stages.add(stage), masks=masks)
+    summary = run_sfm(photos, tmp_path / "out", SfmOptions(masks=masks), progress=lambda stage, *_: stages.add(stage))
     assert (summary.registered, summary.missing) == (7, ())
     assert "decoding" in stages
     assert {path: path.read_bytes() for path in photos.iterdir()} == before

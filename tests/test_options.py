@@ -146,12 +146,12 @@ def test_choices_are_what_there_is():
         assert options_in(command)["criterion"].spec.metavar == "{" + ",".join(CRITERION_NAMES) + "}|TEXT"
         assert _choices(command, "method") == fisher.METHODS
     assert _choices(options.Info, "variant") == ("auto", *runtime.VARIANTS)
-    parameters = inspect.signature(reconstruction.run_sfm).parameters
+    defaults = reconstruction.SfmOptions()
     assert _choices(options.Sfm, "camera_model") == reconstruction.CAMERA_MODELS
     assert _choices(options.Sfm, "matcher") == reconstruction.MATCHING
-    assert options.Sfm.camera_model == parameters["camera_model"].default
-    assert options.Sfm.matcher == parameters["matching"].default
-    assert options.Sfm.seed == parameters["seed"].default
+    assert options.Sfm.camera_model == defaults.camera_model
+    assert options.Sfm.matcher == defaults.matching
+    assert options.Sfm.seed == defaults.seed
 
 
 @pytest.mark.parametrize("name", cli.COMMANDS)

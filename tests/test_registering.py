@@ -17,7 +17,7 @@ from test_sfm import (
 from drgs.data import load
 from drgs.data.images import list_images
 from drgs.sfm.image_folder import FRAMES
-from drgs.sfm.reconstruction import run_sfm
+from drgs.sfm.reconstruction import SfmOptions, run_sfm
 from drgs.sfm.registration import register
 
 pytest.importorskip("pycolmap")
@@ -72,7 +72,7 @@ def test_a_second_batch(corner, first, scene, tmp_path):  # noqa: F811
     (more / FRAMES).write_text(json.dumps(listed))
     before, width = poses(scene), load(scene).views[0].camera.K[0, 0]
     stages = []
-    found = register(scene, list_images(more), lambda *step: stages.append(step))
+    found = register(scene, list_images(more), progress=lambda *step: stages.append(step))
     assert found.added == ("0_2.png", "else.png", "new.png")
     assert found.posed == ("0_2.png", "new.png")
     assert found.moved < 1e-9
@@ -112,7 +112,7 @@ def test_a_second_batch(corner, first, scene, tmp_path):  # noqa: F811
     with pytest.raises(ValueError, match="6.png: must be a new photograph, is in .* already"):
         register(scene, [third])
     # All at once replaces it: everything in it is drgs' own.
-    assert run_sfm(first / "photos", scene, matching="sequential").registered == 4
+    assert run_sfm(first / "photos", scene, SfmOptions(matching="sequential")).registered == 4
     assert (scene / "images").resolve() == first / "photos"
 
 

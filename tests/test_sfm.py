@@ -15,9 +15,9 @@ from test_data_points import HEIGHT, WIDTH, plane_views, render_plane, texture
 from drgs.cameras import Camera, intrinsics, look_at
 from drgs.data import load
 from drgs.sfm.mapping import _gaps, runs
-from drgs.sfm.matching import extract
+from drgs.sfm.matching import FeatureOptions, extract
 from drgs.sfm.photo_files import photo_fault
-from drgs.sfm.reconstruction import run_sfm
+from drgs.sfm.reconstruction import SfmOptions, run_sfm
 
 pytest.importorskip("pycolmap")
 cv2 = pytest.importorskip("cv2")
@@ -140,7 +140,7 @@ def test_recovers_poses_and_loads(corner, tmp_path, tmp_path_factory):
     add_bad_entries(folder, folder / "0.png")
     stages, doing = [], []
     out = tmp_path / "out"
-    summary = run_sfm(folder, out, progress=lambda *step: stages.append(step), doing=doing.append)
+    summary = run_sfm(folder, out, progress=lambda *step: stages.append(step), status=doing.append)
     assert (summary.registered, summary.total, summary.missing) == (7, 7, ())
     assert summary.explanation == ()
     assert summary.points > 100
@@ -169,7 +169,7 @@ def test_recovers_poses_and_loads(corner, tmp_path, tmp_path_factory):
     assert len(dataset.points) == summary.points
     # Again onto the same place: replaced, whole.
     (out / "notes.txt").write_text("mine")
-    again = run_sfm(folder, out, matching="sequential")
+    again = run_sfm(folder, out, SfmOptions(matching="sequential"))
     assert again.registered == 7
     assert len(load(out).views) == 7
     assert sorted(path.name for path in out.iterdir()) == [
@@ -190,7 +190,7 @@ def test_what_was_turned_is_found_by_its_masks(turntable, tmp_path):
         run_sfm(folder / "images", tmp_path / "without")
     for kind, masks in (("images", folder / "masks"), ("alpha", "alpha")):
         out = tmp_path / kind
-        assert run_sfm(folder / kind, out, masks=masks).registered == 5
+        assert run_sfm(folder / kind, out, SfmOptions(masks=masks)).registered == 5
         views = load(out).views
         found = np.stack([view.camera.center for view in views])
         assert aligned_error(found, np.stack([cameras[int(view.name)].center for view in views])) < 0.05
@@ -198,7 +198,7 @@ def test_what_was_turned_is_found_by_its_masks(turntable, tmp_path):
         assert 0.1 < views[0].mask().mean() < 0.9
         assert (out / "masks").is_symlink() == (kind == "images")
     # Again without: masks of an earlier result would say what no longer holds.
-    run_sfm(folder / "alpha", out, masks=folder / "masks")
+    run_sfm(folder / "alpha", out, SfmOptions(masks=folder / "masks"))
     assert (out / "masks").resolve() == folder / "masks"
     with pytest.raises(ValueError, match="could be connected"):
         run_sfm(folder / "alpha", out)
@@ -300,7 +300,7 @@ def test_masks_of_others_stay(masked, tmp_path):
     mine.parent.mkdir(parents=True)
     mine.write_text("hours of work")
     with pytest.raises(ValueError, match="masks.*: must not be replaced"):
-        run_sfm(photos, tmp_path / "out", masks=masks)
+        run_sfm(photos, tmp_path / "out", SfmOptions(masks=masks))
     assert mine.read_text() == "hours of work"
 
 
@@ -393,15 +393,14 @@ def test_a_photo_that_cannot_be_used_is_named(tmp_path, corner):
 def test_a_crash_of_the_detector_is_one_line(tmp_path, corner, capfd):
     """COLMAP's own, over a picture that `run_sfm` does not let through; the next ones have features."""
     assert cv2.imwrite(str(tmp_path / "tiny.png"), np.zeros((15, 15, 3), np.uint8))
-    options = {"camera_model": "SIMPLE_RADIAL", "shared_camera": False, "wide_baseline": True}
     with pytest.raises(ValueError, match=r"^") as error:
-        extract(tmp_path / "a.db", tmp_path, ["tiny.png"], **options)
+        extract(tmp_path / "a.db", tmp_path, ["tiny.png"], FeatureOptions())
     assert str(error.value) == (
         f"{tmp_path / 'tiny.png'}: must be a photograph that COLMAP finds features in, the process that reads it ended "
         "with SIGSEGV; leave it out"
     )
     assert capfd.readouterr().err == ""
-    extract(tmp_path / "b.db", corner[0], ["0.png"], max_image_size=160, **options)
+    extract(tmp_path / "b.db", corner[0], ["0.png"], FeatureOptions(max_image_size=160))
 
 
 def test_bad_input(tmp_path, rng):
@@ -414,9 +413,9 @@ def test_bad_input(tmp_path, rng):
         run_sfm(photos, tmp_path / "out")
     plane_views(photos, rng, count=2)
     with pytest.raises(ValueError, match="camera_model must be one of .*, got 'FOV'"):
-        run_sfm(photos, tmp_path / "out", camera_model="FOV")
+        run_sfm(photos, tmp_path / "out", SfmOptions(camera_model="FOV"))
     with pytest.raises(ValueError, match="matching must be auto, exhaustive, sequential or retrieval"):
-        run_sfm(photos, tmp_path / "out", matching="all")
+        run_sfm(photos, tmp_path / "out", SfmOptions(matching="all"))
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match="must be a folder that can be written, got: File exists"):
         run_sfm(photos, tmp_path / "file")

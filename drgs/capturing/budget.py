@@ -30,7 +30,7 @@ from drgs.fitting.frames import frames_for
 from drgs.fitting.start import start
 from drgs.fitting.threads import fewer_torch_threads
 from drgs.io.atomic import temporary_folder
-from drgs.sfm.matching import extract, match, quiet, start_extraction
+from drgs.sfm.matching import FeatureOptions, extract, match, quiet, start_extraction
 from drgs.sfm.pairing import MAX_EXHAUSTIVE
 
 if TYPE_CHECKING:
@@ -269,7 +269,7 @@ def _timed_pair(images: Sequence[np.ndarray]) -> tuple[float, float]:
         start_extraction()
         began = time.perf_counter()
         with quiet():
-            extract(database, folder, names, camera_model="SIMPLE_RADIAL", shared_camera=False, wide_baseline=True)
+            extract(database, folder, names, FeatureOptions())
             features = (time.perf_counter() - began) / len(names)
             began = time.perf_counter()
             match(database, [(names[0], names[1])])

@@ -14,7 +14,7 @@ from drgs.data.images import list_images
 from drgs.display.progress import Bar
 from drgs.fitting.records import fit_record
 from drgs.io.outputs import lock_folder
-from drgs.sfm.reconstruction import run_sfm
+from drgs.sfm.reconstruction import SfmOptions, run_sfm
 from drgs.sfm.registration import register
 
 if TYPE_CHECKING:
@@ -45,11 +45,9 @@ def find_poses(capture: Capture) -> Outcome:
         summary = run_sfm(
             capture.photos,
             capture.scene,
+            SfmOptions(seed=capture.options.seed, masks=capture.options.masks, **size),
             bar.stage,
-            seed=capture.options.seed,
-            masks=capture.options.masks,
-            doing=_shown_by(bar),
-            **size,
+            _shown_by(bar),
         )
     capture.poses_changed()
     line = (
@@ -78,7 +76,7 @@ def add_poses(capture: Capture) -> Outcome:
         before = capture.record.batches[0].plan.get("poses", {})
         size = {key: before[key] for key in ("max_image_size",) if key in before}
         with _explained(capture), Bar("poses") as bar:
-            joined = register(scene, files, bar.stage, seed=capture.options.seed, doing=_shown_by(bar), **size)
+            joined = register(scene, files, SfmOptions(seed=capture.options.seed, **size), bar.stage, _shown_by(bar))
         summary = joined.summary
         capture.poses_changed()
         posed = _posed(capture, files)

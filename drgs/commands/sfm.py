@@ -6,7 +6,7 @@ import shlex
 from typing import TYPE_CHECKING
 
 from drgs.display.progress import Bar
-from drgs.sfm.reconstruction import run_sfm
+from drgs.sfm.reconstruction import SfmOptions, run_sfm
 
 if TYPE_CHECKING:
     from drgs.commands.options import Sfm
@@ -20,13 +20,9 @@ def run(args: Sfm) -> None:
         summary = run_sfm(
             args.paths,
             args.output,
+            SfmOptions(args.camera_model, matching=args.matcher, seed=args.seed, masks=args.masks, frames=args.frames),
             bar.stage,
-            camera_model=args.camera_model,
-            matching=args.matcher,
-            seed=args.seed,
-            masks=args.masks,
-            doing=lambda text: bar.update(bar.done, text=text),
-            frames=args.frames,
+            lambda text: bar.update(bar.done, text=text),
         )
     if args.quiet:
         return

@@ -22,8 +22,7 @@ def extract_features(path: Path, names: list[str], options: dict[str, Any], tell
     Args:
         path: The images, as messages name them; not read.
         names: Names of the images in their folder.
-        options: `database`, `folder`, `camera_model`, `shared_camera`, `max_image_size`, `wide_baseline`, `masks`,
-            `camera` and `threads`, as `drgs.sfm.matching.extract` takes them.
+        options: `database`, `folder` and `threads` of `drgs.sfm.matching.extract`, and its `FeatureOptions`.
     Returns:
         Number of the camera that the images share; None where each has one of its own.
     """
@@ -32,8 +31,8 @@ def extract_features(path: Path, names: list[str], options: dict[str, Any], tell
     extraction.num_threads = options["threads"]
     if options["max_image_size"]:
         extraction.max_image_size = options["max_image_size"]
-    extraction.sift.estimate_affine_shape = options["wide_baseline"]
-    extraction.sift.domain_size_pooling = options["wide_baseline"]
+    extraction.sift.estimate_affine_shape = True
+    extraction.sift.domain_size_pooling = True
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = options["camera_model"]
     if options["masks"] is not None:
@@ -41,7 +40,7 @@ def extract_features(path: Path, names: list[str], options: dict[str, Any], tell
         extraction.sift.peak_threshold = _MASKED_CONTRAST
     if options["camera"] is not None:
         reader.existing_camera_id = options["camera"]
-    is_shared = options["shared_camera"]
+    is_shared = options["is_shared"]
     pycolmap.extract_features(
         options["database"],
         options["folder"],

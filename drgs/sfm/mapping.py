@@ -1,4 +1,4 @@
-"""Incremental mapping by COLMAP: what it is doing, told while it does it, and what became of all photographs.
+"""Incremental mapping by COLMAP: its progress while it runs, and what became of all photographs.
 
 pycolmap calls back once a photograph has a pose, and between two of these calls minutes of bundle adjustment may pass.
 What goes on then is in COLMAP's log, which is followed here in a file.
@@ -21,7 +21,7 @@ from drgs.io.atomic import check_room
 from drgs.runtime import thread_count
 from drgs.sfm.matching import Progress
 
-__all__ = ["PhotoGroups", "map_photos", "runs", "write_model"]
+__all__ = ["MappingProgress", "PhotoGroups", "map_photos", "posed_names", "runs", "write_model"]
 
 _EVERY = 0.25  # seconds between two looks at the log
 _FEW_FEATURES = 200  # with fewer of its own a photograph is blurred, dark or blank, or its mask is small
@@ -29,7 +29,7 @@ _ADVISED = 3  # gaps that are named
 _STRETCHES = 12  # of names that follow each other
 # Bytes in the files of a model: of a feature its place and point (24), of that its share in a track (8) and in a point
 # of 51 bytes that two features show at least.
-_A_FEATURE = 60
+_FEATURE_BYTES = 60
 
 # What COLMAP's log says -> what that is. Lines that are not known, of another version, change nothing.
 _DOING = {
@@ -44,54 +44,61 @@ _DOING = {
 _LINE = re.compile(rb"^[IWEF]\d{8} \S+ +\d+ [^\]]+\] (.*)$")
 
 
-class _Told:
-    """What `map_photos` tells of: poses found in the model that is being made, and what is being done."""
+class MappingProgress:
+    """Reports how many photographs have a pose in the model that COLMAP is making, and what it is doing.
 
-    def __init__(self, total: int, progress: Progress, doing: Callable[[str], None], registered: int = 0) -> None:
+    Args:
+        total: Number of all photographs.
+        progress: Called with ("mapping", poses in the current model, total), also from another thread.
+        status: Called with what is being done, in words, also from another thread.
+        registered: Number of photographs in the model that mapping begins with.
+    """
+
+    def __init__(self, total: int, progress: Progress, status: Callable[[str], None], registered: int = 0) -> None:
         self.total = total
         self._progress = progress
-        self._doing = doing
+        self._status = status
         self.registered = registered
         self._model = 0
         self._what = "reading the matches"
         self._since = time.monotonic()
         self._lock = threading.Lock()  # COLMAP's thread calls back, another one follows the log
 
-    def begun(self) -> None:
+    def model_begun(self) -> None:
         """A model has its first two photographs, all adjusted."""
         with self._lock:
             self.registered = 2
             self._model = self._model + 1
-            self._tell()
+            self._report()
 
-    def one_more(self) -> None:
+    def image_registered(self) -> None:
         """One photograph more has a pose, all adjusted."""
         with self._lock:
             self.registered += 1
-            self._tell()
+            self._report()
 
-    def line(self, text: str) -> None:
+    def log_line(self, text: str) -> None:
         """A line of COLMAP's log."""
         what = next((what for begins, what in _DOING.items() if text.startswith(begins)), None)
         if what is not None:
             with self._lock:
                 self._what = what
                 self._since = time.monotonic()
-                self._tell()
+                self._report()
 
-    def still(self) -> None:
-        """Time has passed."""
+    def refresh(self) -> None:
+        """Report again how long the same has been going on."""
         with self._lock:
-            self._tell()
+            self._report()
 
-    def _tell(self) -> None:
+    def _report(self) -> None:
         parts = [f"attempt {self._model}"] if self._model > 1 else []  # that was kept, or was too small
         is_last = "bundle adjustment" in self._what and self.registered >= self.total
         what = f"final {self._what}" if is_last else self._what
         seconds = time.monotonic() - self._since
         parts.append(f"{what} for {seconds:.0f} s" if seconds >= 2 else what)
         self._progress("mapping", min(self.registered, self.total), self.total)
-        self._doing(", ".join(parts))
+        self._status(", ".join(parts))
 
 
 def map_photos(
@@ -99,11 +106,8 @@ def map_photos(
     image_dir: Path,
     folder: Path,
     options: Any,
-    total: int,
-    progress: Progress,
-    doing: Callable[[str], None],
+    progress: MappingProgress,
     base: Path | None = None,
-    posed: int = 0,
 ) -> dict[int, Any]:
     """COLMAP's incremental mapping.
 
@@ -112,42 +116,43 @@ def map_photos(
         image_dir: Folder that the names in the database are relative to.
         folder: Folder that COLMAP writes models into; it must exist. Its log lies there meanwhile.
         options: pycolmap.IncrementalPipelineOptions.
-        total: photographs.
-        progress: Called with ("mapping", poses found in the current model, total), also from another thread.
-        doing: Called with what is being done, in words, also from another thread.
+        progress: Hears of every photograph that gets a pose, and of COLMAP's log.
         base: Folder of a model to go on with; default none.
-        posed: Number of photographs in it.
     Returns:
         pycolmap's models by number; empty if no two photographs could be connected.
     """
     from drgs.data.colmap_bindings import opened_database, pycolmap
 
     options.num_threads = options.mapper.num_threads = thread_count()
-    told = _Told(total, progress, doing, posed)
-    told.still()
+    progress.refresh()
     with opened_database(database) as handle:
-        check_room(folder, 2 * handle.num_keypoints() * _A_FEATURE)  # COLMAP writes a model, and then we do
-    with _followed(folder, told):
+        check_room(folder, 2 * handle.num_keypoints() * _FEATURE_BYTES)  # COLMAP writes a model, and then we do
+    with _followed(folder, progress):
         return pycolmap.incremental_mapping(
             database,
             image_dir,
             folder,
             options=options,
             input_path=base or "",
-            initial_image_pair_callback=told.begun,
-            next_image_callback=told.one_more,
+            initial_image_pair_callback=progress.model_begun,
+            next_image_callback=progress.image_registered,
         )
+
+
+def posed_names(model: Any) -> set[str]:
+    """Names of the photographs that have a pose in pycolmap's model."""
+    return {model.images[number].name for number in model.reg_image_ids()}
 
 
 def write_model(model: Any, folder: Path) -> None:
     """Write pycolmap's model as the files of a data set; COLMAP does not say where there was no room for all of it."""
-    check_room(folder, sum(image.num_points2D() for image in model.images.values()) * _A_FEATURE)
+    check_room(folder, sum(image.num_points2D() for image in model.images.values()) * _FEATURE_BYTES)
     model.write_binary(folder)
 
 
 @contextlib.contextmanager
-def _followed(folder: Path, told: _Told) -> Iterator[None]:
-    """COLMAP's log goes to a file in a folder, and `told` hears of every line soon after it is written."""
+def _followed(folder: Path, progress: MappingProgress) -> Iterator[None]:
+    """COLMAP's log goes to a file in a folder, and `progress` hears of every line soon after it is written."""
     from drgs.data.colmap_bindings import pycolmap
 
     log = pycolmap.logging
@@ -171,11 +176,11 @@ def _followed(folder: Path, told: _Told) -> Iterator[None]:
                 for file in folder.glob(f"log.{number}.*"):
                     for found in map(_LINE.match, file.read_bytes().splitlines()):
                         if found:
-                            told.line(found[1].decode("utf-8", "replace"))
+                            progress.log_line(found[1].decode("utf-8", "replace"))
                     file.unlink()
             if is_last:
                 return
-            told.still()
+            progress.refresh()
 
     thread = threading.Thread(target=follow, name="drgs mapping", daemon=True)
     thread.start()

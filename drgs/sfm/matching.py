@@ -5,6 +5,7 @@ enough to report progress.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,13 +18,22 @@ from drgs.io.atomic import check_room, temporary_folder
 from drgs.runtime import thread_count
 from drgs.sfm.photo_files import own_file
 
-__all__ = ["extract", "match", "nearby_pairs", "quiet", "sequential_pairs", "start_extraction", "state_focal_lengths"]
+__all__ = [
+    "FeatureOptions",
+    "extract",
+    "match",
+    "nearby_pairs",
+    "quiet",
+    "sequential_pairs",
+    "start_extraction",
+    "state_focal_lengths",
+]
 
 Progress = Callable[[str, int, int], None]
 _PAIRS_A_STEP = 16  # a thread: all of them are busy, and progress is seen
 # Bytes on the disk: a feature of SIFT has 128 of its descriptor and 24 of its place, a match 8 when it is found and 8
 # when it is verified. SQLite writes everything twice, first into a log beside the database.
-_A_FEATURE, _A_MATCH = 2 * 152, 2 * 16
+_FEATURE_BYTES, _MATCH_BYTES = 2 * 152, 2 * 16
 _MOST_FEATURES = 8192  # of a photograph, as COLMAP has it
 
 _extractor = Child("drgs.sfm.extraction", "a photograph that COLMAP finds features in", "leave it out")
@@ -43,58 +53,57 @@ def quiet() -> Iterator[None]:
         pycolmap.logging.minloglevel = level
 
 
+@dataclasses.dataclass(frozen=True)
+class FeatureOptions:
+    """How features are detected, and which camera their photographs get.
+
+    Attributes:
+        camera_model: COLMAP's name.
+        is_shared: One camera for all photographs of a call, or one each.
+        max_image_size: Pixels on the longer side above which photographs are shrunk; 0 for never.
+        masks: Folder with `NAME.EXT.png` of every photograph, of its size: no features where it is 0.
+        camera: Number of a camera in the database that the photographs share; None: a new one.
+    """
+
+    camera_model: str = "SIMPLE_RADIAL"
+    is_shared: bool = False
+    max_image_size: int = 0
+    masks: Path | None = None
+    camera: int | None = None
+
+
 def extract(
     database: Path,
     folder: Path,
     names: list[str],
-    *,
-    camera_model: str,
-    shared_camera: bool,
-    max_image_size: int = 0,
-    wide_baseline: bool = False,
-    masks: Path | None = None,
-    camera: int | None = None,
+    options: FeatureOptions,
     progress: Progress | None = None,
     originals: Path | None = None,
 ) -> None:
-    """SIFT features of images into a COLMAP database.
+    """SIFT features of photographs into a COLMAP database, with affine shapes and pooled scales, which connect views
+    that are further apart, at 2.5 times the cost.
 
     Args:
         database: file, made if absent.
-        folder, names: Folder of the images, and their names in it.
-        camera_model: COLMAP's name.
-        shared_camera: One camera for all images, or one each.
-        max_image_size: Pixels on the longer side above which images are shrunk; 0 for never.
-        wide_baseline: Affine shapes and pooled scales: connects views further apart, at 2.5 times
-            the cost.
-        masks: Folder with `NAME.EXT.png` of every image, of its size: no features where it is 0.
-        camera: Number of a camera in the database that the images share; default a new one.
+        folder, names: Folder of the photographs, and their names in it.
+        options: Their camera, size and masks.
         progress: Called with ("features", done, total).
         originals: Folder of the photographs that messages name, where those in `folder` are copies.
     Raises:
-        ValueError: COLMAP crashed over an image.
+        ValueError: COLMAP crashed over a photograph.
     """
     threads = thread_count()
-    shared_camera = shared_camera or camera is not None
+    settings = dataclasses.asdict(options) | {"database": str(database), "folder": str(folder), "threads": threads}
+    settings["masks"] = None if options.masks is None else str(options.masks)
+    settings["is_shared"] = options.is_shared or options.camera is not None
     for start in range(0, len(names), threads):  # one a thread: all of them are busy, and progress is seen
         if progress:
             progress("features", start, len(names))
-        check_room(database.parent, min(threads, len(names) - start) * _MOST_FEATURES * _A_FEATURE)
+        check_room(database.parent, min(threads, len(names) - start) * _MOST_FEATURES * _FEATURE_BYTES)
         some = names[start : start + threads]
-        options = {
-            "database": str(database),
-            "folder": str(folder),
-            "camera_model": camera_model,
-            "shared_camera": shared_camera,
-            "max_image_size": max_image_size,
-            "wide_baseline": wide_baseline,
-            "masks": None if masks is None else str(masks),
-            "camera": camera,
-            "threads": threads,
-        }
         shown = " or ".join(str(own_file((originals or folder) / name)) for name in some)
         # Every call would otherwise open a camera of its own.
-        camera = _extractor.ask("extract_features", Path(shown), some, options)
+        settings["camera"] = _extractor.ask("extract_features", Path(shown), some, settings)
     if progress:
         progress("features", len(names), len(names))
 
@@ -151,7 +160,7 @@ def match(
     verification.ransac.random_seed = seed
     with opened_database(database) as handle:
         most = max((handle.num_keypoints_for_image(image.image_id) for image in handle.read_all_images()), default=0)
-    needed = min(len(pairs), _PAIRS_A_STEP * threads) * most * _A_MATCH
+    needed = min(len(pairs), _PAIRS_A_STEP * threads) * most * _MATCH_BYTES
     with temporary_folder("pairs") as folder, _numbered(database) as numbers:
         pairing = pycolmap.ImportedPairingOptions()
         pairing.match_list_path = folder / "pairs.txt"

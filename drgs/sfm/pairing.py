@@ -38,11 +38,13 @@ class Pairing:
 
     Attributes:
         pairs: Their names.
+        total: Number of all pairs.
         left_out: A sentence about those that are not; empty if all are.
     """
 
     pairs: list[tuple[str, str]]
-    left_out: str
+    total: int
+    left_out: str = ""
 
 
 def choose_pairs(database: Path, names: list[str], matching: str, is_masked: bool, seed: int) -> Pairing:
@@ -60,7 +62,7 @@ def choose_pairs(database: Path, names: list[str], matching: str, is_masked: boo
         most = MAX_EXHAUSTIVE_MASKED if is_masked else MAX_EXHAUSTIVE
         matching = "exhaustive" if len(names) <= most else "retrieval"
     if matching == "exhaustive":
-        return Pairing(list(itertools.combinations(names, 2)), "")
+        return Pairing(list(itertools.combinations(names, 2)), total)
     if matching == "sequential":
         pairs = sequential_pairs(names, _WINDOW)
         what = f"the {_WINDOW} next by name, and some further on"
@@ -71,8 +73,9 @@ def choose_pairs(database: Path, names: list[str], matching: str, is_masked: boo
         pairs = sorted({*by_name, *((names[i], names[j]) for i, j in near)}, key=lambda p: (place[p[0]], place[p[1]]))
         what = f"the {_NEAREST} nearest by appearance, and the {_NARROW_WINDOW} next by name"
     if len(pairs) == total:
-        return Pairing(pairs, "")
-    return Pairing(pairs, f"{len(pairs):,} of {total:,} pairs are matched: {what}; --matcher exhaustive matches all")
+        return Pairing(pairs, total)
+    left_out = f"{len(pairs):,} of {total:,} pairs are matched: {what}; --matcher exhaustive matches all"
+    return Pairing(pairs, total, left_out)
 
 
 def choose_new_pairs(database: Path, old: list[str], new: list[str], seed: int) -> Pairing:
@@ -86,13 +89,14 @@ def choose_new_pairs(database: Path, old: list[str], new: list[str], seed: int) 
     names = [*old, *new]
     total = len(new) * (len(new) - 1) // 2 + len(new) * len(old)
     if len(names) <= MAX_EXHAUSTIVE:
-        return Pairing([(names[i], names[j]) for j in range(len(old), len(names)) for i in range(j)], "")
+        return Pairing([(names[i], names[j]) for j in range(len(old), len(names)) for i in range(j)], total)
     near = nearest_pairs(global_descriptors(database, names, seed), _NEAREST_NEW, firsts=len(old))
     pairs = sorted({*((names[i], names[j]) for i, j in near), *sequential_pairs(new, _NARROW_WINDOW)})
     if len(pairs) == total:
-        return Pairing(pairs, "")
+        return Pairing(pairs, total)
     what = f"the {_NEAREST_NEW} nearest by appearance, and the {_NARROW_WINDOW} next by name"
-    return Pairing(pairs, f"{len(pairs):,} of {total:,} pairs with new photographs are matched: {what}")
+    left_out = f"{len(pairs):,} of {total:,} pairs with new photographs are matched: {what}"
+    return Pairing(pairs, total, left_out)
 
 
 def nearest_pairs(descriptors: np.ndarray, count: int, firsts: int | None = None) -> list[tuple[int, int]]:

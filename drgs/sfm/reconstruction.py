@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,7 +19,8 @@ from drgs.io.atomic import temporary_folder
 from drgs.io.outputs import lock_folder
 from drgs.sfm.feature_masks import ALPHA_MASKS, feature_mask, masked_photo, masks_of
 from drgs.sfm.image_folder import fill, named_files, recorded_frames, usable_files
-from drgs.sfm.mapping import PhotoGroups, map_photos, write_model
+from drgs.sfm.mapping import MappingProgress, PhotoGroups, map_photos, posed_names, write_model
+from drgs.sfm.matching import FeatureOptions
 from drgs.sfm.pairing import choose_pairs
 from drgs.sfm.photo_files import check_names, readable_photos, usable_photos
 
@@ -27,8 +28,9 @@ if TYPE_CHECKING:
     from drgs.io.outputs import LockedFolder
     from drgs.sfm.findings import Finding
     from drgs.sfm.matching import Progress
+    from drgs.sfm.pairing import Pairing
 
-__all__ = ["CAMERA_MODELS", "MATCHING", "SfmSummary", "run_sfm"]
+__all__ = ["CAMERA_MODELS", "MATCHING", "SfmOptions", "SfmSummary", "StageTimes", "run_sfm"]
 
 CAMERA_MODELS = (
     "SIMPLE_PINHOLE",
@@ -46,13 +48,13 @@ _MASKED_INLIERS = 15
 
 @dataclass(frozen=True)
 class SfmSummary:
-    """What structure from motion found.
+    """What became of photographs in structure from motion.
 
     Attributes:
         registered, total: Photos with a pose, and all.
         points: Number of 3D points.
         reprojection_error: mean, in pixels.
-        models: Separate models found; the largest was kept.
+        models: Number of separate models; the largest was kept.
         explanation: Sentences about the photos without a pose: which models they are in, and what would help.
         seconds: Time by stage: features, matching, mapping; videos, too, where there are some.
         missing: Names of the photos without a pose.
@@ -76,20 +78,95 @@ class SfmSummary:
     frames: int = 0
     findings: tuple[Finding, ...] = ()
 
+    @classmethod
+    def of(cls, model: Any, names: Sequence[str], pairing: Pairing, times: StageTimes) -> SfmSummary:
+        """The summary of the model that was kept, as far as it says itself; its points get their errors.
+
+        Args:
+            model: pycolmap's.
+            names: Names of all photos.
+            pairing: Pairs that were compared.
+            times: Time of each stage.
+        """
+        model.update_point_3d_errors()
+        kept = posed_names(model)
+        return cls(
+            registered=len(kept),
+            total=len(names),
+            points=model.num_points3D(),
+            reprojection_error=float(model.compute_mean_reprojection_error()),
+            models=1,
+            seconds=times.seconds,
+            missing=tuple(name for name in names if name not in kept),
+            matched=len(pairing.pairs),
+            pairs=pairing.total,
+            left_out=pairing.left_out,
+        )
+
+
+class StageTimes:
+    """Seconds that each stage of a piece of work has taken, from when this was made.
+
+    Attributes:
+        seconds: Name of a stage -> seconds, of those that have ended.
+    """
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._began = time.perf_counter()
+
+    def end(self, stage: str) -> None:
+        """A stage has ended, and the next one begins."""
+        now = time.perf_counter()
+        self.seconds[stage] = now - self._began
+        self._began = now
+
+
+@dataclass(frozen=True)
+class SfmOptions:
+    """How structure from motion is run.
+
+    Attributes:
+        camera_model: COLMAP's name of the lens, of `CAMERA_MODELS`. Photos of one size and focal length (EXIF) share
+            one camera, and so do frames of one video.
+        max_image_size: Pixels on the longer side that features are detected at; 0 for the photos' own.
+        matching: `exhaustive`, `sequential` (photos in the order of a walk or video), `retrieval` (those and the
+            nearest by appearance) or `auto` (exhaustive up to 60 photos, 150 with masks, then retrieval).
+        seed: Seed of all random sampling.
+        masks: Where features are detected, if an object was turned or moved between photos: a folder with a mask of
+            every photo, `NAME.EXT.png` or `NAME.png`, white where the object is, of the photo's shape; or `"alpha"`,
+            the photos' own alpha channel. Weights below a half count as black.
+        frames: Largest number of frames of all videos together (`pick_frames`).
+    Raises:
+        ValueError: An unknown camera model or way of matching.
+    """
+
+    camera_model: str = "SIMPLE_RADIAL"
+    max_image_size: int = 1600
+    matching: str = "auto"
+    seed: int = 0
+    masks: str | os.PathLike | None = None
+    frames: int = 150
+
+    def __post_init__(self) -> None:
+        if self.camera_model not in CAMERA_MODELS:
+            raise ValueError(
+                f"run_sfm: camera_model must be one of {', '.join(CAMERA_MODELS)}, got {self.camera_model!r}"
+            )
+        if self.matching not in MATCHING:
+            raise ValueError(
+                f"run_sfm: matching must be auto, exhaustive, sequential or retrieval, got {self.matching!r}"
+            )
+
 
 def run_sfm(
     photos: str | os.PathLike | Sequence[str | os.PathLike],
     out_dir: str | os.PathLike,
-    progress: Callable[[str, int, int], None] | None = None,
-    camera_model: str = "SIMPLE_RADIAL",
-    max_image_size: int = 1600,
-    matching: str = "auto",
-    seed: int = 0,
-    masks: str | os.PathLike | None = None,
-    doing: Callable[[str], None] | None = None,
-    frames: int = 150,
+    options: SfmOptions | None = None,
+    progress: Progress | None = None,
+    status: Callable[[str], None] | None = None,
 ) -> SfmSummary:
-    """Find camera poses and points from photos or videos; afterwards `drgs.data.load(out_dir)` works.
+    """Compute camera poses and points from photos or videos; afterwards `drgs.data.load(out_dir)` works.
 
     Writes `out_dir/{database.db, sparse/0, images}`, and `masks` if there are any, where a fit finds them. Of one
     folder of photos, `images` is a link to it where links work, a copy elsewhere, and so is `masks`; of several, or of
@@ -99,80 +176,64 @@ def run_sfm(
     Args:
         photos: Folder of photos; or a photo, a video, a folder with some of both, or several of all these.
         out_dir: Folder of the data set; made if absent.
+        options: Lens, matching, masks and so on; None: the defaults.
         progress: Called with (stage, done, total); stages are frames of each video, masks, features, matching and
             mapping. Of mapping, which may begin anew, `done` is the number of photos with a pose so far; it is called
             from another thread, too.
-        camera_model: COLMAP's name of the lens. Photos of one size and focal length (EXIF) share one camera, and so do
-            frames of one video.
-        max_image_size: Pixels on the longer side that features are found at; 0 for the photos' own.
-        matching: `exhaustive`, `sequential` (photos in the order of a walk or video), `retrieval` (those and the
-            nearest by appearance) or `auto` (exhaustive up to 60 photos, 150 with masks, then retrieval).
-        seed: Seed of all random sampling.
-        masks: What features are looked for in, where an object was turned or moved between photos: a folder with a mask
-            of every photo, `NAME.EXT.png` or `NAME.png`, white where the object is, of the photo's shape; or
-            `"alpha"`, the photos' own alpha channel. Weights below a half count as black.
-        doing: Called with what is being done within mapping, in words; from another thread, too.
-        frames: Largest number of frames of all videos together (`pick_frames`).
+        status: Called with what mapping is doing, in words; from another thread, too.
     Raises:
         FileNotFoundError: No such folder or file, or no mask of a photo.
-        ValueError: Fewer than 2 photos that can be used (the log names those that are left out), an unknown option, a
-            video that cannot be decoded, photos that do not connect, or an `out_dir` that holds a COLMAP project or
-            photos that were not made here; a mask of another shape, one that keeps nothing, or a photo without alpha.
+        ValueError: Fewer than 2 photos that can be used (the log names those that are left out), a video that cannot be
+            decoded, photos that do not connect, or an `out_dir` that holds a COLMAP project or photos that were not
+            made here; a mask of another shape, one that keeps nothing, or a photo without alpha.
     """
-    out_dir = Path(out_dir)
+    options = options or SfmOptions()
+    report, status = progress or (lambda stage, done, total: None), status or (lambda text: None)
     paths = [Path(photos)] if isinstance(photos, str | os.PathLike) else [Path(path) for path in photos]
-    if camera_model not in CAMERA_MODELS:
-        raise ValueError(f"run_sfm: camera_model must be one of {', '.join(CAMERA_MODELS)}, got {camera_model!r}")
-    if matching not in MATCHING:
-        raise ValueError(f"run_sfm: matching must be auto, exhaustive, sequential or retrieval, got {matching!r}")
-    report = progress or (lambda stage, done, total: None)
     image_dir = _one_folder(paths)
     photographs, videos = ([], []) if image_dir else named_files(paths)
     if not image_dir and not videos and len(photographs) < 2:
         raise ValueError(f"{paths[0]}: must be at least 2 photos, got {len(photographs)}; add overlapping photos")
-    linked = {} if image_dir is None else {"images": image_dir}
-    linked |= {} if masks in (None, ALPHA_MASKS) else {"masks": Path(masks)}
-    made = [name for name, is_made in (("images", not image_dir), ("masks", masks == ALPHA_MASKS)) if is_made]
-    marks = [time.perf_counter()]
-    with lock_folder(out_dir, "sfm", inputs=[*paths, *linked.values()]) as output:
-        _check_output(output, linked, made)
+    folders = _Folders.of(image_dir, options.masks)
+    with lock_folder(out_dir, "sfm", inputs=[*paths, *folders.linked.values()]) as output:
+        _check_output(output, folders)
         with temporary_folder("sfm", output.path) as partial:
-            (partial / "models").mkdir()
-            gathered = None
-            if image_dir is None:
-                photographs, videos = usable_files(photographs, videos, paths[0], 2, max_image_size)
-                gathered = fill(partial / "images", photographs, videos, "sfm", frames, report)
-                marks.append(time.perf_counter())
-            folder = image_dir or partial / "images"
-            try:
-                names, mask_files = _checked(folder, masks, max_image_size)
-                if mask_files is not None:
-                    _write_masked(folder, names, mask_files, partial, report)
-                summary = _reconstruct(
-                    folder,
-                    names,
-                    partial,
-                    report,
-                    doing or (lambda text: None),
-                    camera_model,
-                    max_image_size,
-                    matching,
-                    seed,
-                    mask_files is not None,
-                )
-            except ValueError as error:
-                if gathered is None:
-                    raise
-                text = str(error).replace(str(folder), str(paths[0]))
-                found = (finding.line() for finding in gathered.findings)
-                raise ValueError("; ".join([text, *found])) from None
-            _install(partial, output, linked, made)
-    if gathered is None:
-        return summary
-    seconds = {"videos": marks[1] - marks[0]} if videos else {}
-    return dataclasses.replace(
-        summary, seconds=seconds | summary.seconds, frames=gathered.frames, findings=gathered.findings
-    )
+            if image_dir is not None:
+                summary = _reconstruct(image_dir, partial, options, report, status)
+            else:
+                times = StageTimes()
+                photographs, videos = usable_files(photographs, videos, paths[0], 2, options.max_image_size)
+                filled = fill(partial / "images", photographs, videos, "sfm", options.frames, report)
+                times.end("videos")
+                try:
+                    summary = _reconstruct(filled.folder, partial, options, report, status)
+                except ValueError as error:
+                    text = str(error).replace(str(filled.folder), str(paths[0]))
+                    raise ValueError("; ".join([text, *(finding.line() for finding in filled.findings)])) from None
+                seconds = (times.seconds if videos else {}) | summary.seconds
+                summary = dataclasses.replace(summary, seconds=seconds, frames=filled.frames, findings=filled.findings)
+            _install(partial, output, folders)
+    return summary
+
+
+@dataclass(frozen=True)
+class _Folders:
+    """The folders of photographs and masks of a data set that structure from motion makes.
+
+    Attributes:
+        linked: Name in the data set -> the user's folder, to which it becomes a link.
+        made: Names of those that are made for it.
+    """
+
+    linked: dict[str, Path]
+    made: list[str]
+
+    @classmethod
+    def of(cls, image_dir: Path | None, masks: str | os.PathLike | None) -> _Folders:
+        linked = {} if image_dir is None else {"images": image_dir}
+        linked |= {} if masks in (None, ALPHA_MASKS) else {"masks": Path(masks)}
+        made = [name for name, is_made in (("images", not image_dir), ("masks", masks == ALPHA_MASKS)) if is_made]
+        return cls(linked, made)
 
 
 def _one_folder(paths: list[Path]) -> Path | None:
@@ -222,17 +283,11 @@ def _write_masked(image_dir: Path, names: list[str], masks: list[Path], partial:
     report("masks", len(names), len(names))
 
 
-def _check_output(output: LockedFolder, linked: dict[str, Path], made: list[str]) -> None:
-    """Find out that what is to be replaced is an earlier result, before minutes of work.
-
-    Args:
-        output: The folder of the data set.
-        linked: Folders that it will have links to, by the name of the link.
-        made: Names of folders that are made for it.
-    """
+def _check_output(output: LockedFolder, folders: _Folders) -> None:
+    """Raise ValueError, before minutes of work, unless what is to be replaced is an earlier result."""
     places = ["sparse", *(path.name for path in output.path.glob("database.db*"))]
-    places += [name for name, folder in linked.items() if (output.path / name).resolve() != folder.resolve()]
-    places += made
+    places += [name for name, folder in folders.linked.items() if (output.path / name).resolve() != folder.resolve()]
+    places += folders.made
     try:
         output.check(places)
     except ValueError as error:
@@ -240,51 +295,45 @@ def _check_output(output: LockedFolder, linked: dict[str, Path], made: list[str]
 
 
 def _reconstruct(
-    image_dir: Path,
-    names: list[str],
-    partial: Path,
-    report: Progress,
-    doing: Callable[[str], None],
-    camera_model: str,
-    max_image_size: int,
-    matching: str,
-    seed: int,
-    is_masked: bool,
+    image_dir: Path, partial: Path, options: SfmOptions, report: Progress, status: Callable[[str], None]
 ) -> SfmSummary:
-    """Run the three stages; leaves `database.db` and `sparse/0` in `partial`."""
+    """Features, matching and mapping of the photographs in a folder.
+
+    Leaves `database.db`, `sparse/0` and, of alpha masks, `masks` in `partial`.
+    """
     from drgs.data.colmap_bindings import pycolmap
     from drgs.sfm.matching import match, quiet, state_focal_lengths
 
+    names, masks = _checked(image_dir, options.masks, options.max_image_size)
+    is_masked = masks is not None
+    if masks is not None:
+        _write_masked(image_dir, names, masks, partial, report)
     database = partial / "database.db"
-    marks = [time.perf_counter()]
+    times = StageTimes()
     with quiet():
         readable = readable_photos(image_dir, names, partial / "readable", report)
         lenses = _lenses(image_dir, readable, names, report)
-    _extract(
-        database,
-        partial / "photos" if is_masked else readable,
-        lenses,
-        camera_model,
-        max_image_size,
-        partial / "masks" if is_masked else None,
-        report,
-        image_dir,
+    features = FeatureOptions(
+        options.camera_model, max_image_size=options.max_image_size, masks=partial / "masks" if is_masked else None
     )
+    _extract(database, partial / "photos" if is_masked else readable, lenses, features, report, image_dir)
     with quiet():
         if is_masked:
             state_focal_lengths(database, readable)
-        marks.append(time.perf_counter())
-        chosen = choose_pairs(database, names, matching, is_masked, seed)
-        match(database, chosen.pairs, seed=seed, guided=is_masked, progress=report)
-        marks.append(time.perf_counter())
-        options = pycolmap.IncrementalPipelineOptions()
-        options.random_seed = seed
+        times.end("features")
+        pairing = choose_pairs(database, names, options.matching, is_masked, options.seed)
+        match(database, pairing.pairs, seed=options.seed, guided=is_masked, progress=report)
+        times.end("matching")
+        pipeline = pycolmap.IncrementalPipelineOptions()
+        pipeline.random_seed = options.seed
         if is_masked:
-            options.mapper.init_min_num_inliers = _MASKED_INLIERS_FIRST
-            options.mapper.abs_pose_min_num_inliers = _MASKED_INLIERS
-        options.min_model_size = min(options.min_model_size, max(2, len(names) // 2))
-        models = map_photos(database, readable, partial / "models", options, len(names), report, doing)
-        marks.append(time.perf_counter())
+            pipeline.mapper.init_min_num_inliers = _MASKED_INLIERS_FIRST
+            pipeline.mapper.abs_pose_min_num_inliers = _MASKED_INLIERS
+        pipeline.min_model_size = min(pipeline.min_model_size, max(2, len(names) // 2))
+        (partial / "models").mkdir()
+        mapping = MappingProgress(len(names), report, status)
+        models = map_photos(database, readable, partial / "models", pipeline, mapping)
+        times.end("mapping")
     if not models:
         raise ValueError(
             f"{image_dir}: the photos must overlap and show texture, no two of {len(names)} could be connected; take "
@@ -292,26 +341,15 @@ def _reconstruct(
             "`drgs sfm --camera-model OPENCV`"
         )
     best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    best.update_point_3d_errors()
+    summary = SfmSummary.of(best, names, pairing, times)  # gives points their errors, which are written
     (partial / "sparse/0").mkdir(parents=True)
     write_model(best, partial / "sparse/0")
-    found = {id(model): {model.images[i].name for i in model.reg_image_ids()} for model in models.values()}
-    kept = found.pop(id(best))
-    parts = PhotoGroups.of(database, names, kept, list(found.values()))
+    posed = {id(model): posed_names(model) for model in models.values()}
+    kept = posed.pop(id(best))
+    groups = PhotoGroups.of(database, names, kept, list(posed.values()))
     report("mapping", len(kept), len(names))
-    return SfmSummary(
-        registered=len(kept),
-        total=len(names),
-        points=best.num_points3D(),
-        reprojection_error=float(best.compute_mean_reprojection_error()),
-        models=len(models),
-        seconds={stage: marks[i + 1] - marks[i] for i, stage in enumerate(("features", "matching", "mapping"))},
-        missing=tuple(name for name in names if name not in kept),
-        explanation=tuple(parts.lines(names, is_masked, bool(chosen.left_out))),
-        matched=len(chosen.pairs),
-        pairs=len(names) * (len(names) - 1) // 2,
-        left_out=chosen.left_out,
-    )
+    lines = groups.lines(names, is_masked, bool(pairing.left_out))
+    return dataclasses.replace(summary, models=len(models), explanation=tuple(lines))
 
 
 def _lenses(image_dir: Path, readable: Path, names: list[str], report: Progress) -> list[list[str]]:
@@ -339,14 +377,7 @@ def _lenses(image_dir: Path, readable: Path, names: list[str], report: Progress)
 
 
 def _extract(
-    database: Path,
-    folder: Path,
-    lenses: list[list[str]],
-    camera_model: str,
-    max_image_size: int,
-    masks: Path | None,
-    report: Progress,
-    originals: Path,
+    database: Path, folder: Path, lenses: list[list[str]], options: FeatureOptions, report: Progress, originals: Path
 ) -> None:
     """Features of all photos, those of each lens with a camera of theirs; those that share it with no other at once."""
     from drgs.sfm.matching import extract
@@ -359,24 +390,20 @@ def _extract(
             database,
             folder,
             names,
-            camera_model=camera_model,
-            shared_camera=is_shared,
-            max_image_size=max_image_size,
-            wide_baseline=True,
-            masks=masks,
-            progress=lambda stage, done, _, before=before: report(stage, before + done, total),
-            originals=originals,
+            dataclasses.replace(options, is_shared=is_shared),
+            lambda stage, done, _, before=before: report(stage, before + done, total),
+            originals,
         )
         before += len(names)
 
 
-def _install(partial: Path, output: LockedFolder, linked: dict[str, Path], made: list[str]) -> None:
+def _install(partial: Path, output: LockedFolder, folders: _Folders) -> None:
     """Move the finished result to its place; the model, which makes the folder a data set, comes
     last.
     """
-    _check_output(output, linked, made)  # minutes later
-    new = {name: partial / name for name in made}
-    for name, folder in linked.items():
+    _check_output(output, folders)  # again: minutes have passed
+    new = {name: partial / name for name in folders.made}
+    for name, folder in folders.linked.items():
         if (output.path / name).resolve() == folder.resolve():
             continue
         new[name] = partial / f"linked_{name}"
@@ -392,7 +419,7 @@ def _install(partial: Path, output: LockedFolder, linked: dict[str, Path], made:
     masks = output.path / "masks"
     # Those of an earlier result; an empty folder is nobody's.
     is_stale = output.is_ours(masks, ("sfm",)) and (masks.is_symlink() or any(masks.iterdir()))
-    if is_stale and "masks" not in linked:
+    if is_stale and "masks" not in folders.linked:
         output.remove(masks)
     for stale in output.path.glob("database.db*"):
         output.remove(stale)

@@ -6,9 +6,9 @@ goes on from the model with its frames and its lenses held. What has been fitted
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import shutil
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,10 +20,11 @@ from drgs.data.images import IMAGE_SUFFIXES, image_size
 from drgs.io.atomic import temporary_folder
 from drgs.io.outputs import lock_folder
 from drgs.sfm.image_folder import FRAMES, joined_frames, recorded_frames, write_frames
-from drgs.sfm.mapping import PhotoGroups, map_photos, write_model
+from drgs.sfm.mapping import MappingProgress, PhotoGroups, map_photos, posed_names, write_model
+from drgs.sfm.matching import FeatureOptions
 from drgs.sfm.pairing import choose_new_pairs
 from drgs.sfm.photo_files import link_or_copy, photo_fault, readable_photos
-from drgs.sfm.reconstruction import SfmSummary
+from drgs.sfm.reconstruction import SfmOptions, SfmSummary, StageTimes
 
 if TYPE_CHECKING:
     from drgs.io.outputs import LockedFolder
@@ -56,12 +57,11 @@ class Registration:
 def register(
     scene: str | os.PathLike,
     photographs: Sequence[str | os.PathLike],
-    progress: Callable[[str, int, int], None] | None = None,
-    max_image_size: int = 1600,
-    seed: int = 0,
-    doing: Callable[[str], None] | None = None,
+    options: SfmOptions | None = None,
+    progress: Progress | None = None,
+    status: Callable[[str], None] | None = None,
 ) -> Registration:
-    """Find the poses of further photographs in the world of a data set that `run_sfm` made.
+    """Compute the poses of further photographs in the world of a data set that `run_sfm` made.
 
     The data set has the new photographs afterwards (as links where links work), their poses, and points that they
     show; poses and lenses that were there do not change. `images` becomes a folder of links to the photographs where it
@@ -71,33 +71,25 @@ def register(
         scene: Folder of the data set.
         photographs: Files. Those of one size, in a data set with one camera of that size and about the focal length
             that their EXIF states, share it. One with a name that is taken gets a number behind its own.
+        options: `max_image_size`, best as for the data set, and `seed`; the others are those of the data set.
         progress: Called with (stage, done, total) as by `run_sfm`; also from another thread.
-        max_image_size: Pixels on the longer side that features are found at, best as for the data set; 0 for all.
-        seed: Seed of all random sampling.
-        doing: Called with what is being done within mapping, in words; from another thread, too.
+        status: Called with what mapping is doing, in words; from another thread, too.
     Raises:
         FileNotFoundError: No such data set or photograph.
         ValueError: A data set that `run_sfm` did not make or that has masks, a file that is no photograph or is in the
             data set already, or none of the photographs connects to those that are there; then nothing has changed.
     """
+    options = options or SfmOptions()
+    report, status = progress or (lambda stage, done, total: None), status or (lambda text: None)
     scene, files = Path(scene), [Path(path) for path in photographs]
-    _check(scene, files, max_image_size)
+    _check(scene, files, options.max_image_size)
     with lock_folder(scene, "sfm", inputs=files) as output:
         output.check(["sparse", "database.db"])
-        names = _new_names(output.path / "images", files)
+        new = dict(zip(_new_names(output.path / "images", files), files, strict=True))
         with temporary_folder("register", output.path) as partial:
-            found = _registered(
-                output.path,
-                files,
-                names,
-                partial,
-                progress or (lambda stage, done, total: None),
-                doing or (lambda text: None),
-                max_image_size,
-                seed,
-            )
-            _install(output, partial, files, names)
-    return found
+            registration = _registered(output.path, new, partial, options, report, status)
+            _install(output, partial, new)
+    return registration
 
 
 def _check(scene: Path, files: list[Path], max_image_size: int) -> None:
@@ -147,15 +139,22 @@ def _new_names(images: Path, files: list[Path]) -> list[str]:
 
 def _registered(
     scene: Path,
-    files: list[Path],
-    names: list[str],
+    new: dict[str, Path],
     partial: Path,
+    options: SfmOptions,
     report: Progress,
-    doing: Callable[[str], None],
-    max_image_size: int,
-    seed: int,
+    status: Callable[[str], None],
 ) -> Registration:
-    """Run the three stages; leaves `database.db`, `sparse/0` and the `photos` under their new names in `partial`."""
+    """Features, matching and mapping of new photographs.
+
+    Leaves `database.db`, `sparse/0` and the `photos` under their new names in `partial`.
+
+    Args:
+        scene: The data set.
+        new: Name in the data set -> photograph.
+        partial: Empty folder.
+        options, report, status: The arguments of `register`.
+    """
     from drgs.data.colmap_bindings import opened_database, pycolmap
     from drgs.sfm.matching import extract, match, quiet
 
@@ -163,78 +162,51 @@ def _registered(
         (partial / folder).mkdir(parents=True)
     for path in _photographs(scene / "images"):
         link_or_copy(path, partial / "photos" / path.name)
-    for file, name in zip(files, names, strict=True):
+    for name, file in new.items():
         link_or_copy(file, partial / "photos" / name)
     database = partial / "database.db"
     shutil.copyfile(scene / "database.db", database)
     before = pycolmap.Reconstruction(str(scene / "sparse/0"))
+    cameras = list(before.cameras.values())
     with opened_database(database) as handle:
         old = [image.name for image in handle.read_all_images()]
-    marks = [time.perf_counter()]
+    names = [*old, *new]
+    times = StageTimes()
     with quiet():
-        readable = readable_photos(partial / "photos", [*old, *names], partial / "readable", report)
-        cameras = list(before.cameras.values())
-        extract(
-            database,
-            readable,
-            names,
-            camera_model=cameras[0].model_name,
-            shared_camera=len({image_size(file) for file in files}) == 1,
-            max_image_size=max_image_size,
-            wide_baseline=True,
-            camera=_shared_camera(cameras, [readable / name for name in names]),
-            progress=report,
+        readable = readable_photos(partial / "photos", names, partial / "readable", report)
+        features = FeatureOptions(
+            cameras[0].model_name,
+            is_shared=len({image_size(file) for file in new.values()}) == 1,
+            max_image_size=options.max_image_size,
+            camera=_shared_camera(cameras, [readable / name for name in new]),
         )
-        marks.append(time.perf_counter())
-        chosen = choose_new_pairs(database, old, names, seed)
-        match(database, chosen.pairs, seed=seed, progress=report)
-        marks.append(time.perf_counter())
-        options = pycolmap.IncrementalPipelineOptions()
-        options.random_seed = seed
-        options.multiple_models = False
-        options.fix_existing_frames = True
-        options.constant_cameras = {camera.camera_id for camera in cameras}
-        total = len(old) + len(names)
-        models = map_photos(
-            database,
-            readable,
-            partial / "models",
-            options,
-            total,
-            report,
-            doing,
-            base=scene / "sparse/0",
-            posed=before.num_reg_images(),
-        )
-        marks.append(time.perf_counter())
+        extract(database, readable, list(new), features, report)
+        times.end("features")
+        pairing = choose_new_pairs(database, old, list(new), options.seed)
+        match(database, pairing.pairs, seed=options.seed, progress=report)
+        times.end("matching")
+        pipeline = pycolmap.IncrementalPipelineOptions()
+        pipeline.random_seed = options.seed
+        pipeline.multiple_models = False
+        pipeline.fix_existing_frames = True
+        pipeline.constant_cameras = {camera.camera_id for camera in cameras}
+        mapping = MappingProgress(len(names), report, status, before.num_reg_images())
+        models = map_photos(database, readable, partial / "models", pipeline, mapping, base=scene / "sparse/0")
+        times.end("mapping")
     model = max(models.values(), key=lambda model: model.num_reg_images(), default=before)
-    kept = {model.images[i].name for i in model.reg_image_ids()}
-    parts = PhotoGroups.of(database, [*old, *names], kept, [])
-    lines = parts.lines([*old, *names], is_masked=False, is_partial=False)
-    posed = tuple(name for name in names if name in kept)
+    kept = posed_names(model)
+    lines = PhotoGroups.of(database, names, kept, []).lines(names, is_masked=False, is_partial=False)
+    posed = tuple(name for name in new if name in kept)
     if not posed:
         raise ValueError(
-            f"{files[0].parent}: photographs that are joined to {scene} must show what those there show, none of "
-            f"{len(names)} could be connected; {lines[-1] if lines else 'take some in between'}"
+            f"{next(iter(new.values())).parent}: photographs that are joined to {scene} must show what those there "
+            f"show, none of {len(new)} could be connected; {lines[-1] if lines else 'take some in between'}"
         )
     moved = _moved(before, model)
-    model.update_point_3d_errors()
+    summary = dataclasses.replace(SfmSummary.of(model, names, pairing, times), explanation=tuple(lines))
     write_model(model, partial / "sparse/0")
-    report("mapping", len(kept), total)
-    summary = SfmSummary(
-        registered=len(kept),
-        total=total,
-        points=model.num_points3D(),
-        reprojection_error=float(model.compute_mean_reprojection_error()),
-        models=1,
-        seconds={stage: marks[i + 1] - marks[i] for i, stage in enumerate(("features", "matching", "mapping"))},
-        missing=tuple(name for name in (*old, *names) if name not in kept),
-        explanation=tuple(lines),
-        matched=len(chosen.pairs),
-        pairs=len(names) * (len(names) - 1) // 2 + len(names) * len(old),
-        left_out=chosen.left_out,
-    )
-    return Registration(summary, tuple(names), posed, moved)
+    report("mapping", len(kept), len(names))
+    return Registration(summary, tuple(new), posed, moved)
 
 
 def _shared_camera(cameras: list[Any], files: list[Path]) -> int | None:
@@ -269,16 +241,16 @@ def _moved(before: Any, after: Any) -> float:
     return float(np.linalg.norm(new - old, axis=1).max() / max(spread, 1e-12))
 
 
-def _install(output: LockedFolder, partial: Path, files: list[Path], names: list[str]) -> None:
+def _install(output: LockedFolder, partial: Path, new_files: dict[str, Path]) -> None:
     """Add the photographs, then put the new database and the new model in the place of the old ones."""
     images = output.path / "images"
-    frames = joined_frames(recorded_frames(images), files, names, output.command)
+    frames = joined_frames(recorded_frames(images), list(new_files.values()), list(new_files), output.command)
     if images.is_symlink():  # to the folder of the first photographs, which is not ours to add to
         made = partial / "images"
         made.mkdir()
         for path in _photographs(images):
             link_or_copy(path, made / path.name)
-    new = {f"images/{name}": partial / "photos" / name for name in names}
+    new = {f"images/{name}": partial / "photos" / name for name in new_files}
     if frames is not None:
         write_frames(partial / FRAMES, frames)
         new[f"images/{FRAMES}"] = partial / FRAMES
@@ -289,7 +261,7 @@ def _install(output: LockedFolder, partial: Path, files: list[Path], names: list
         output.record_planned(partial / "images", "images")
         output.remove(images)
         output.put(partial / "images", "images")
-    for name in names:
+    for name in new_files:
         output.put(partial / "photos" / name, f"images/{name}")
     if frames is not None:
         output.remove(images / FRAMES)
