@@ -233,7 +233,7 @@ def test_triangulates_views_far_apart(tmp_path, rng):
         assert cv2.imwrite(str(views[-1].image_path), np.round(color[..., ::-1] * 255).astype(np.uint8))
     points, _, source = initial_points(views)
     found, total = re.fullmatch(
-        r"triangulated from 2 given poses, (\d+) points; (\d+) with guesses where there are none", source
+        r"triangulated from 2 given poses, (\d+) points; (\d+) with proposed ones where there are none", source
     ).groups()
     assert int(found) > 200
     assert on_plane(points[: int(found)]) > 0.9
@@ -329,7 +329,7 @@ def test_fits_begin_again_where_views_show_more(tmp_path, rng):
     assert starts("never") == starts("always", "all") == ([None] * 3,) * 3
 
 
-def test_a_sure_start_asks_for_no_guesses(tmp_path, rng, monkeypatch):
+def test_a_sure_start_asks_for_no_proposals(tmp_path, rng, monkeypatch):
     """Where the answer is to go on, only the count that is recorded is found, the same as ever."""
     views, config = (
         plane_views(tmp_path, rng, count=4),
@@ -554,7 +554,7 @@ def test_given_points_get_guesses_where_there_are_none(tmp_path, rng):
     right = got[300:][got[300:, 0] > 0]
     assert len(right) > 300
     assert np.median(np.abs(right[:, 2])) < 0.3
-    assert source == f"model; {len(got)} with guesses where there are none"
+    assert source == f"model; {len(got)} with proposed ones where there are none"
     few = initial_points(model, max_points=100, train=views)[0]
     assert len(few) <= 100
     model.tracks = None

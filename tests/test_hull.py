@@ -119,7 +119,8 @@ def test_matches_that_a_third_photograph_denies_are_left_out(tmp_path, monkeypat
         lambda views, *_: (found, np.ones((120, 3), np.float32), np.ones((len(views), 120), bool)),
     )
     points, _, source = initial_points(around(tmp_path), max_points=3000)
-    assert source == f"triangulated from 6 given poses, 120 points; {len(points)} with guesses where there are none"
+    what = f"120 points; {len(points)} with proposed ones where there are none"
+    assert source == f"triangulated from 6 given poses, {what}"
     assert {tuple(point) for point in right} <= {tuple(point) for point in points}
     assert not {tuple(point) for point in wrong} & {tuple(point) for point in points}
     assert np.linalg.norm(points, axis=1).max() < 1.4 * RADIUS

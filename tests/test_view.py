@@ -33,7 +33,7 @@ from drgs.commands.options import View
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.view import subject_of, watched_files
 from drgs.data import load
-from drgs.data.camera_path import read_flight
+from drgs.data.camera_path import read_camera_path
 from drgs.display.pictures import map_colors
 from drgs.files import load_state, save_state
 from drgs.viewing import panel
@@ -750,7 +750,7 @@ def test_a_flight_is_made_in_the_browser(viewers, tmp_path, times):
         part = client.wait(lambda m: m["type"] == "FileTransferPart")
     path = tmp_path / "flight.json"
     path.write_bytes(part["content"])
-    flight = read_flight(path)
+    flight = read_camera_path(path)
     np.testing.assert_allclose([key.position for key in flight.keyframes], [[10, 0, -3], [11, 0, -4]], atol=1e-12)
     np.testing.assert_allclose([key.fov for key in flight.keyframes], np.degrees([0.8, 0.5]))
     assert [key.seconds for key in flight.keyframes] == [0.0, 0.5]

@@ -28,7 +28,7 @@ from drgs.commands import view
 from drgs.commands.options import View
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.view import subject_of, watched_files
-from drgs.data.camera_path import read_flight, rotation_of
+from drgs.data.camera_path import read_camera_path, rotation_of
 from drgs.files import load_state, save_state
 from drgs.viewing.client import camera_of, pose_of
 from drgs.viewing.server import Viewer
@@ -333,7 +333,7 @@ def test_a_flight_is_downloaded(shown, tmp_path):
         page.get_by_role("button", name="save flight.json").click()
     download.value.save_as(tmp_path / "flight.json")
     assert download.value.suggested_filename == "flight.json"
-    keys = read_flight(tmp_path / "flight.json").keyframes
+    keys = read_camera_path(tmp_path / "flight.json").keyframes
     assert [key.seconds for key in keys] == [0.0, 2.0]
     for key in keys:
         np.testing.assert_allclose(key.position, looked.first.pose.position, atol=1e-5)

@@ -13,14 +13,14 @@ from drgs.cameras import Camera, intrinsics
 from drgs.codecs.ply import save_ply
 from drgs.commands.viewpoints import frame_size
 from drgs.data.camera_layout import level_frame, upright
-from drgs.data.camera_path import read_flight
+from drgs.data.camera_path import read_camera_path
 from drgs.display.progress import Bar
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.commands.options import Render
     from drgs.commands.scene_input import SceneInput
-    from drgs.data.camera_path import Flight
+    from drgs.data.camera_path import CameraPath
     from drgs.ellipsoids import Scene
     from drgs.settings import RenderSettings
 
@@ -58,7 +58,7 @@ class Film:
 
     frames: int
     fps: float
-    flight: Flight | None = None
+    flight: CameraPath | None = None
 
 
 def check_flight_options(args: Render) -> None:
@@ -85,7 +85,7 @@ def film_of(args: Render) -> Film:
     Raises:
         FileNotFoundError, ValueError: If there is no such flight, or there would be too many frames.
     """
-    flight = None if args.path is None else read_flight(args.path)
+    flight = None if args.path is None else read_camera_path(args.path)
     stated = flight.fps if flight is not None else None
     fps = args.fps if args.fps is not None else stated or _FPS
     if flight is not None and args.duration is not None:

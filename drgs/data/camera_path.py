@@ -1,14 +1,14 @@
-"""Flights of a camera through keyframes: where it is, where it looks and how wide, at every moment between them.
+"""Paths of a camera through keyframes: where it is, where it looks and how wide, at every moment between them.
 
 Symbols: s_i are the seconds of keyframe i, h_i = s_i+1 - s_i the step after it, d_i its slope: what changes over that
 step, divided by it. The rate at a keyframe is that of the parabola through it and both neighbors (the tangent of
 Catmull-Rom splines for uneven steps), v_i = (h_i d_i-1 + h_i-1 d_i) / (h_i-1 + h_i), shortened where it is longer than
 the shorter slope; at an open end it is (3 d - v) / 2, of a spline whose ends do not bend, shortened alike. Between two
-keyframes runs the cubic that has both values and both rates. So a flight passes through every keyframe, changes its
+keyframes runs the cubic that has both values and both rates. So a path passes through every keyframe, changes its
 rates nowhere suddenly, stands still between two equal keyframes, and backwards goes the same way.
 
 By the Bernstein form a cubic is off the chord by no more than (u (1 - u)^2 + u^2 (1 - u)) h max|v - d|, at most
-h |2 d| / 4: a flight leaves the straight way between two keyframes by no more than half of its length.
+h |2 d| / 4: a path leaves the straight way between two keyframes by no more than half of its length.
 
 Reference: Barry and Goldman, "A recursive evaluation algorithm for a class of Catmull-Rom splines", SIGGRAPH 1988;
 Shoemake, "Animating rotation with quaternion curves", SIGGRAPH 1985 (Bezier curves of rotations, by slerp).
@@ -34,20 +34,20 @@ from drgs.guards.records import nearest
 from drgs.io.journal import SCHEMA
 from drgs.io.json_files import check_json, read_json
 
-__all__ = ["Flight", "Keyframe", "flight_json", "quaternion_of", "read_flight", "rotation_of"]
+__all__ = ["CameraPath", "Keyframe", "camera_path_json", "quaternion_of", "read_camera_path", "rotation_of"]
 
 _TINY = 1e-12  # radians: below, an arc and its chord are the same to rounding
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Keyframe:
-    """A camera that a flight passes through.
+    """A camera that a path passes through.
 
     Attributes:
         position: (3,) center of the camera in the world.
         wxyz: (4,) quaternion of camera to world, OpenCV axes, of length 1.
         fov: Vertical field of view in degrees.
-        seconds: Time at which the flight is there; only differences count.
+        seconds: Time at which the camera is there; only differences count.
         time: Time of the scene, of one that moves.
     """
 
@@ -59,12 +59,12 @@ class Keyframe:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Flight:
-    """A way through keyframes.
+class CameraPath:
+    """A path of a camera through keyframes.
 
     Attributes:
         keyframes: Keyframes in the order of their seconds, at least one, no two at the same; all have a time, or none.
-        duration: Seconds of the whole flight, to which those of the keyframes are stretched; None leaves them.
+        duration: Seconds of the whole path, to which those of the keyframes are stretched; None leaves them.
         loop: Whether it ends where it began, after one more step as long as the others in the mean.
         fps: Frames a second; None where the file says nothing.
         width, height: Pixels of the pictures; None where the file says nothing.
@@ -93,7 +93,7 @@ class Flight:
         return np.linspace(0.0, 1.0, count) if count > 1 else np.zeros(count)
 
     def at(self, shares: np.ndarray) -> list[Keyframe]:
-        """Where the camera is after shares of the flight's duration in [0, 1]; `seconds` are those of the flight."""
+        """Where the camera is after shares of the path's duration in [0, 1]; `seconds` are those from its start."""
         keys = [*self.keyframes, *self.keyframes[: self.loop]]
         knots = self._knots()
         steps = np.diff(knots)
@@ -102,14 +102,14 @@ class Flight:
             return [dataclasses.replace(keys[0], seconds=float(x * self.seconds)) for x in shares]
         moments = shares * knots[-1]
         number = np.clip(np.searchsorted(knots, moments, side="right") - 1, 0, len(steps) - 1)
-        part = ((moments - knots[number]) / steps[number])[:, None]
+        samples = _Samples(steps, self.loop, number, ((moments - knots[number]) / steps[number])[:, None])
         places = np.array([key.position for key in keys], np.float64)
-        position = _through(places, np.diff(places, axis=0), steps, self.loop, np.add, _lerp, number, part)
+        position = samples.interpolated(places, np.diff(places, axis=0), np.add, _lerp)
         zoom = np.log(np.tan(np.radians([key.fov for key in keys]) / 2))[:, None]
-        zoom = _through(zoom, np.diff(zoom, axis=0), steps, self.loop, np.add, _lerp, number, part, monotone=True)
-        turns = np.array([key.wxyz for key in keys], np.float64)
-        ways = _logarithm(_product(turns[:-1] * [1, -1, -1, -1], turns[1:]))
-        wxyz = _through(turns, ways, steps, self.loop, _turned, _slerp, number, part)
+        zoom = samples.interpolated(zoom, np.diff(zoom, axis=0), np.add, _lerp, monotone=True)
+        rotations = np.array([key.wxyz for key in keys], np.float64)
+        turns = _logarithm(_product(rotations[:-1] * [1, -1, -1, -1], rotations[1:]))
+        wxyz = samples.interpolated(rotations, turns, _turned, _slerp)
         fovs = np.degrees(2 * np.arctan(np.exp(zoom[:, 0])))
         times: list[float | None] = [None] * len(shares)
         if keys[0].time is not None:
@@ -140,40 +140,47 @@ class Flight:
         return knots
 
 
-def _through(
-    values: np.ndarray,
-    ways: np.ndarray,
-    steps: np.ndarray,
-    loop: bool,
-    moved: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    between: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
-    number: np.ndarray,
-    part: np.ndarray,
-    monotone: bool = False,
-) -> np.ndarray:
-    """Cubic Bezier curves through values, by de Casteljau, whose rates at the values are as the module says.
+@dataclasses.dataclass(frozen=True)
+class _Samples:
+    """Where a path is sampled.
 
-    Args:
-        values: (M + 1, D) of the keyframes, of a loop with the first one again.
-        ways: (M, E) what changes over each step.
-        steps: (M,) seconds.
-        loop: Whether the last value is the first.
-        moved: Function that moves values by changes.
-        between: Function that goes from values to values, by shares.
-        number, part: (S,) number of the step and (S, 1) share of it, of each sample.
-        monotone: Whether a value that is between its neighbors nowhere (a peak) is passed at a rate of 0.
-    Returns:
-        (S, D) values.
+    Attributes:
+        steps: (M,) seconds from each keyframe to the next.
+        loop: Whether the last keyframe is the first.
+        number: (S,) number of the step of each sample.
+        share: (S, 1) share of that step.
     """
-    slopes = ways / steps[:, None]
-    rates = _rates(slopes, steps, loop, monotone)
-    third = steps[:, None] / 3
-    end = moved(values[:-1], ways)
-    first, second = moved(values[:-1], rates[:-1] * third), moved(end, -rates[1:] * third)
-    points = [x[number] for x in (values[:-1], first, second, end)]
-    while len(points) > 1:
-        points = [between(a, b, part) for a, b in zip(points, points[1:], strict=False)]
-    return points[0]
+
+    steps: np.ndarray
+    loop: bool
+    number: np.ndarray
+    share: np.ndarray
+
+    def interpolated(
+        self,
+        values: np.ndarray,
+        changes: np.ndarray,
+        moved: Callable[[np.ndarray, np.ndarray], np.ndarray],
+        between: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
+        monotone: bool = False,
+    ) -> np.ndarray:
+        """(S, D) values on cubic Bezier curves, by de Casteljau, whose rates at the keyframes are as the module says.
+
+        Args:
+            values: (M + 1, D) of the keyframes, of a loop with the first one again.
+            changes: (M, E) what changes over each step.
+            moved: Function that moves values by changes.
+            between: Function that goes from values to values, by shares.
+            monotone: Whether a value that is between its neighbors nowhere (a peak) is passed at a rate of 0.
+        """
+        rates = _rates(changes / self.steps[:, None], self.steps, self.loop, monotone)
+        third = self.steps[:, None] / 3
+        end = moved(values[:-1], changes)
+        first, second = moved(values[:-1], rates[:-1] * third), moved(end, -rates[1:] * third)
+        points = [x[self.number] for x in (values[:-1], first, second, end)]
+        while len(points) > 1:
+            points = [between(a, b, self.share) for a, b in zip(points, points[1:], strict=False)]
+        return points[0]
 
 
 def _rates(slopes: np.ndarray, steps: np.ndarray, loop: bool, monotone: bool) -> np.ndarray:
@@ -281,8 +288,8 @@ _FPS = 24.0
 _THEIRS: dict[str, Any] = {"render_height": int, "render_width": int, "camera_path": [dict]}
 
 
-def flight_json(flight: Flight) -> bytes:
-    """A flight as `read_flight` reads it."""
+def camera_path_json(path: CameraPath) -> bytes:
+    """A camera path as `read_camera_path` reads it."""
     keys = [
         {
             "position": key.position.tolist(),
@@ -291,15 +298,15 @@ def flight_json(flight: Flight) -> bytes:
             "seconds": key.seconds,
             **({} if key.time is None else {"time": key.time}),
         }
-        for key in flight.keyframes
+        for key in path.keyframes
     ]
-    told = {name: getattr(flight, name) for name in ("duration", "fps", "width", "height")}
-    told = {name: value for name, value in told.items() if value is not None}
-    return json.dumps({"schema": SCHEMA, "keyframes": keys, "loop": flight.loop, **told}, indent=1).encode()
+    stated = {name: getattr(path, name) for name in ("duration", "fps", "width", "height")}
+    stated = {name: value for name, value in stated.items() if value is not None}
+    return json.dumps({"schema": SCHEMA, "keyframes": keys, "loop": path.loop, **stated}, indent=1).encode()
 
 
-def read_flight(path: Path) -> Flight:
-    """Read a flight.
+def read_camera_path(path: Path) -> CameraPath:
+    """Read a camera path.
 
     Args:
         path: Our JSON, or Nerfstudio's: with `camera_path`, whose every camera becomes a keyframe, one a frame.
@@ -323,7 +330,7 @@ def read_flight(path: Path) -> Flight:
     _check_together(where, keys)
     if "loop" in found:
         check_json(where, found, {"loop": bool}, _ADVICE)
-    return Flight(
+    return CameraPath(
         keys,
         duration=_number(where, found, "duration", _STEP, _LONGEST),
         loop=found.get("loop", False),
@@ -417,7 +424,7 @@ def _check_together(where: str, keys: tuple[Keyframe, ...]) -> None:
         raise ValueError(f"{where}: keyframes[{k}]: must have time as others have, found none; add it, or drop all")
 
 
-def _of_nerfstudio(where: str, found: dict) -> Flight:
+def _of_nerfstudio(where: str, found: dict) -> CameraPath:
     """A camera path of Nerfstudio's viewer: OpenGL axes, matrices of 16 numbers, vertical fields of view in degrees."""
     check_json(where, found, _THEIRS, "export the camera path again")
     kind = found.get("camera_type", "perspective")
@@ -449,6 +456,6 @@ def _of_nerfstudio(where: str, found: dict) -> Flight:
         time = _number(at, row, "render_time", -math.inf, math.inf)
         keys.append(Keyframe(position, wxyz, float(row["fov"]), k / fps, time))
     _check_together(where, tuple(keys))
-    return Flight(
+    return CameraPath(
         tuple(keys), fps=fps, width=_side(where, found, "render_width"), height=_side(where, found, "render_height")
     )

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.sfm.matching import Progress
 
-__all__ = ["Features", "Matches", "detect"]
+__all__ = ["Features", "Matches", "Triangulated", "detect"]
 
 _MOST = 6000  # features of a picture, the strongest
 _CONTRAST = 0.02  # half of OpenCV's default: weak features still match along a line
@@ -90,6 +90,30 @@ def detect(camera: Camera, image: np.ndarray, mask: np.ndarray | None = None) ->
     )
 
 
+@dataclasses.dataclass(frozen=True)
+class Triangulated:
+    """Points that two or more of V pictures show.
+
+    Attributes:
+        points: (P, 3) float64, world.
+        colors: (P, 3) float32 in [0, 1].
+        shown: (V, P) bool, which picture shows which point.
+    """
+
+    points: np.ndarray
+    colors: np.ndarray
+    shown: np.ndarray
+
+    @classmethod
+    def none(cls, pictures: int) -> Triangulated:
+        """No point."""
+        return cls(np.empty((0, 3)), np.empty((0, 3), np.float32), np.empty((pictures, 0), bool))
+
+    def only(self, kept: np.ndarray) -> Triangulated:
+        """Some of the points, by (P,) bool."""
+        return Triangulated(self.points[kept], self.colors[kept], self.shown[:, kept])
+
+
 class Matches:
     """Pictures and what has been matched between them, so that one more costs only its own pairs.
 
@@ -99,33 +123,30 @@ class Matches:
 
     def __init__(self):
         self.pictures: list[Features] = []
-        self._found: dict[tuple[int, int], tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+        self._matched: dict[tuple[int, int], tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 
     def match(self, pairs: list[tuple[int, int]], progress: Progress | None = None) -> None:
         """Match pairs of pictures (i, j) that have not been matched yet; `progress` gets ("matching", done, total)."""
-        left = [pair for pair in pairs if pair not in self._found]
+        left = [pair for pair in pairs if pair not in self._matched]
         for done, (i, j) in enumerate(left):
             if progress:
                 progress("matching", done, len(left))
-            self._found[i, j] = _match(self.pictures[i], self.pictures[j])
+            self._matched[i, j] = _match(self.pictures[i], self.pictures[j])
         if progress:
             progress("matching", len(left), len(left))
 
-    def triangulate(self, pairs: list[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def triangulate(self, pairs: list[tuple[int, int]]) -> Triangulated:
         """The points of the matches of these pairs; matches that share a feature make one point.
 
         What else was matched, when there were fewer pictures, is left out: points then depend on the pictures alone,
         not on how many of them came at once, and a fit that was killed and resumed has those of one that was not.
-
-        Returns:
-            Points (P, 3) float64, colors (P, 3) float32, and which of them each of V pictures shows (V, P) bool.
         """
         starts = np.cumsum([0] + [len(picture.pixels) for picture in self.pictures])
-        found = [(pair, self._found[pair]) for pair in sorted(pairs)]
-        if not sum(len(points) for _, (_, _, points) in found):
-            return np.empty((0, 3)), np.empty((0, 3), np.float32), np.empty((len(self.pictures), 0), bool)
-        edges = [np.stack([a + starts[i], b + starts[j]], axis=-1) for (i, j), (a, b, _) in found]
-        points = [points for _, (_, _, points) in found]
+        matched = [(pair, self._matched[pair]) for pair in sorted(pairs)]
+        if not sum(len(points) for _, (_, _, points) in matched):
+            return Triangulated.none(len(self.pictures))
+        edges = [np.stack([a + starts[i], b + starts[j]], axis=-1) for (i, j), (a, b, _) in matched]
+        points = [points for _, (_, _, points) in matched]
         return _tracks(self.pictures, starts, np.concatenate(edges), np.concatenate(points))
 
 
@@ -212,9 +233,7 @@ def _meet(
     return points, depth_a, depth_b, np.degrees(np.arccos(np.clip(between, -1, 1)))
 
 
-def _tracks(
-    pictures: list[Features], starts: np.ndarray, edges: np.ndarray, points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _tracks(pictures: list[Features], starts: np.ndarray, edges: np.ndarray, points: np.ndarray) -> Triangulated:
     """Matches that share features make one point: that of the match which most of their pictures agree with.
 
     Args:
@@ -222,8 +241,6 @@ def _tracks(
         starts: (V + 1,) number of the first feature of each.
         edges: (E, 2) numbers of the features that are matched.
         points: (E, 3) where.
-    Returns:
-        As `Matches.triangulate`.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -253,7 +270,7 @@ def _tracks(
     np.maximum.at(most, edges.ravel(), np.repeat(support, 2))
     kept = np.flatnonzero((support >= 3) | ((support == 2) & (most[edges] == 2).all(axis=1)))
     if not len(kept):
-        return np.empty((0, 3)), np.empty((0, 3), np.float32), np.empty((len(pictures), 0), bool)
+        return Triangulated.none(len(pictures))
     links = coo_array((np.ones(len(kept), bool), tuple(edges[kept].T)), shape=(len(pixels), len(pixels)))
     label = connected_components(links, directed=False)[1][edges[kept, 0]]
     order = np.lexsort((-support[kept], label))
@@ -272,7 +289,7 @@ def _tracks(
     np.add.at(A, match, across)
     np.add.at(b, match, (across @ eyes[:, :, None])[:, :, 0])
     np.add.at(color, match, np.concatenate([picture.colors for picture in pictures])[member])
-    made = np.linalg.solve(A, b[:, :, None])[:, :, 0]
+    nearest = np.linalg.solve(A, b[:, :, None])[:, :, 0]
     shown = np.zeros((len(pictures), len(chosen)), bool)
     shown[picture_of[member], match] = True
-    return made, color / np.bincount(match)[:, None].astype(np.float32), shown
+    return Triangulated(nearest, color / np.bincount(match)[:, None].astype(np.float32), shown)

@@ -1,6 +1,6 @@
 """Triangulated points of photographs with given poses, kept from one fit to the next of the same photographs.
 
-Matching takes minutes. What it finds depends on the photographs, their masks and cameras and on the code alone: a hash
+Matching takes minutes. Its points depend on the photographs, their masks and cameras and on the code alone: a hash
 of all these names the file in the user's cache, so that a photograph that changes is matched anew.
 """
 
@@ -23,8 +23,9 @@ import numpy as np
 from drgs.data.checks import check_npz
 from drgs.data.views import View
 from drgs.io.atomic import hidden_file, is_left_over
+from drgs.sfm.guided import Triangulated
 
-__all__ = ["found_once"]
+__all__ = ["cached"]
 
 _LARGEST = 256 << 20  # bytes of all files; those of a hundred photographs have about 5 MiB
 _CHUNK = 1 << 20  # bytes that are hashed at once
@@ -33,34 +34,31 @@ _LEFT = 86_400  # seconds after which what a killed process has not finished is 
 
 _log = logging.getLogger(__name__)
 
-Triangulated = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""(P, 3) float64 points, (P, 3) float32 colors, and (V, P) bool of which views show which points."""
 
-
-def found_once(views: list[View], find: Callable[[], Triangulated]) -> Triangulated:
-    """What was found before of the same photographs, else what `find` finds, which is kept.
+def cached(views: list[View], triangulate: Callable[[], Triangulated]) -> Triangulated:
+    """The points of earlier photographs that are the same as these, else what `triangulate` returns, which is kept.
 
     A file that is damaged, or that drgs did not make, is not read; where nothing can be kept, nothing is.
 
     Args:
         views: Views with images.
-        find: Finds it.
+        triangulate: Matches the views and triangulates, which takes minutes.
     """
     try:
         digest = _digest(views)
         file = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "drgs" / "matches" / f"{digest}.npz"
     except (OSError, RuntimeError) as error:  # a photograph that cannot be read, a user without a home
         _log.info("matches are not kept: %s", error)
-        return find()
-    found = _read(file, len(views))
-    if found is None:
-        found = find()
-        _write(file, *found)
-    return found
+        return triangulate()
+    kept = _read(file, len(views))
+    if kept is None:
+        kept = triangulate()
+        _write(file, kept)
+    return kept
 
 
 def _digest(views: list[View]) -> str:
-    """Hash of all that matching depends on: content of photographs and masks, cameras, and the code."""
+    """Hash of all that triangulation depends on: content of photographs and masks, cameras, and the code."""
     found = hashlib.blake2b(_code(), digest_size=20)
     for view in views:
         for field in dataclasses.fields(view.camera):
@@ -98,16 +96,16 @@ def _read(path: Path, count: int) -> Triangulated | None:
         _log.info("%s is not used: %s", path, error)
         return None
     _log.info("points are those of an earlier fit to the same photographs (%s)", path)
-    return points, colors, np.unpackbits(packed, axis=1, count=number).astype(bool)
+    return Triangulated(points, colors, np.unpackbits(packed, axis=1, count=number).astype(bool))
 
 
-def _write(path: Path, points: np.ndarray, colors: np.ndarray, shown: np.ndarray) -> None:
-    """Keep what was found, if there is a place for it, and let go of what was used longest ago."""
+def _write(path: Path, kept: Triangulated) -> None:
+    """Keep points, if there is a place for them, and delete what was used longest ago."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with hidden_file(str(path.parent.resolve()), path.name) as hidden:
             with open(hidden, "wb") as file:
-                np.savez(file, points=points, colors=colors, shown=np.packbits(shown, axis=1))
+                np.savez(file, points=kept.points, colors=kept.colors, shown=np.packbits(kept.shown, axis=1))
             os.replace(hidden, path)
         _bound(path.parent)
     except OSError as error:

@@ -1,16 +1,18 @@
-"""Initial points of a scene: the data set's own, from depth maps, triangulated, or guessed (guesses.py)."""
+"""Initial points of a scene: the data set's own, from depth maps, triangulated, or proposed (proposals.py)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import dataclasses
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drgs.data.dataset import Dataset
 from drgs.data.views import View
 from drgs.display.progress import Bar
-from drgs.sfm.guided import Matches, detect
-from drgs.sfm.match_cache import found_once
+from drgs.sfm.guided import Matches, Triangulated, detect
+from drgs.sfm.match_cache import cached
 from drgs.sfm.matching import nearby_pairs
 from drgs.sfm.proposals import (
     FEWEST,
@@ -22,6 +24,9 @@ from drgs.sfm.proposals import (
     points_beside,
     subset,
 )
+
+if TYPE_CHECKING:
+    from drgs.sfm.matching import Progress
 
 __all__ = [
     "added_points",
@@ -48,18 +53,18 @@ def initial_points(
     data: Dataset | list[View],
     seed: int = 0,
     max_points: int = 100_000,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress | None = None,
     matches: Matches | None = None,
     train: list[View] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """Points to start Gaussians from, by the first way that works.
 
-    The data set's own points; back-projected depth maps; SIFT features triangulated with the given
-    poses, and guesses along the rays of pixels that have none of these near, as far away as what is
-    triangulated beside them; random points where the cameras look. Given a list of views, nothing but these is
-    read, as active runs need it. Of synchronous cameras of a data set, those that are held out are not
-    read. What moves has points where it was at first: of views at several times, those at the first one
-    are read, unless they are from one place (a single camera that moves: then all).
+    The data set's own points; back-projected depth maps; SIFT features triangulated with the given poses, and points
+    proposed along the rays of pixels that have none of these near, as far away as what is triangulated beside them;
+    random points where the cameras look. Given a list of views, nothing but these is read, as active runs need it. Of
+    synchronous cameras of a data set, those that are held out are not read. What moves has points where it was at
+    first: of views at several times, those at the first one are read, unless they are from one place (a single camera
+    that moves: then all).
 
     Args:
         data: a data set, or views (then there are no given points).
@@ -67,8 +72,8 @@ def initial_points(
         max_points: Number of points at most.
         progress: Called with (stage, done, total) while triangulating.
         matches: Gets the features and matches, if there are any, which `shared_points` goes on with.
-        train: Views for guesses along rays of pixels that have none of the data set's own points near, where it has
-            their tracks; None: there are none.
+        train: Views along whose rays points are proposed for pixels that have none of the data set's own points near,
+            where it has their tracks; None: none are proposed.
     Returns:
         points (P,3) float64, colors (P,3) float32 in [0,1], and where they come from, one line.
     """
@@ -77,18 +82,7 @@ def initial_points(
     if not views:
         raise ValueError("initial_points: there must be at least one view, got none; pass the training views")
     if isinstance(data, Dataset) and data.points is not None and len(data.points):
-        colors = data.colors if data.colors is not None else np.full(data.points.shape, 0.5, dtype=np.float32)
-        if train and data.tracks is not None:
-            places, shown = _tracked(*data.tracks, train)
-            if len(places) >= _MIN_TRIANGULATED:
-                hull = Hull.of(train, progress)
-                points, colors = _with_guesses(
-                    train, data.points, colors, shown, max_points, hull, rng, progress, places
-                )
-                return points, colors, f"{data.point_source}; {len(points)} with guesses where there are none"
-        keep = subset(len(data.points), max_points, rng)
-        note = "" if len(keep) == len(data.points) else f", {len(keep)} kept"
-        return data.points[keep], colors[keep], f"{data.point_source}{note}"
+        return _own_points(data, train, max_points, rng, progress)
     if any(view.depth_path is not None for view in views):
         points, colors = _from_depth(views, max_points, rng)
         if len(points):
@@ -97,12 +91,13 @@ def initial_points(
     tried = ""
     if len(views) >= 2 and all(view.has_image for view in views):
         matches = matches or Matches()
-        triangulated = found_once(views, lambda: _triangulated(views, matches, progress))
-        points, colors, found = _completed(views, seed, max_points, *triangulated, progress)
+        triangulated = cached(views, lambda: _triangulated(views, matches, progress))
+        points, colors = _completed(views, triangulated, seed, max_points, progress)
+        count = len(triangulated.points)
         if len(points):
-            source = f"triangulated from {len(views)} given poses, {found} points"
-            return points, colors, f"{source}; {len(points)} with guesses where there are none"
-        tried = f" (triangulation gave {found})"
+            source = f"triangulated from {len(views)} given poses, {count} points"
+            return points, colors, f"{source}; {len(points)} with proposed ones where there are none"
+        tried = f" (triangulation gave {count})"
         hull = Hull.of(views, progress)
         room = None if hull is None else hull.points(min(max_points, _MAX_RANDOM), rng, progress)
         if room is not None:
@@ -111,12 +106,26 @@ def initial_points(
     return points, colors, f"random where {len(views)} cameras look, {len(points)} points{tried}"
 
 
+def _own_points(
+    data: Dataset, train: list[View] | None, max_points: int, rng: np.random.Generator, progress: Progress | None
+) -> tuple[np.ndarray, np.ndarray, str]:
+    """`initial_points` of a data set that has points."""
+    points = data.points
+    assert points is not None  # checked
+    colors = data.colors if data.colors is not None else np.full(points.shape, 0.5, dtype=np.float32)
+    if train and data.tracks is not None:
+        tracked, shown = _tracked(*data.tracks, train)
+        if len(tracked) >= _MIN_TRIANGULATED:
+            proposer = _Proposer(train, Hull.of(train, progress), max_points, rng, progress)
+            points, colors = proposer.completed(points, colors, tracked, shown)
+            return points, colors, f"{data.point_source}; {len(points)} with proposed ones where there are none"
+    keep = subset(len(points), max_points, rng)
+    note = "" if len(keep) == len(points) else f", {len(keep)} kept"
+    return points[keep], colors[keep], f"{data.point_source}{note}"
+
+
 def triangulated_points(
-    views: list[View],
-    seed: int,
-    max_points: int,
-    matches: Matches,
-    progress: Callable[[str, int, int], None] | None = None,
+    views: list[View], seed: int, max_points: int, matches: Matches, progress: Progress | None = None
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Points to start Gaussians from that all of these views together show, without depth maps.
 
@@ -127,75 +136,77 @@ def triangulated_points(
         matches: Matches, as `added_points` takes them.
         progress: Callback, as `initial_points` takes it.
     Returns:
-        points (P,3) float64 and colors (P,3) float32: those triangulated, and where images have none of them, guesses
-        as far away as those beside; no point at all, if fewer than 50 are triangulated. Third, how many are, before any
-        is left out.
+        points (P,3) float64 and colors (P,3) float32: those triangulated, and where images have none of them, proposed
+        ones as far away as those beside; no point at all, if fewer than 50 are triangulated. Third, how many are,
+        before any is left out.
     """
-    return _completed(views, seed, max_points, *_triangulated(views, matches, progress), progress)
+    triangulated = _triangulated(views, matches, progress)
+    return *_completed(views, triangulated, seed, max_points, progress), len(triangulated.points)
 
 
 def _completed(
-    views: list[View],
-    seed: int,
-    max_points: int,
-    points: np.ndarray,
-    colors: np.ndarray,
-    shown: np.ndarray,
-    progress: Callable[[str, int, int], None] | None,
-) -> tuple[np.ndarray, np.ndarray, int]:
-    """`triangulated_points` of what `_triangulated` has found."""
-    rng = np.random.default_rng(seed)
-    found = len(points)
-    if found < _MIN_TRIANGULATED:
-        return points[:0], colors[:0], found
+    views: list[View], triangulated: Triangulated, seed: int, max_points: int, progress: Progress | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points and colors of `triangulated_points`."""
+    if len(triangulated.points) < _MIN_TRIANGULATED:
+        return triangulated.points[:0], triangulated.colors[:0]
     hull = Hull.of(views, progress)
     if hull is not None:
         # Two photographs agreed about what others say is not there.
-        there = ~hull.is_denied(points)
-        points, colors, shown = points[there], colors[there], shown[:, there]
-    return *_with_guesses(views, points, colors, shown, max_points, hull, rng, progress), found
+        triangulated = triangulated.only(~hull.is_denied(triangulated.points))
+    proposer = _Proposer(views, hull, max_points, np.random.default_rng(seed), progress)
+    return proposer.completed(triangulated.points, triangulated.colors, triangulated.points, triangulated.shown)
 
 
-def _with_guesses(
-    views: list[View],
-    points: np.ndarray,
-    colors: np.ndarray,
-    shown: np.ndarray,
-    max_points: int,
-    hull: Hull | None,
-    rng: np.random.Generator,
-    progress: Callable[[str, int, int], None] | None,
-    places: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Points and colors, at most `max_points`, and where images have none of them, guesses as far away as those beside.
+@dataclasses.dataclass(frozen=True)
+class _Proposer:
+    """Proposes points where images have none.
 
-    Args:
+    Attributes:
         views: V views.
-        points, colors: (P, 3) each.
-        shown: (V, N) which views show which points.
-        places: (N, 3) points that `shown` is about, if these are not all `points`.
+        hull: Their visual hull, in which points are proposed if there is one, else along rays.
+        max_points: Number of all points at most.
+        rng: Source of all random choices.
+        progress: Callback, as `initial_points` takes it.
     """
-    places = points if places is None else places
-    # What no two views show would stay empty: density control does not leave what there is. Guesses are as dense as
-    # what is triangulated, at most as many, but together they are enough; and the budget is shared by area.
-    share = empty_share(views, places, shown)
-    # Where all is empty, the share of what is not is 0.
-    as_dense = len(points) * min(1.0, share / max(1 - share, 1e-9))
-    guesses = round(min(max(_ENOUGH - len(points), as_dense), share * max_points))
-    keep = subset(len(points), max_points - guesses, rng)
-    room = None if hull is None else hull.points(guesses, rng, progress)
-    more, more_colors = room or points_beside(views, places, shown, guesses, rng)
-    return np.concatenate([points[keep], more]), np.concatenate([colors[keep], more_colors])
+
+    views: list[View]
+    hull: Hull | None
+    max_points: int
+    rng: np.random.Generator
+    progress: Progress | None
+
+    def completed(
+        self, points: np.ndarray, colors: np.ndarray, tracked: np.ndarray, shown: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Points and colors, (P, 3) each, and proposed ones behind them.
+
+        Args:
+            points, colors: (P, 3) each.
+            tracked: (N, 3) points of which it is known which views show them: all, or some.
+            shown: (V, N) bool, which view shows which of these.
+        """
+        # What no two views show would stay empty: density control does not leave what there is. Proposed points are as
+        # dense as what is triangulated, at most as many, but together they are enough; and the budget is shared by
+        # area.
+        share = empty_share(self.views, tracked, shown)
+        # Where all is empty, the share of what is not is 0.
+        as_dense = len(points) * min(1.0, share / max(1 - share, 1e-9))
+        count = round(min(max(_ENOUGH - len(points), as_dense), share * self.max_points))
+        keep = subset(len(points), self.max_points - count, self.rng)
+        room = None if self.hull is None else self.hull.points(count, self.rng, self.progress)
+        more, more_colors = room or points_beside(self.views, tracked, shown, count, self.rng)
+        return np.concatenate([points[keep], more]), np.concatenate([colors[keep], more_colors])
 
 
 def matched_points(
-    views: list[View], matches: Matches, progress: Callable[[str, int, int], None] | None = None
+    views: list[View], matches: Matches, progress: Progress | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """(P, 3) points that two or more of V views show, as far as they are triangulated, and (V, P) bool of which show
     which; arguments as of `triangulated_points`.
     """
-    points, _, shown = _triangulated(views, matches, progress)
-    return points, shown
+    triangulated = _triangulated(views, matches, progress)
+    return triangulated.points, triangulated.shown
 
 
 def shared_points(
@@ -203,7 +214,7 @@ def shared_points(
     views: list[View],
     seed: int = 0,
     matches: Matches | None = None,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Points that photographs are compared by, and which photographs show them: by projecting alone, a point that
     something hides would be taken for what hides it.
@@ -226,15 +237,13 @@ def shared_points(
         return _shown_by_depth(views, np.random.default_rng(seed))
     if matches is None or len(views) < 2:
         return None
-    points, _, shown = found_once(views, lambda: _triangulated(views, matches, progress))
-    return _shown_beside(views, points, shown)
+    triangulated = cached(views, lambda: _triangulated(views, matches, progress))
+    return _shown_beside(views, triangulated.points, triangulated.shown)
 
 
-def triangulated_count(
-    views: list[View], matches: Matches, progress: Callable[[str, int, int], None] | None = None
-) -> int:
+def triangulated_count(views: list[View], matches: Matches, progress: Progress | None = None) -> int:
     """The third value of `triangulated_points` alone."""
-    return len(_triangulated(views, matches, progress)[0])
+    return len(_triangulated(views, matches, progress).points)
 
 
 def _all_at_first(data: Dataset) -> list[View]:
@@ -257,28 +266,29 @@ def added_points(
     views: list[View],
     seed: int,
     matches: Matches,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Points that the last view adds to what those before it show, without depth maps.
 
     Args:
         views: Views, at least one; nothing but these is read.
         seed: Seed of all random choices.
-        matches: What was found in the first ones of these views by earlier calls; is added to.
+        matches: Features and matches of the first ones of these views, by earlier calls; those of the others are added.
         progress: Callback, as `initial_points` takes it.
     Returns:
         points (P,3) float64 and colors (P,3) float32: first those triangulated with the last view, whose number is the
-        third value, then guesses: along rays of the last view as far away as what is triangulated near them, or, where
-        these are next to none, random ones where the views look.
+        third value, then proposed ones: along rays of the last view as far away as what is triangulated near them, or,
+        where these are next to none, random ones where the views look.
     """
-    points, colors, shown = _triangulated(views, matches, progress)
-    mine = shown[-1] if len(points) else np.empty(0, bool)
+    triangulated = _triangulated(views, matches, progress)
+    mine = triangulated.shown[-1]
+    own = triangulated.only(mine)
     rng = np.random.default_rng(seed)
     if mine.sum() >= FEWEST:
-        more, more_colors = points_beside(views[-1:], points, shown[-1:], _MAX_RANDOM, rng)
+        more, more_colors = points_beside(views[-1:], triangulated.points, triangulated.shown[-1:], _MAX_RANDOM, rng)
     else:
         more, more_colors = points_anywhere(views, _MAX_RANDOM, rng)
-    return np.concatenate([points[mine], more]), np.concatenate([colors[mine], more_colors]), int(mine.sum())
+    return np.concatenate([own.points, more]), np.concatenate([own.colors, more_colors]), int(mine.sum())
 
 
 # -------------------------------------------------- depth
@@ -330,7 +340,7 @@ def _tracked(points: np.ndarray, tracks: Mapping[str, np.ndarray], views: list[V
 
 def _shown_beside(views: list[View], points: np.ndarray, shown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The points, and which views show them: `shown`, and where they are as far away as the nearest point that the view
-    was found to show in their part of the picture. Tracks alone are short: errors add up from one to the next.
+    shows by its tracks in their part of the picture. Tracks alone are short: errors add up from one to the next.
     """
     found = shown.copy()
     for row, view in enumerate(views):
@@ -383,12 +393,8 @@ def _filled(depth: np.ndarray) -> np.ndarray:
     return known[label]
 
 
-def _triangulated(
-    views: list[View], matches: Matches, progress: Callable[[str, int, int], None] | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """SIFT features inside the masks, matched along the epipolar lines of the given poses and triangulated: (P,3)
-    points, (P,3) colors, and which points each view shows, (V,P).
-    """
+def _triangulated(views: list[View], matches: Matches, progress: Progress | None) -> Triangulated:
+    """SIFT features inside the masks, matched along the epipolar lines of the given poses and triangulated."""
     import cv2
 
     new = views[len(matches.pictures) :]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drgs.data.camera_path import Flight, Keyframe, flight_json
+from drgs.data.camera_path import CameraPath, Keyframe, camera_path_json
 from drgs.viewing import panel
 
 if TYPE_CHECKING:
@@ -80,9 +80,9 @@ class KeyframeFolder:
         self._show()
 
     @property
-    def flight(self) -> Flight:
+    def flight(self) -> CameraPath:
         """The flight through the keyframes, of which there must be one at least."""
-        return Flight(tuple(self.keyframes), loop=bool(self._loop.value) and len(self.keyframes) > 1)
+        return CameraPath(tuple(self.keyframes), loop=bool(self._loop.value) and len(self.keyframes) > 1)
 
     @property
     def is_flying(self) -> bool:
@@ -127,7 +127,7 @@ class KeyframeFolder:
 
     async def _saved(self, _: Any) -> None:
         if self.keyframes:
-            self.client.send_file_download("flight.json", flight_json(self.flight), save_immediately=True)
+            self.client.send_file_download("flight.json", camera_path_json(self.flight), save_immediately=True)
 
     async def _flown(self, _: Any) -> None:
         if self._preview is not None:
@@ -137,7 +137,7 @@ class KeyframeFolder:
             self._show_line(False)  # it leads through the camera
             self._preview = asyncio.create_task(self._previewed(self.flight))
 
-    async def _previewed(self, flight: Flight) -> None:
+    async def _previewed(self, flight: CameraPath) -> None:
         """Fly once, at the pace of the flight."""
         began = time.monotonic()
         while (gone := (time.monotonic() - began) / flight.seconds) < 1:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drgs.cameras import c2w_to_opengl, look_at
-from drgs.data.camera_path import Flight, Keyframe, flight_json, quaternion_of, read_flight, rotation_of
+from drgs.data.camera_path import CameraPath, Keyframe, camera_path_json, quaternion_of, read_camera_path, rotation_of
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -19,11 +19,11 @@ def key(position=(0, 0, 0), wxyz=IDENTITY, fov=50.0, seconds=0.0, time=None) -> 
     return Keyframe(np.asarray(position, np.float64), wxyz / np.linalg.norm(wxyz), fov, float(seconds), time)
 
 
-def some(rng, count: int = 6, loop: bool = False) -> Flight:
+def some(rng, count: int = 6, loop: bool = False) -> CameraPath:
     """Keyframes anywhere, at uneven steps."""
     seconds = np.cumsum(rng.uniform(0.3, 2.0, count))
     keys = [key(rng.normal(size=3), rng.normal(size=4), rng.uniform(20, 90), s) for s in seconds]
-    return Flight(tuple(keys), loop=loop)
+    return CameraPath(tuple(keys), loop=loop)
 
 
 def arrays(keys) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -35,7 +35,7 @@ def arrays(keys) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     )
 
 
-def shares_of(flight: Flight) -> np.ndarray:
+def shares_of(flight: CameraPath) -> np.ndarray:
     """Where the keyframes are."""
     seconds = np.array([x.seconds for x in flight.keyframes]) - flight.keyframes[0].seconds
     return seconds / flight.seconds
@@ -79,7 +79,7 @@ def test_backwards_is_the_same_way(rng):
     shares = np.linspace(0, 1, 41)
     for _ in range(20):
         flight = some(rng)
-        back = Flight(tuple(dataclasses.replace(x, seconds=-x.seconds) for x in reversed(flight.keyframes)))
+        back = CameraPath(tuple(dataclasses.replace(x, seconds=-x.seconds) for x in reversed(flight.keyframes)))
         for a, b in zip(arrays(flight.at(shares)), arrays(back.at(1 - shares)), strict=True):
             np.testing.assert_allclose(a, b, atol=1e-9)
 
@@ -88,14 +88,14 @@ def test_mirrored_keyframes_make_a_mirrored_flight(rng):
     """Symmetric: what is mirrored at x = 0 and in time lies mirrored."""
     right = [key((x, y, 0.0), seconds=s) for x, y, s in ((1, 0, 1.0), (2, 1, 2.5), (2.5, 3, 3.0))]
     left = [dataclasses.replace(x, position=x.position * [-1, 1, 1], seconds=-x.seconds) for x in reversed(right)]
-    position, _, _ = arrays(Flight((*left, *right)).at(np.linspace(0, 1, 31)))
+    position, _, _ = arrays(CameraPath((*left, *right)).at(np.linspace(0, 1, 31)))
     np.testing.assert_allclose(position, position[::-1] * [-1, 1, 1], atol=1e-12)
 
 
 def test_two_keyframes_are_a_straight_line_at_an_even_pace():
     """Also of the rotation, about one axis."""
     turned = np.array([np.cos(0.6), 0, np.sin(0.6), 0])
-    flight = Flight((key((0, 0, 0)), key((3, 6, -9), turned, seconds=2)))
+    flight = CameraPath((key((0, 0, 0)), key((3, 6, -9), turned, seconds=2)))
     made = flight.at(np.linspace(0, 1, 11))
     position, _, _ = arrays(made)
     np.testing.assert_allclose(position, np.linspace((0, 0, 0), (3, 6, -9), 11), atol=1e-12)
@@ -105,7 +105,7 @@ def test_two_keyframes_are_a_straight_line_at_an_even_pace():
 
 def test_points_on_a_line_stay_on_it_without_turning_back():
     """Whatever the steps, it never goes past a keyframe."""
-    flight = Flight(tuple(key((x, 0, 0), seconds=s) for x, s in ((0, 0), (1, 3), (10, 3.2), (10.1, 9))))
+    flight = CameraPath(tuple(key((x, 0, 0), seconds=s) for x, s in ((0, 0), (1, 3), (10, 3.2), (10.1, 9))))
     position, _, _ = arrays(flight.at(np.linspace(0, 1, 501)))
     assert (np.diff(position[:, 0]) >= -1e-12).all()
     np.testing.assert_allclose(position[:, 1:], 0, atol=1e-12)
@@ -128,7 +128,7 @@ def test_stays_within_half_a_chord(rng):
 
 def test_one_keyframe_stands_still():
     """One frame, or as many as it lasts."""
-    flight = Flight((key((1, 2, 3), seconds=7),))
+    flight = CameraPath((key((1, 2, 3), seconds=7),))
     assert flight.seconds == 0
     assert flight.frame_count(24) == 1
     still = dataclasses.replace(flight, duration=0.5)
@@ -141,7 +141,7 @@ def test_one_keyframe_stands_still():
 def test_equal_keyframes_are_a_rest():
     """Between two of them nothing moves."""
     turned = np.array([0.8, 0.6, 0, 0])
-    flight = Flight(
+    flight = CameraPath(
         (
             key((0, 0, 0)),
             key((1, 0, 0), turned, seconds=1),
@@ -157,11 +157,11 @@ def test_equal_keyframes_are_a_rest():
 
 def test_half_turns_go_one_way_at_an_even_pace():
     """Two keyframes that look away from each other: half a turn about one axis, no point of it undefined."""
-    flight = Flight((key(), key(wxyz=(0, 0, 1, 0), seconds=1)))
+    flight = CameraPath((key(), key(wxyz=(0, 0, 1, 0), seconds=1)))
     turns = arrays(flight.at(np.linspace(0, 1, 19)))[1]
     steps = [np.degrees(np.arccos((np.trace(a.T @ b) - 1) / 2)) for a, b in zip(turns, turns[1:], strict=False)]
     np.testing.assert_allclose(steps, 10, atol=1e-6)
-    around = Flight((key(), key(wxyz=(0, 0, 1, 0), seconds=1), key(wxyz=(1, 0, 0, 0), seconds=2)))
+    around = CameraPath((key(), key(wxyz=(0, 0, 1, 0), seconds=1), key(wxyz=(1, 0, 0, 0), seconds=2)))
     assert np.isfinite(arrays(around.at(np.linspace(0, 1, 19)))[1]).all()
 
 
@@ -170,13 +170,13 @@ def test_signs_of_quaternions_mean_nothing(rng):
     flight = some(rng)
     turned = [dataclasses.replace(x, wxyz=x.wxyz * sign) for x, sign in zip(flight.keyframes, (1, -1) * 3, strict=True)]
     shares = np.linspace(0, 1, 31)
-    np.testing.assert_allclose(arrays(flight.at(shares))[1], arrays(Flight(tuple(turned)).at(shares))[1], atol=1e-9)
+    np.testing.assert_allclose(arrays(flight.at(shares))[1], arrays(CameraPath(tuple(turned)).at(shares))[1], atol=1e-9)
 
 
 def test_durations_and_frames():
     """A flight of 2 s has 49 frames at 24 a second, both ends; stretched, it shows the same places."""
     keys = tuple(key((x, 0, 0), seconds=x, time=2.0 * x) for x in (0, 0.5, 2))
-    flight = Flight(keys)
+    flight = CameraPath(keys)
     assert flight.frame_count(24) == 49
     slow = dataclasses.replace(flight, duration=8.0)
     assert slow.frame_count(24) == 193
@@ -193,7 +193,7 @@ def test_durations_and_frames():
 def test_cameras(rng):
     """Frames look as their keyframes: pose, and field of view of the height."""
     w2c = look_at((1, 2, 3), (0, 0, 0), (0, -1, 0))
-    flight = Flight((key(-w2c[:3, :3].T @ w2c[:3, 3], quaternion_of(w2c[:3, :3].T), fov=60),))
+    flight = CameraPath((key(-w2c[:3, :3].T @ w2c[:3, 3], quaternion_of(w2c[:3, :3].T), fov=60),))
     camera = flight.cameras(1, 200, 100)[0]
     np.testing.assert_allclose(camera.w2c, w2c, atol=1e-12)
     assert 2 * np.degrees(np.arctan(0.5 * 100 / camera.K[1, 1])) == pytest.approx(60)
@@ -213,8 +213,8 @@ def test_files_there_and_back(rng, tmp_path):
     flight = dataclasses.replace(
         flight, keyframes=tuple(dataclasses.replace(x, time=0.1 * k) for k, x in enumerate(flight.keyframes))
     )
-    (tmp_path / "f.json").write_bytes(flight_json(flight))
-    again = read_flight(tmp_path / "f.json")
+    (tmp_path / "f.json").write_bytes(camera_path_json(flight))
+    again = read_camera_path(tmp_path / "f.json")
     for name in ("duration", "loop", "fps", "width", "height"):
         assert getattr(again, name) == getattr(flight, name)
     for a, b in zip(flight.keyframes, again.keyframes, strict=True):
@@ -227,7 +227,7 @@ def test_poses_as_matrices(tmp_path):
     """w2c says the same as position and quaternion."""
     w2c = look_at((1, 2, 3), (0, 0.5, 0), (0, -1, 0))
     (tmp_path / "f.json").write_text(json.dumps({"keyframes": [{"w2c": w2c.tolist(), "fov": 40, "seconds": 0}]}))
-    camera = read_flight(tmp_path / "f.json").cameras(1, 20, 10)[0]
+    camera = read_camera_path(tmp_path / "f.json").cameras(1, 20, 10)[0]
     np.testing.assert_allclose(camera.w2c, w2c, atol=1e-12)
 
 
@@ -247,7 +247,7 @@ def test_camera_paths_of_nerfstudio(tmp_path):
         ],
     }
     (tmp_path / "path.json").write_text(json.dumps(path))
-    flight = read_flight(tmp_path / "path.json")
+    flight = read_camera_path(tmp_path / "path.json")
     assert (flight.fps, flight.width, flight.height) == (30.0, 96, 54)
     assert flight.frame_count(flight.fps) == 3
     cameras = flight.cameras(3, 96, 54)
@@ -256,7 +256,7 @@ def test_camera_paths_of_nerfstudio(tmp_path):
     path["camera_path"][1]["camera_to_world"] = path["camera_path"][1]["camera_to_world"][:12]
     (tmp_path / "path.json").write_text(json.dumps(path))
     with pytest.raises(ValueError, match=r"camera_path\[1\]: camera_to_world must hold 16 numbers, got 12") as error:
-        read_flight(tmp_path / "path.json")
+        read_camera_path(tmp_path / "path.json")
     assert "\n" not in str(error.value)
 
 
@@ -308,7 +308,7 @@ def test_bad_files_are_refused_in_a_line(tmp_path, found, expected):
     path = tmp_path / "f.json"
     path.write_text(json.dumps(found))
     with pytest.raises(ValueError, match=r"f\.json") as error:
-        read_flight(path)
+        read_camera_path(path)
     assert expected in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -316,4 +316,4 @@ def test_bad_files_are_refused_in_a_line(tmp_path, found, expected):
 def test_no_file(tmp_path):
     """A path that is none."""
     with pytest.raises(FileNotFoundError, match="must be a JSON file of a flight, found none"):
-        read_flight(tmp_path / "none.json")
+        read_camera_path(tmp_path / "none.json")
