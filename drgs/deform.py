@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -62,9 +61,6 @@ class FieldConfig:
     last_std: float = 0.0
 
     def __post_init__(self) -> None:
-        if type(self.depth) is int and self.depth == 0:
-            warnings.warn("FieldConfig: depth must be >= 1, got 0, which is read as 1; say 1", FutureWarning, 3)
-            object.__setattr__(self, "depth", 1)
         least = {"channels": 1, "resolution": 2, "time_resolution": 2, "width": 1, "depth": 1}
         for name, low in least.items():
             value = getattr(self, name)

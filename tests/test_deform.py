@@ -130,15 +130,13 @@ def test_derivative_by_time_at_a_node():
 
 
 def test_depth_counts_the_layers_of_the_trunk():
-    """As many layers as it says; 0, which once was another word for 1, is read as that, with a warning."""
+    """As many layers as it says, one at least."""
     sizes = {"channels": 3, "resolution": 4, "time_resolution": 5, "width": 8}
     bounds = [[0.0] * 3, [1.0] * 3]
     for depth in (1, 2, 3):
         field = DeformationField(FieldConfig(**sizes, depth=depth), bounds)
         assert sum(isinstance(layer, torch.nn.Linear) for layer in field.mlp["trunk"]) == depth
-    with pytest.warns(FutureWarning, match="FieldConfig: depth must be >= 1, got 0, which is read as 1; say 1"):
-        assert FieldConfig(**sizes, depth=0) == FieldConfig(**sizes, depth=1) == FieldConfig(**sizes)
-    for wrong in (-1, False):
+    for wrong in (0, -1, False):
         with pytest.raises(ValueError, match=r"FieldConfig: depth must be a whole number >= 1, got"):
             FieldConfig(**sizes, depth=wrong)
 

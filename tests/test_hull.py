@@ -8,6 +8,7 @@ import pytest
 
 from drgs.cameras import Camera, intrinsics, look_at
 from drgs.data import View
+from drgs.sfm.guided import Triangulated
 from drgs.sfm.points import initial_points
 from drgs.sfm.proposals import Hull
 
@@ -116,7 +117,7 @@ def test_matches_that_a_third_photograph_denies_are_left_out(tmp_path, monkeypat
     found = np.concatenate([right, wrong])
     monkeypatch.setattr(
         "drgs.sfm.points._triangulated",
-        lambda views, *_: (found, np.ones((120, 3), np.float32), np.ones((len(views), 120), bool)),
+        lambda views, *_: Triangulated(found, np.ones((120, 3), np.float32), np.ones((len(views), 120), bool)),
     )
     points, _, source = initial_points(around(tmp_path), max_points=3000)
     what = f"120 points; {len(points)} with proposed ones where there are none"

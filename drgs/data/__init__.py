@@ -120,7 +120,6 @@ def load(
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: must be a data set, found no such file or folder; check the path")
-    name, path = _located(path)
     if isinstance(times, bool) or not isinstance(times, int) or times < 1:
         raise ValueError(f"load: times must be a whole number >= 1, got {times!r}; correct it")
     if isinstance(test_cameras, str):
@@ -137,13 +136,7 @@ def load(
         "times": times,
         "test_cameras": test_cameras,
     }
-    try:
-        dataset = LOADERS[name].read(name, path, options)
-    except (FileNotFoundError, ValueError) as error:
-        if not (beside := _beside(name, path, options)):
-            raise
-        kind = FileNotFoundError if isinstance(error, FileNotFoundError) else ValueError
-        raise kind(f"{error}; {beside}") from error
+    dataset = _read(*_located(path), options)
     dataset.test_every = test_every
     dataset.test_offset = test_offset
     if test_cameras is not None:
@@ -156,6 +149,17 @@ def load(
     if semantics:
         attach(dataset, lazy)
     return dataset
+
+
+def _read(name: str, path: Path, options: dict[str, Any]) -> Dataset:
+    """The data set, by the format of this name; what is wrong with it says which other format could be read there."""
+    try:
+        return LOADERS[name].read(name, path, options)
+    except (FileNotFoundError, ValueError) as error:
+        if not (beside := _beside(name, path, options)):
+            raise
+        kind = FileNotFoundError if isinstance(error, FileNotFoundError) else ValueError
+        raise kind(f"{error}; {beside}") from error
 
 
 def _located(path: Path) -> tuple[str, Path]:

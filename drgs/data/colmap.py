@@ -58,50 +58,49 @@ def load_colmap(
         )
     ply = None if not points or (model / f"points3D{model_suffix(model)}").is_file() else point_ply(model)
     reconstruction = read_model(model, points and ply is None)
-    views = []
-    absent = []
-    listed = []
-    by_id = {}
+    dataset = Dataset(path, "colmap", [])
+    by_id = _add_views(dataset, reconstruction, model, lazy)
+    for view in dataset.views:
+        view.background = background
+    go_on_without(model, [view.image_path for view in dataset.absent], len(dataset.views), strict)
+    xyz, colors = read_point_ply(ply) if ply else model_points(reconstruction, model)
+    if len(xyz):
+        dataset.points, dataset.colors = xyz, colors
+        dataset.point_source = f"{ply.name if ply else f'COLMAP model {model.name}'}, {len(xyz)} points"
+    dataset.reprojection = _reprojection(reconstruction)
+    dataset.tracks = _tracks(reconstruction, by_id)
+    return dataset
+
+
+def _add_views(dataset: Dataset, reconstruction: Any, model: Path, lazy: bool) -> dict[int, View]:
+    """Put a view of every registered image into a data set, into `absent` where the image is not there or damaged.
+
+    Returns:
+        Number of the image in the model -> view.
+    """
     # By name: COLMAP numbers images in the order in which its threads finish them.
     registered = sorted(reconstruction.reg_image_ids(), key=lambda image_id: reconstruction.images[image_id].name)
     if not registered:
         raise ValueError(f"{model}: must hold at least one registered image, got none; run `drgs sfm` again")
     names = [reconstruction.images[image_id].name for image_id in registered]
-    folder = image_folder(path, model, names)
+    path, folder = dataset.path, image_folder(dataset.path, model, names)
     of_here = names_of_here(str(model), folder, names)
+    by_id = {}
     for index, image_id in enumerate(registered):
         image = reconstruction.images[image_id]
         name = of_here(image.name) if of_here else image.name
         file = file_inside(folder, name, f"{model}: image {index}")
         name = os.path.relpath(file, folder)  # without ..
         where = f"{model}: image {index} ({name})"
-        view = View(None, str(Path(name).with_suffix("")), image_path=file)
-        listed.append(view)
-        by_id[image_id] = view
-        if not is_file(view.image_path) or (not lazy and is_damaged(view.image_path)):
-            absent.append(view)
+        view = by_id[image_id] = View(None, str(Path(name).with_suffix("")), image_path=file, is_checked=not lazy)
+        if not is_file(file) or (not lazy and is_damaged(file)):
+            dataset.absent.append(view)
             continue
-        camera = model_camera(reconstruction, image, where)
-        view.camera = fit_to_image(camera, view.image_path, where, lazy)
+        view.camera = fit_to_image(model_camera(reconstruction, image, where), file, where, lazy)
         view.mask_path = mask_file((path if folder == path else folder.parent) / "masks", name)
-        view.background = background
-        view.is_checked = not lazy
-        views.append(view)
-    make_unique(listed)
-    go_on_without(model, [view.image_path for view in absent], len(views), strict)
-    xyz, colors = read_point_ply(ply) if ply else model_points(reconstruction, model)
-    source = f"{ply.name if ply else f'COLMAP model {model.name}'}, {len(xyz)} points" if len(xyz) else ""
-    return Dataset(
-        path=path,
-        format="colmap",
-        views=views,
-        points=xyz if len(xyz) else None,
-        colors=colors if len(xyz) else None,
-        point_source=source,
-        absent=absent,
-        reprojection=_reprojection(reconstruction),
-        tracks=_tracks(reconstruction, by_id),
-    )
+        dataset.views.append(view)
+    make_unique(list(by_id.values()))
+    return by_id
 
 
 def find_model(path: Path, whole: bool = True) -> Path | None:

@@ -85,8 +85,6 @@ def load_transforms(
         raise FileNotFoundError(
             f"{path}: must hold transforms.json or transforms_train.json, found none; check the path"
         )
-    xyz = colors = None
-    source = ""
     read = {file: _frames(file) for file in files}
     dataset = Dataset(path, "transforms", [])
     rows = _listed(read, dataset, lazy)
@@ -94,30 +92,32 @@ def load_transforms(
     _name_cameras(dataset, [frame.get("time") for data in read.values() for frame in data["frames"]])
     first = _FirstImage(dataset, test_every, test_offset, test_cameras) if lazy else None
     for file, data in read.items():
-        sizes: dict[tuple[int, int], int] = {}
-        for index, frame in enumerate(data["frames"]):
-            view = rows[file][index]
-            if view is None:
-                continue
-            where = f"{file}: frame {index}"
-            own = _fill(view, file.parent, where, data, frame, background, first)
-            if not own:
-                sizes.setdefault((view.camera.width, view.camera.height), index)
-        if len(sizes) > 1:
-            (first, i), (second, j) = list(sizes.items())[:2]
-            raise ValueError(
-                f"{file}: images must have one size unless every frame has its own intrinsics, got "
-                f"{first[0]}x{first[1]} at frame {i} and {second[0]}x{second[1]} at frame {j}; "
-                "write fl_x, w, h a frame"
-            )
-        if points and xyz is None and isinstance(data.get("ply_file_path"), str):
+        shared: dict[int, View] = {}  # number of the frame -> view, of those whose intrinsics are the file's
+        for index, (frame, view) in enumerate(zip(data["frames"], rows[file], strict=True)):
+            if view is not None:
+                view.background = background
+                if not _fill(view, file.parent, f"{file}: frame {index}", data, frame, first):
+                    shared[index] = view
+        _check_one_size(file, shared)
+        if points and dataset.points is None and isinstance(data.get("ply_file_path"), str):
             ply = file_inside(file.parent, data["ply_file_path"], f"{file}: ply_file_path")
-            xyz, colors = read_point_ply(ply)
-            source = f"{ply.name}, {len(xyz)} points"
-    dataset.points = xyz
-    dataset.colors = colors
-    dataset.point_source = source
+            dataset.points, dataset.colors = read_point_ply(ply)
+            dataset.point_source = f"{ply.name}, {len(dataset.points)} points"
     return dataset
+
+
+def _check_one_size(file: Path, views: dict[int, View]) -> None:
+    """Raise ValueError unless views of the same intrinsics have images of one size."""
+    sizes: dict[tuple[int, int], int] = {}
+    for index, view in views.items():
+        sizes.setdefault((view.camera.width, view.camera.height), index)
+    if len(sizes) > 1:
+        (first, i), (second, j) = list(sizes.items())[:2]
+        raise ValueError(
+            f"{file}: images must have one size unless every frame has its own intrinsics, got "
+            f"{first[0]}x{first[1]} at frame {i} and {second[0]}x{second[1]} at frame {j}; "
+            "write fl_x, w, h a frame"
+        )
 
 
 TRANSFORMS = Format(
@@ -233,7 +233,6 @@ def _fill(
     where: str,
     data: dict,
     frame: dict,
-    background: tuple[float, float, float],
     first: _FirstImage | None,
 ) -> bool:
     """Complete a view whose image is there; returns whether its frame carries its own intrinsics.
@@ -249,7 +248,6 @@ def _fill(
     view.mask_path = _optional_file(folder, where, frame, "mask_path")
     view.depth_path = depth
     view.depth_scale = _depth_scale(where, merged, depth)
-    view.background = background
     view.is_checked = first is None
     return own
 
