@@ -205,10 +205,10 @@ def test_packets_that_do_not_say_what_is_shown(neu3d, monkeypatch):
 
     monkeypatch.setattr(cv2, "VideoCapture", Shifted)
     file, told = (neu3d / "cam02.mp4", (0, 0), True), []
-    video = video_decoding.walk(*file, tell=told.append)
+    video = video_decoding.walk(*file, report=told.append)
     assert (video["count"], video["stamps"]) == (FRAMES, [])
     for index in (4, 2, 5, 0, 3):
-        assert decoded(video_decoding.frame(*file, index, tell=told.append)) == (2, index)
+        assert decoded(video_decoding.frame(*file, index, report=told.append)) == (2, index)
 
 
 def test_a_seek_that_ends_elsewhere_is_noticed(neu3d, monkeypatch):
@@ -228,7 +228,7 @@ def test_a_seek_that_ends_elsewhere_is_noticed(neu3d, monkeypatch):
     monkeypatch.setattr(cv2, "VideoCapture", Careless)
     monkeypatch.setattr(video_decoding, "_NEAR", 0)
     for index in (4, 2, 5, 0, 3):
-        found = video_decoding.frame(neu3d / "cam02.mp4", (0, 1), True, index, tell=lambda _: None)
+        found = video_decoding.frame(neu3d / "cam02.mp4", (0, 1), True, index, report=lambda _: None)
         assert decoded(found) == (2, index)
 
 

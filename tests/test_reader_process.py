@@ -23,24 +23,24 @@ from pathlib import Path
 import numpy as np
 from drgs.data.reader_process import serve
 
-def fail(path, kind, tell):
+def fail(path, kind, report):
     raise {"ValueError": ValueError, "FileNotFoundError": FileNotFoundError, "KeyError": KeyError}[kind](f"{path}: no")
 
-def count(path, number, tell):
+def count(path, number, report):
     for i in range(number):
-        tell(i)
+        report(i)
     logging.getLogger("drgs").warning("%s: counted", path)
     return number
 
-def read(path, tell):
+def read(path, report):
     return path.read_text()
 
-def zeros(path, shape, tell):
+def zeros(path, shape, report):
     return np.arange(np.prod(shape), dtype=np.uint8).reshape(shape)
 
 if __name__ == "__main__":
     serve({"fail": fail, "count": count, "read": read, "zeros": zeros,
-           "abort": lambda path, tell: os.abort(), "sleep": lambda path, tell: time.sleep(60)})
+           "abort": lambda path, report: os.abort(), "sleep": lambda path, report: time.sleep(60)})
 """
 
 
@@ -62,7 +62,7 @@ def stopped(pid: int) -> bool:
 def test_answers(child, tmp_path, caplog):
     """Values, arrays, errors, warnings and what is told on the way; one process for all."""
     told = []
-    assert child.ask("count", Path("a"), 3, told=told.append) == 3
+    assert child.ask("count", Path("a"), 3, progress=told.append) == 3
     pid = child.pid
     assert told == [0, 1, 2]
     assert caplog.messages == ["a: counted"]

@@ -51,7 +51,7 @@ CODECS: Registry[Codec] = Registry(
     },
     Codec,
 )
-"""Formats of Gaussians, in the order in which they are asked whether a file is theirs; those of other packages and
+"""Formats of Gaussians, in the order in which they are tried; those of other packages and
 scripts come after these. PLY is written by `drgs.save_ply`, which alone has room for more columns.
 """
 

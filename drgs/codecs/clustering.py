@@ -12,9 +12,9 @@ from drgs.display.progress import Bar
 
 __all__ = ["codebook", "morton_order", "palette"]
 
-_BINS = 1 << 16
-_CODEBOOK_STEPS = 40
-_PALETTE_STEPS = 6
+_BINS = 1 << 16  # of a histogram: 256 to an entry of the codebook
+_CODEBOOK_STEPS = 40  # of Lloyd's algorithm, on the histogram
+_PALETTE_STEPS = 6  # of the same, on all rows, which takes most of the time of writing
 _BLOCK = 4096  # rows that are compared with all centers at a time
 _SEED = 0
 _MORTON_BITS = 20  # an axis: a few Gaussians far away shall not leave one cell for all others

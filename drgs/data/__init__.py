@@ -55,7 +55,7 @@ LOADERS: Registry[Format] = Registry(
     },
     Format,
 )
-"""Formats of data sets, in the order in which they are asked whether a folder is theirs; those of other packages and
+"""Formats of data sets, in the order in which they are tried; those of other packages and
 scripts come after these, so that no folder changes its meaning when something is installed.
 """
 

@@ -33,7 +33,7 @@ _TURN = 75.0  # degrees between photographs of one path
 _SMOOTH = 0.75  # standard deviation of the smoothing in steps between photographs, at least
 _STEEPEST = 80.0  # degrees above or below the horizon, beyond which an axis does not say what is ahead
 _SMOOTHED = 40  # and in parts of the whole path, of which a video has many photographs
-_EXTENT_MARGIN = 1.1
+_EXTENT_MARGIN = 1.1  # 3DGS's own factor of the radius of the cameras
 
 
 @dataclasses.dataclass(frozen=True)

@@ -284,7 +284,7 @@ _MANY = 100_000  # keyframes
 _STEP = 1e-3  # seconds between two keyframes, at least
 _UNIT = 1e-3  # by which the length of a quaternion may be off 1: of three digits
 _RIGID = 1e-3  # by which a rotation may be none
-_FPS = 24.0
+_FPS = 24.0  # frames a second, where a camera path of Nerfstudio states none
 _THEIRS: dict[str, Any] = {"render_height": int, "render_width": int, "camera_path": [dict]}
 
 

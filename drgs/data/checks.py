@@ -35,7 +35,7 @@ __all__ = [
     "repaired_pose",
 ]
 
-_MAX_NPY_HEADER = 65536
+_MAX_NPY_HEADER = 65536  # bytes: a dtype of many fields takes a few hundred
 _DEFLATE = 1032  # bytes that one byte of deflate can become
 _MAX_NAME = 1024  # characters, folders included
 _SHOWN = 120  # characters of a reader's own message

@@ -21,7 +21,7 @@ class Format:
 
     Attributes:
         recognizes: Whether a folder, or a file that was named itself, is such a data set; it opens no images. Formats
-            are asked in the order of the table.
+            are tried in the order of the table.
         load: `load(path, ...)` makes the `Dataset`. By the names of its parameters it says which options of
             `drgs.data.load` mean something to the format: of `background`, `lazy`, `points`, `strict`, `test_every`,
             `test_offset`, `times` and `test_cameras` it gets those alone.

@@ -25,7 +25,7 @@ __all__ = ["HDR", "HdrReader", "hdr_transfer", "in_srgb"]
 HDR = {16: "PQ", 18: "HLG"}
 """Names of the transfer characteristics that are converted, by their numbers in ITU-T H.273."""
 
-_HLG_WHITE = 0.75
+_HLG_WHITE = 0.75  # of the signal
 _PQ_WHITE = 203.0  # cd/m2
 _PQ_PEAK = 10_000.0  # cd/m2
 _LARGEST = 1 << 26  # bytes of a header that are looked at; that of an hour of video has some MiB

@@ -35,7 +35,7 @@ Image.MAX_IMAGE_PIXELS = None  # bounded here, and phones make 200 million
 pillow_heif.register_heif_opener(thumbnails=False, depth_images=False, aux_images=False)
 
 
-def size(path: Path, tell: Any) -> list[int]:
+def size(path: Path, report: Any) -> list[int]:
     """[width, height] as it is shown, by the header.
 
     Raises:
@@ -47,7 +47,7 @@ def size(path: Path, tell: Any) -> list[int]:
         return [height, width] if is_turned else [width, height]
 
 
-def pixels(path: Path, tell: Any) -> np.ndarray:
+def pixels(path: Path, report: Any) -> np.ndarray:
     """(H, W), (H, W, 3) or (H, W, 4) uint8, as it is shown.
 
     Raises:
@@ -56,7 +56,7 @@ def pixels(path: Path, tell: Any) -> np.ndarray:
     return np.asarray(_shown(path))
 
 
-def encoded_jpeg(path: Path, quality: int, tell: Any) -> np.ndarray:
+def encoded_jpeg(path: Path, quality: int, report: Any) -> np.ndarray:
     """The bytes of a JPEG, uint8: the photograph as it is shown and without alpha, with its EXIF.
 
     Raises:

@@ -49,7 +49,7 @@ _BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1
 
 _decoder = Child("drgs.data.heif_decoding", "a photograph that can be decoded", "convert it to JPEG, or leave it out")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", *HEIF_SUFFIXES)
-_MAX_PIXELS = 2**31
+_MAX_PIXELS = 2**31  # what an int of OpenCV holds
 # What OpenCV, libpng, libjpeg, libtiff and FFmpeg begin their lines with; OpenCV ends some with an empty one.
 _DECODER = re.compile(
     rb"^\[ *(WARN|ERROR|INFO)|^\[[\w, ]+ @ 0x|^OpenCV|^Truncating packet|"  # OpenCV, FFmpeg

@@ -77,10 +77,10 @@ def load_cameras(
             "none; run COLMAP on one frame of each camera, named so"
         )
     if without := [folder.name for folder in folders if folder.name not in posed]:
-        told = f"{model}: has no image of {len(without)} of the {len(folders)} cameras ({', '.join(without[:5])})"
+        problem = f"{model}: has no image of {len(without)} of the {len(folders)} cameras ({', '.join(without[:5])})"
         if strict or len(posed) < 2:
-            raise FileNotFoundError(f"{told}; name its images by their cameras, as cam00.png, or run COLMAP again")
-        _log.warning("%s; going on without them", told)
+            raise FileNotFoundError(f"{problem}; name its images by their cameras, as cam00.png, or run COLMAP again")
+        _log.warning("%s; going on without them", problem)
     numbers, frames = frames_of([folder for folder in folders if folder.name in posed], times)
     recordings = []
     for name, files in frames.items():

@@ -11,7 +11,7 @@ from drgs.io.foreign import is_file, refuse_foreign
 
 __all__ = ["read_point_ply"]
 
-_MAX_PLY_HEADER = 65536
+_MAX_PLY_HEADER = 65536  # bytes in which a header must end: that of 3DGS takes some 1,500
 _SHOWN = 200  # characters of a reader's own message
 _PLY_BYTES = {
     **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),

@@ -60,14 +60,14 @@ class Child:
         """Number of the process; None where there is none."""
         return self._process.pid if self._process is not None and self._owner == os.getpid() else None
 
-    def ask(self, what: str, path: Path, *rest: Any, told: Callable[[int], None] = lambda _: None) -> Any:
-        """What a function of the module answers: a value of JSON, or an array.
+    def ask(self, what: str, path: Path, *rest: Any, progress: Callable[[int], None] = lambda _: None) -> Any:
+        """Call a function of the module in its process; its result, a value of JSON or an array.
 
         Args:
             what: Name of the function.
             path: Its first argument: the file that is read.
             rest: More arguments, values of JSON.
-            told: Is called with the numbers that it tells of on the way.
+            progress: Called with the numbers that the function reports while it runs.
         Raises:
             ValueError: The process ended over this file.
             Exception: What the function raises.
@@ -82,9 +82,9 @@ class Child:
                     answer = json.loads(self._file.readline() or b"null")
                     if answer is None:
                         raise BrokenPipeError
-                    if "told" not in answer:
+                    if "progress" not in answer:
                         break
-                    told(answer["told"])
+                    progress(answer["progress"])
                 array = self._shared.array(answer["shape"]).copy() if "shape" in answer else None
             except (BrokenPipeError, ConnectionResetError):
                 code = self._process.wait()
@@ -136,17 +136,17 @@ def serve(functions: dict[str, Callable[..., Any]]) -> None:
     """Answer the questions of a `Child` until it is gone: the main function of its module.
 
     Args:
-        functions: Functions by name; they get a path, the other arguments, and `tell`, which takes a number.
+        functions: Functions by name; they get a path, the other arguments, and `report`, which takes a number.
     """
-    for name in (signal.SIGINT, signal.SIGTERM):  # a fit that is told to end saves first, and may need this one
+    for name in (signal.SIGINT, signal.SIGTERM):  # a fit that gets one saves first, and may need this process
         signal.signal(name, signal.SIG_IGN)
-    warnings = _Kept()
+    warnings = _KeptWarnings()
     logging.getLogger().addHandler(warnings)
     file = socket.socket(fileno=int(sys.argv[1])).makefile("rwb")
     shared = _Shared(int(sys.argv[2]))
 
-    def tell(number: int) -> None:
-        file.write(json.dumps({"told": number}).encode() + b"\n")
+    def report(number: int) -> None:
+        file.write(json.dumps({"progress": number}).encode() + b"\n")
         file.flush()
 
     for line in file:
@@ -154,7 +154,7 @@ def serve(functions: dict[str, Callable[..., Any]]) -> None:
         os.chdir(folder)  # that paths are relative to
         answer: dict[str, Any] = {}
         try:
-            value = functions[what](Path(path), *rest, tell=tell)
+            value = functions[what](Path(path), *rest, report=report)
             if isinstance(value, np.ndarray):
                 answer["shape"] = value.shape
                 shared.array(value.shape)[...] = value
@@ -198,7 +198,7 @@ def _memory() -> int:
         return os.dup(file.fileno())
 
 
-class _Kept(logging.Handler):
+class _KeptWarnings(logging.Handler):
     """Keeps what is logged."""
 
     def __init__(self) -> None:

@@ -28,7 +28,7 @@ __all__ = ["POSES", "REPLICA", "load_replica"]
 
 POSES = "traj_w_c.txt"
 _FIELD_OF_VIEW = 90.0  # degrees across the width
-_MILLIMETER = 1e-3
+_MILLIMETER = 1e-3  # meters, in which Replica has its scenes
 _LARGEST = 1 << 27  # bytes; 900 poses take 0.3 MB
 _FRAME = re.compile(r"rgb_(\d{1,9})")
 

@@ -41,8 +41,8 @@ _DEPTHS = ("depth_file_path", "depth_path")  # nerfstudio's key, and NeRFCapture
 _FILE_KEYS = ("file_path", "mask_path", *_DEPTHS)
 _DEPTH_SCALES = ("depth_unit_scale_factor", "integer_depth_scale")
 _SHOWN = 40  # characters of a key in a message
-_MILLIMETER = 1e-3
-_DEPTH_SCALE_MAX = 1e9
+_MILLIMETER = 1e-3  # meters: the unit of depth images where a file states none, as in nerfstudio
+_DEPTH_SCALE_MAX = 1e9  # scene units: a larger one is a mistake
 _log = logging.getLogger(__name__)
 
 

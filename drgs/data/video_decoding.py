@@ -27,7 +27,7 @@ from drgs.guards import memory
 
 __all__ = ["frame", "gray", "walk"]
 
-_MAX_PIXELS = 2**31
+_MAX_PIXELS = 2**31  # of a frame: what an int of OpenCV holds
 _MAX_FRAMES = 10**7  # four days at 30 a second; a time stamp of each is held
 _MISSING = (0.02, 8)  # share or number of frames that a header may claim too many, where it states a duration alone
 _NEAR = 16  # frames ahead that are decoded rather than sought
@@ -35,13 +35,13 @@ _SAME = 0.01  # milliseconds between time stamps of one frame
 # videos that are held open, and of which is known what is in them
 _OPEN = 4
 _KNOWN = 1024
-_TOLD = 50  # frames between two reports
+_REPORT_EVERY = 50  # frames between two reports
 _COPY = "it is truncated or damaged, copy it again"
 
 _log = logging.getLogger(__name__)
 
 
-def walk(path: Path, version: Sequence[int], is_mp4: bool, tell: Callable[[int], None]) -> dict[str, Any]:
+def walk(path: Path, version: Sequence[int], is_mp4: bool, report: Callable[[int], None]) -> dict[str, Any]:
     """What is in a video: `width`, `height`, `count` of frames that are shown, and the milliseconds at which they are,
     `stamps`, empty where the file does not say.
 
@@ -49,7 +49,7 @@ def walk(path: Path, version: Sequence[int], is_mp4: bool, tell: Callable[[int],
         path: The file.
         version: Size and time of change; what was found is kept until these change.
         is_mp4: It lists its frames.
-        tell: Gets the number of frames that were decoded, where all are.
+        report: Gets the number of frames that were decoded, where all are.
     Raises:
         ValueError: One that OpenCV cannot open, or that ends before its header says.
     """
@@ -57,49 +57,49 @@ def walk(path: Path, version: Sequence[int], is_mp4: bool, tell: Callable[[int],
     if key not in _walked:
         while len(_walked) >= _KNOWN:
             _walked.popitem(last=False)
-        _walked[key] = _walk(path, is_mp4, tell)
+        _walked[key] = _walk(path, is_mp4, report)
     return _walked[key]
 
 
-def frame(path: Path, version: Sequence[int], is_mp4: bool, index: int, tell: Callable[[int], None]) -> np.ndarray:
+def frame(path: Path, version: Sequence[int], is_mp4: bool, index: int, report: Callable[[int], None]) -> np.ndarray:
     """(H, W, 3) uint8, sRGB, of a frame, also of an HDR video.
 
     Args:
-        path, version, is_mp4, tell: The arguments of `walk`.
+        path, version, is_mp4, report: The arguments of `walk`.
         index: Number of the frame as it is shown, from 0.
     Raises:
         ValueError: It cannot be decoded.
     """
-    return _reader(path, version, is_mp4, tell).frame(index)
+    return _reader(path, version, is_mp4, report).frame(index)
 
 
-def _reader(path: Path, version: Sequence[int], is_mp4: bool, tell: Callable[[int], None]) -> _Reader:
+def _reader(path: Path, version: Sequence[int], is_mp4: bool, report: Callable[[int], None]) -> _Reader:
     """An open video; of those read last, some stay open."""
     key = (path, *version)
     if key not in _readers:
         while len(_readers) >= _OPEN:
             _readers.popitem(last=False)
-        video = walk(path, version, is_mp4, tell)
+        video = walk(path, version, is_mp4, report)
         _readers[key] = _Reader(path, video["stamps"], video["count"], is_mp4)
     _readers.move_to_end(key)
     return _readers[key]
 
 
 def gray(
-    path: Path, version: Sequence[int], is_mp4: bool, index: int, longest: int, tell: Callable[[int], None]
+    path: Path, version: Sequence[int], is_mp4: bool, index: int, longest: int, report: Callable[[int], None]
 ) -> np.ndarray:
     """(h, w) uint8 of a frame, reduced; of an HDR video its coded luma, which is as sharp.
 
     Args:
-        path, version, is_mp4, index, tell: The arguments of `frame`.
+        path, version, is_mp4, index, report: The arguments of `frame`.
         longest: Pixels that the longer side has at most.
     Raises:
         ValueError: It cannot be decoded.
     """
-    return shrunk(_reader(path, version, is_mp4, tell).frame(index, is_gray=True), longest)
+    return shrunk(_reader(path, version, is_mp4, report).frame(index, is_gray=True), longest)
 
 
-def _walk(path: Path, is_mp4: bool, tell: Callable[[int], None]) -> dict[str, Any]:
+def _walk(path: Path, is_mp4: bool, report: Callable[[int], None]) -> dict[str, Any]:
     """`walk`, of a file that is not known."""
     # packets, undecoded; frames
     raw = _opened(path, [cv2.CAP_PROP_FORMAT, -1])
@@ -123,7 +123,7 @@ def _walk(path: Path, is_mp4: bool, tell: Callable[[int], None]) -> dict[str, An
         )
     stamps.sort()  # packets come in the order of decoding
     if not _is_ascending(stamps) or not _ends_agree(shown, stamps):
-        stamps = _decoded(path, len(stamps), tell)
+        stamps = _decoded(path, len(stamps), report)
     if not stamps:
         raise ValueError(f"{path}: must hold at least one frame, none can be read; {_COPY}")
     shown_at = stamps if _is_ascending(stamps) else []
@@ -155,7 +155,7 @@ def _opened(path: Path, options: list[int]) -> Any:
     return capture
 
 
-def _decoded(path: Path, packets: int, tell: Callable[[int], None]) -> list[float]:
+def _decoded(path: Path, packets: int, report: Callable[[int], None]) -> list[float]:
     """Time stamps of all frames, as they are decoded; some decoders do not know those of the last ones.
 
     Raises:
@@ -167,8 +167,8 @@ def _decoded(path: Path, packets: int, tell: Callable[[int], None]) -> list[floa
     with native_stderr() as complaints:
         while len(stamps) <= _MAX_FRAMES and capture.grab():
             stamps.append(capture.get(cv2.CAP_PROP_POS_MSEC))
-            if len(stamps) % _TOLD == 0:
-                tell(len(stamps))
+            if len(stamps) % _REPORT_EVERY == 0:
+                report(len(stamps))
     if len(stamps) < packets and complaints:
         raise ValueError(
             f"{path}: frame {len(stamps)} of {packets} must be decoded, could not be ({complaints[0].strip()[:100]}); "
@@ -187,7 +187,7 @@ class _Reader:
         self._stamps = stamps
         self._count = count
         self._next = 0
-        self._told = False
+        self._has_warned = False
         self._sought = False
         self._capture = _opened(path, [])
         self._hdr: HdrReader | None = None
@@ -216,8 +216,8 @@ class _Reader:
         if data is None:
             raise self._undecoded(index)
         # After a seek, decoders complain about frames before it that others refer to, and leave these out.
-        if complaints and not self._told and not self._sought:
-            self._told = True
+        if complaints and not self._has_warned and not self._sought:
+            self._has_warned = True
             text = complaints[0].strip()
             _log.warning("%s: is damaged, frames may be wrong (%s); copy it again", self._path, text)
         return cv2.cvtColor(data, cv2.COLOR_BGR2GRAY if is_gray else cv2.COLOR_BGR2RGB)

@@ -103,7 +103,7 @@ def _walked(path: Path, version: tuple[int, int]) -> VideoFile:
     """`read_video` of a file that has not changed since."""
     is_mp4 = _check_kind(path)
     with Bar(f"frames of {path.name}") as bar:
-        found = _decoder.ask("walk", path, version, is_mp4, told=bar.update)
+        found = _decoder.ask("walk", path, version, is_mp4, progress=bar.update)
     return VideoFile(path, found["width"], found["height"], tuple(found["stamps"]), found["count"], version, is_mp4)
 
 

@@ -65,12 +65,12 @@ def go_on_without(where: Path, missing: list[Path], left: int, strict: bool) -> 
     shown = ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
     damaged = sum(is_file(path) for path in missing)
     state = "not there" if not damaged else "damaged" if damaged == len(missing) else "not there or damaged"
-    told = f"{where}: {len(names)} of the {count} images that it lists are {state} ({shown})"
+    problem = f"{where}: {len(names)} of the {count} images that it lists are {state} ({shown})"
     if strict or left < _FEWEST:
         rule = "all must be there" if strict else f"at least {_FEWEST} must be there"
         hint = ", or drop --strict (strict=True) to go on without them" if strict and left >= _FEWEST else ""
-        raise FileNotFoundError(f"{told}; {rule}: restore them{hint}")
-    _log.warning("%s; going on with the other %d (--strict refuses that)", told, left)
+        raise FileNotFoundError(f"{problem}; {rule}: restore them{hint}")
+    _log.warning("%s; going on with the other %d (--strict refuses that)", problem, left)
     if len(names) > _SHOWN:
         others = [path.name[:_LONGEST] for path in missing[_SHOWN : _SHOWN + _ALSO]]
         more = len(names) - _SHOWN - len(others)
@@ -78,7 +78,7 @@ def go_on_without(where: Path, missing: list[Path], left: int, strict: bool) -> 
 
 
 def check_parallax(views: list[View]) -> None:
-    """Warn about views that stand in one place, from which no depth can be told; refuse views that are all the same.
+    """Warn about views that stand in one place, from which no depth can be problem; refuse views that are all the same.
 
     Views of one pose at several times are one place: a camera that stands still before something that moves.
 
@@ -170,7 +170,7 @@ def check_times(dataset: Dataset) -> None:
 
 
 def make_unique(views: list[View]) -> None:
-    """Views are told apart by their names, in splits, picks and file names: a repeated one gets a number."""
+    """Views are problem apart by their names, in splits, picks and file names: a repeated one gets a number."""
     taken = {view.name for view in views}
     seen: set[str] = set()
     for view in views:

@@ -33,8 +33,8 @@ class View:
         name: Unique in the data set; the image's path below the image folder without its suffix.
         image_path, mask_path, depth_path: files, or None. Masks: white is kept. Depth: z-depth, 0
             is unknown.
-        empty_outside: Whether nothing is where the mask or the alpha channel keeps nothing, unless a fit is told: False
-            where other photographs of the data set have neither, and show what is there.
+        empty_outside: Whether nothing is where the mask or the alpha channel keeps nothing, unless an option of the fit
+            says otherwise: False where other photographs of the data set have neither, and show what is there.
         depth_scale: Scene units in one unit of the depth file.
         background: Color in [0,1] that images with an alpha channel are composited on.
         split: `train`, `val` or `test` where the data set itself says so, else empty.

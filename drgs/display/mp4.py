@@ -122,7 +122,7 @@ class Mp4:
 
     def _failure(self, problem: Exception) -> OSError:
         """The error of the path, in a line."""
-        told = " ".join(str(problem).split()) or type(problem).__name__
+        text = " ".join(str(problem).split()) or type(problem).__name__
         return OSError(
-            f"{self.path}: must be written, got: {told}; free some space, choose another folder, or use webm"
+            f"{self.path}: must be written, got: {text}; free some space, choose another folder, or use webm"
         )

@@ -44,7 +44,7 @@ _DECADES = 3.0  # decades that are told apart by color, at most
 _WEBM_SEGMENT = bytes.fromhex("18538067")  # id of what holds all of a WebM file
 _WEBM_HEAD = 1024  # bytes of the file within which that begins
 _NAME = 100  # bytes of a view's name in the name of a file
-_JPEG_QUALITY = 95
+_JPEG_QUALITY = 95  # of 100
 _XMP = b"http://ns.adobe.com/xap/1.0/\0"
 _PANORAMA = (
     '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'

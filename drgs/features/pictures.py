@@ -19,7 +19,7 @@ __all__ = ["NO_LABEL", "FeatureColors", "label_colors", "label_picture", "mask_p
 
 NO_LABEL = (40, 40, 40)
 """Color of pixels without a label."""
-_PERCENTILES = 1.0, 99.0
+_PERCENTILES = 1.0, 99.0  # of each component, which become 0 and 255: outliers do not take the range
 _ROWS = 5000  # samples of a basis: 20 MB of 512 channels in float64
 _INK = (235, 235, 235)
 _BACK = (18, 18, 18)

@@ -28,7 +28,7 @@ SCORE_DEFINITIONS = {
     ),
     "iou": "intersection over union of each class over all images; none where the reference does not have the class",
 }
-_TOP = 7
+_TOP = 7  # labels, Feature 3DGS's own number
 _CHUNK = 1 << 22  # numbers that a step holds: 16 MB of float32, 8,192 pixels of 512 channels
 
 
@@ -162,7 +162,7 @@ def cosines(features: torch.Tensor, vectors: torch.Tensor, decoder: Decoder | No
     if decoder is not None:
         _check_width("cosines", features, decoder.width)
     parts = []
-    with torch.no_grad():  # what is asked is what is so, not how it would change
+    with torch.no_grad():  # values alone: cosines are shown, not differentiated
         for chunk in _chunks(features, max(channels, *rows.shape)):
             decoded = chunk if decoder is None else decoder(chunk.to(decoder.matrix)).cpu().float()
             _check_finite("cosines", decoded)

@@ -16,7 +16,7 @@ _MASKED_CONTRAST = 0.002  # a third of COLMAP's: an object alone has few feature
 _CRASHES = (signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGABRT)
 
 
-def extract_features(path: Path, names: list[str], options: dict[str, Any], tell: Any) -> int | None:
+def extract_features(path: Path, names: list[str], options: dict[str, Any], report: Any) -> int | None:
     """SIFT features of some images into a COLMAP database.
 
     Args:
@@ -56,7 +56,7 @@ def extract_features(path: Path, names: list[str], options: dict[str, Any], tell
         return max(found.camera_id for found in handle.read_all_cameras())
 
 
-def ready(path: Path, tell: Any) -> bool:
+def ready(path: Path, report: Any) -> bool:
     """That the process has started."""
     return True
 

@@ -193,8 +193,8 @@ def fill(
         photographs, videos, most, progress: The arguments of `gather`.
         command: Name of the command, for frames.json.
     """
-    tell = progress or (lambda stage, done, total: None)
-    picked = _picked(videos, most, tell) if videos else []
+    report = progress or (lambda stage, done, total: None)
+    picked = _picked(videos, most, report) if videos else []
     folder.mkdir()
     names = list[str]()
     for path in photographs:
@@ -204,7 +204,7 @@ def fill(
     total = sum(len(one.frames) for one in picked)
     for video, stem, one in zip(videos, _stems(videos), picked, strict=True):
         for frame in one.frames:
-            tell("frames", len(rows), total)
+            report("frames", len(rows), total)
             file = _free_name(folder, Path(video.resolve().parent.name) / f"{stem}_{frame.frame.index:06d}.jpg")
             pixels = np.ascontiguousarray(frame.frame.read()[..., ::-1])
             data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
@@ -291,13 +291,13 @@ def _video_row(video: Path, picked: Picked) -> dict[str, Any]:
     return row | {"looks": picked.looks, "wanted": picked.wanted, "frames": len(picked.frames)}
 
 
-def _picked(videos: Sequence[Path], most: int, tell: Callable[[str, int, int], None]) -> list[Picked]:
+def _picked(videos: Sequence[Path], most: int, report: Callable[[str, int, int], None]) -> list[Picked]:
     """Frames of each video; of several, as many of each as its share of those that are wanted."""
     if most < max(1, len(videos)):
         raise ValueError(f"frames: must be at least one of each video, {len(videos)}, got {most}; ask for more")
     found = []
     for video in videos:
-        found.append(examine(video, lambda done, total, video=video: tell(f"looking at {video.name}", done, total)))
+        found.append(examine(video, lambda done, total, video=video: report(f"looking at {video.name}", done, total)))
     wanted = [min(one.wanted, most) for one in found]
     shares = wanted
     if sum(wanted) > most:  # one of each, and the rest by what is wanted

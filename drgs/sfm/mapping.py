@@ -172,7 +172,7 @@ def _followed(folder: Path, progress: MappingProgress) -> Iterator[None]:
             is_last = is_over.wait(_EVERY)
             # The log keeps lines back for half a minute, until its file is closed: another one takes its place.
             log.set_log_destination(log.Level.INFO, "" if is_last else str(folder / f"log.{number + 1}."))
-            with contextlib.suppress(OSError):  # without the log it is told how long it takes, not what is being done
+            with contextlib.suppress(OSError):  # without the log only the time is reported, not what is being done
                 for file in folder.glob(f"log.{number}.*"):
                     for found in map(_LINE.match, file.read_bytes().splitlines()):
                         if found:

@@ -23,11 +23,11 @@ MAX_EXHAUSTIVE = 60
 """Photographs of which all pairs are matched by default."""
 MAX_EXHAUSTIVE_MASKED = 150
 """The same with masks: an object alone has a tenth of the features to compare."""
-_WINDOW = 10
+_WINDOW = 10  # next photographs that one is matched with: COLMAP's own sequential overlap
 _NARROW_WINDOW = 4  # beside those that appearance finds
 _NEAREST = 20  # by appearance
 _NEAREST_NEW = 30  # the same for photographs that come later, whose only way into the model these are
-_CENTERS = 64
+_CENTERS = 64  # of VLAD: 64 x 128 numbers describe a photograph
 _SAMPLE = 400  # features of a photograph that the centers are found from
 _ROUNDS = 12  # of k-means
 

@@ -37,11 +37,11 @@ __all__ = [
     "triangulated_points",
 ]
 
-_MIN_TRIANGULATED = 50
+_MIN_TRIANGULATED = 50  # points: fewer may be chance matches, and nothing is proposed beside them
 _ENOUGH = 2_000  # triangulated points that need no others beside them
-_MAX_RANDOM = 20_000
-_NEIGHBORS = 10
-_FEATURE_SIZE = 1600
+_MAX_RANDOM = 20_000  # points where nothing is known: density control moves them to where they are needed
+_NEIGHBORS = 10  # photographs that each one is matched with, the nearest by place and direction
+_FEATURE_SIZE = 1600  # pixels of the longer side that features are detected at, as for structure from motion
 _COMPARED = 20_000  # points of depth maps that photographs are compared by
 _SOME = 100  # photographs, at most, whose depth maps they are drawn from: every map is read once more to be compared
 _CELLS = 20  # cells along the longer side of a photograph, whose nearest point that it shows hides what is behind

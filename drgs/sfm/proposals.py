@@ -204,7 +204,7 @@ _SOME = 8  # photographs that say whether there is a background at all
 _WIDTH = 400  # pixels; averages of several are less noisy
 _DENIED = 0.1  # of the photographs that show a place, part that may deny what two have agreed about: edges are soft
 _ROUND = 50_000  # places at a time
-_ROUNDS = 40
+_ROUNDS = 40  # at most: 2 million places in all
 _FEWEST_FOUND = 100  # of all rounds; fewer say that silhouettes do not agree
 
 

@@ -30,12 +30,12 @@ _MOST_LOOKS = 6_000  # ten minutes; of longer videos they are further apart
 _CANDIDATES = 3  # frames of a look, at most, of which the sharpest is kept
 _SHARP_AT = 960  # pixels of the longer side at which sharpness is measured
 _WIDTH = 480  # the same of motion
-_CORNERS = 400
+_CORNERS = 400  # at most, that are tracked from look to look
 _FOCAL = 0.9  # of the longer side: phones have 0.7 to 1.1; a wrong one leaves a turn's motion of second order alone
 _PARALLAX = 0.01  # of the longer side, between two frames that are taken
 _MOTION = 0.12  # the same of all motion, where there is little parallax: such frames connect
 _TURN_STEP = 0.25  # the same within a turn, which is only to be bridged: three quarters are in both
-_FEWEST_TRACKS = 20
+_FEWEST_TRACKS = 20  # with fewer, motion and parallax are unknown
 _BLANK = 0.05  # frames a look where there is nothing to be tracked
 _BLURRED = 0.45  # of the sharpness that is usual near by
 _NEAR = 1.5  # seconds that are near by
@@ -201,7 +201,7 @@ def examine(path: Path, progress: Callable[[int, int], None] | None = None) -> E
     Raises:
         FileNotFoundError, ValueError: No video, or one that cannot be decoded.
     """
-    tell = progress or (lambda done, total: None)
+    report = progress or (lambda done, total: None)
     video = read_video(Path(path))
     times = np.array(video.stamps) / 1000.0 if video.stamps else np.arange(video.count) / 30.0
     times = times - times[0]
@@ -210,13 +210,13 @@ def examine(path: Path, progress: Callable[[int, int], None] | None = None) -> E
     looks = list[_Look]()
     before: np.ndarray | None = None
     for start in range(0, video.count, stride):
-        tell(start, video.count)
+        report(start, video.count)
         candidates = range(start, min(start + stride, video.count), math.ceil(stride / _CANDIDATES))
         sharpness, index, gray = _sharpest(video.path, candidates)
         motion, parallax, corners = (0.0, 0.0, _CORNERS) if before is None else _moved(before, gray)
         looks.append(_Look(index, float(times[index]), sharpness, motion, parallax, corners))
         before = gray
-    tell(video.count, video.count)
+    report(video.count, video.count)
     return ExaminedVideo(video, looks, 1.0 / rate if video.count > 1 else 0.0)
 
 
