@@ -20,7 +20,7 @@ from drgs.sfm import match_cache
 from drgs.sfm.guided import Matches
 from drgs.sfm.matching import nearby_pairs, sequential_pairs
 from drgs.sfm.points import added_points, initial_points, shared_points
-from drgs.sfm.proposals import points_beside
+from drgs.sfm.proposals import propose_near_triangulated
 
 cv2 = pytest.importorskip("cv2")
 WIDTH, HEIGHT = 320, 240
@@ -451,7 +451,7 @@ def test_guesses_are_as_far_away_as_what_is_beside_them(tmp_path, rng):
     depth = np.where(near, 2.0, 6.0)
     points = np.c_[(at - (150.5, 128.0)) / 300 * depth[:, None], depth]
     shown = np.stack([np.ones(60, bool), np.zeros(60, bool)])
-    found, colors = points_beside(views, points, shown, 1000, rng)
+    found, colors = propose_near_triangulated(views, points, shown, 1000, rng)
     pixels, z = camera.project(found)
     assert len(found) == len(colors) == 1000
     assert pixels[:, 1].min() >= 50

@@ -10,7 +10,7 @@ from drgs.cameras import Camera, intrinsics, look_at
 from drgs.data import View
 from drgs.sfm.guided import Triangulated
 from drgs.sfm.points import initial_points
-from drgs.sfm.proposals import Hull
+from drgs.sfm.proposals import VisualHull
 
 RADIUS = 1.0
 DISTANCE = 60.0
@@ -53,29 +53,29 @@ def test_points_are_where_the_ball_is(tmp_path, behind):
 
 def test_places_are_looked_at_in_all_photographs(tmp_path):
     """How many show a place, of those that none shows as empty; and that nothing is behind a camera."""
-    hull = Hull.of(around(tmp_path))
+    hull = VisualHull.of(around(tmp_path))
     places = np.array([[0, 0, 0], [0, 1.5, 0], [0, 9.0, 0], [0, 0.4 * DISTANCE, 2 * DISTANCE]])
-    assert hull.room(places).tolist() == [6, -1, 0, 1]
-    assert hull.is_denied(places).tolist() == [False, True, False, False]
+    assert hull.support(places).tolist() == [6, -1, 0, 1]
+    assert hull.is_contradicted(places).tolist() == [False, True, False, False]
     np.testing.assert_allclose(hull.colors(places[:1]), [(0.6, 0.5, 0.4)], atol=2 / 255)
     np.testing.assert_allclose(hull.center, 0, atol=1e-6)
 
 
 def test_edges_deny_nothing(tmp_path):
     """Each point of a surface is at the edge of some silhouette of many, and stays; what stands off goes."""
-    hull = Hull.of(around(tmp_path, count=60))
+    hull = VisualHull.of(around(tmp_path, count=60))
     way = np.random.default_rng(0).normal(size=(500, 3))
     surface = RADIUS * way / np.linalg.norm(way, axis=1, keepdims=True)
-    assert (hull.room(surface) < 0).mean() > 0.1  # a pixel of some photograph says so
-    assert not hull.is_denied(surface).any()
-    assert hull.is_denied(1.2 * surface).all()
+    assert (hull.support(surface) < 0).mean() > 0.1  # a pixel of some photograph says so
+    assert not hull.is_contradicted(surface).any()
+    assert hull.is_contradicted(1.2 * surface).all()
 
 
 def test_how_far_it_is_is_told(tmp_path):
     """Stages with what is done of them: many photographs take seconds."""
     told = []
     views = around(tmp_path)
-    hull = Hull.of(views, lambda *stage: told.append(stage))
+    hull = VisualHull.of(views, lambda *stage: told.append(stage))
     hull.points(100, np.random.default_rng(0), lambda *stage: told.append(stage))
     assert told[:7] == [("silhouettes", number, 6) for number in range(7)]
     assert told[-1] == ("room for points", 100, 100)
@@ -86,14 +86,14 @@ def test_nothing_is_said_where_photographs_do_not_tell(tmp_path):
     leave no room, and points are guessed as before.
     """
     views = around(tmp_path)
-    assert Hull.of(views) is not None
-    assert Hull.of(views[:2]) is None
-    assert Hull.of(around(tmp_path, behind=(0.5, 0.5, 0.5), ball=(0.0, 0.0, 0.0))) is not None
+    assert VisualHull.of(views) is not None
+    assert VisualHull.of(views[:2]) is None
+    assert VisualHull.of(around(tmp_path, behind=(0.5, 0.5, 0.5), ball=(0.0, 0.0, 0.0))) is not None
     for view in views:
         view.background = (0.3, 0.0, 0.0)
-    assert Hull.of(views) is None
+    assert VisualHull.of(views) is None
     apart = around(tmp_path, away=SIZE / 4 + 4)
-    assert Hull.of(apart).points(1000, np.random.default_rng(0)) is None
+    assert VisualHull.of(apart).points(1000, np.random.default_rng(0)) is None
     source = initial_points(apart, max_points=100)[2]
     assert source.startswith("random where 6 cameras look")
 
@@ -103,10 +103,10 @@ def test_views_of_several_times_say_nothing(tmp_path):
     views = around(tmp_path)
     for index, view in enumerate(views):
         view.camera = dataclasses.replace(view.camera, time=float(index % 2))
-    assert Hull.of(views) is None
+    assert VisualHull.of(views) is None
     for view in views:
         view.camera = dataclasses.replace(view.camera, time=0.5)
-    assert Hull.of(views) is not None
+    assert VisualHull.of(views) is not None
 
 
 def test_matches_that_a_third_photograph_denies_are_left_out(tmp_path, monkeypatch):

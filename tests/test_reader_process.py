@@ -105,7 +105,7 @@ def test_an_interrupt_leaves_no_answer_for_the_next_question(child):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        child.ask("count", Path("a"), 3, told=interrupt)
+        child.ask("count", Path("a"), 3, progress=interrupt)
     assert child.ask("zeros", Path("a"), [2]).tolist() == [0, 1]
 
 

@@ -14,7 +14,7 @@ from test_data_points import HEIGHT, WIDTH, plane_views, render_plane, texture
 
 from drgs.cameras import Camera, intrinsics, look_at
 from drgs.data import load
-from drgs.sfm.mapping import _gaps, runs
+from drgs.sfm.mapping import _gaps, name_ranges
 from drgs.sfm.matching import FeatureOptions, extract
 from drgs.sfm.photo_files import photo_fault
 from drgs.sfm.reconstruction import SfmOptions, run_sfm
@@ -287,8 +287,8 @@ def test_a_name_that_leaves_no_room_for_its_mask(masked, tmp_path, capfd):
 def test_names_in_words():
     """However many photographs are left out, a line stays a line."""
     names = [f"{i:04d}" for i in range(100)]
-    assert runs(names[3:9] + names[20:22], names) == "0003 to 0008, 0020, 0021"
-    assert runs(names[::2], names).endswith("0020, 0022, and 38 more")
+    assert name_ranges(names[3:9] + names[20:22], names) == "0003 to 0008, 0020, 0021"
+    assert name_ranges(names[::2], names).endswith("0020, 0022, and 38 more")
     found = _gaps(names, {"0010", "0011"}, [["0013"], ["0000", "0001"], ["0050"]], {("0050", "0011"): 7})
     assert found == [("0011", "0050", 7), ("0011", "0013", 0), ("0010", "0001", 0)]
 

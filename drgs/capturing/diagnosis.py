@@ -20,7 +20,7 @@ from drgs.display.progress import Bar
 from drgs.fitting.exposure import estimate_exposure
 from drgs.fitting.frames import load_frames
 from drgs.sfm.findings import Finding
-from drgs.sfm.mapping import runs
+from drgs.sfm.mapping import name_ranges
 from drgs.sfm.points import shared_points
 
 if TYPE_CHECKING:
@@ -117,7 +117,8 @@ def of_poses(dataset: Dataset, names: Sequence[str], summary: SfmSummary | None 
         findings.append(
             Finding(
                 "poses",
-                f"{len(summary.missing)} of {summary.total} photographs have no pose: {runs(summary.missing, names)}",
+                f"{len(summary.missing)} of {summary.total} photographs have no pose: "
+                f"{name_ranges(summary.missing, names)}",
                 f"take {advice[0]}" if advice and advice[0].startswith("photos") else (advice or ["take more"])[0],
             )
         )

@@ -36,7 +36,7 @@ from drgs.io.atomic import is_full
 from drgs.io.outputs import lock_folder
 from drgs.io.run import Run
 from drgs.report.write import FILE as REPORT
-from drgs.sfm.image_folder import gather, named_files, usable_files
+from drgs.sfm.image_folder import make_image_folder, named_files, usable_files
 from drgs.sharing.scene import FILE as PAGE
 from drgs.sharing.scene import scene_of_run
 from drgs.sharing.write import write_page
@@ -187,7 +187,7 @@ def _gather(capture: Capture, photographs: list[Path], videos: list[Path]) -> Ou
             capture.say(f"plan for {duration(budget)}: at most {frames} frames of videos, for their poses")
     with lock_folder(capture.folder, "capture") as held, Bar("photos") as bar:
         held.remove(capture.photos)  # of a command that ended before it could say so
-        gathered = gather(photographs, videos, held, capture.photos.name, frames, bar.stage)
+        gathered = make_image_folder(photographs, videos, held, capture.photos.name, frames, bar.stage)
     names = [path.name for path in list_images(gathered.folder)]
     if len(names) < _FEWEST and not capture.is_added:
         raise ValueError(

@@ -20,7 +20,7 @@ from drgs.data.replica import POSES
 from drgs.data.semantics import Semantics
 from drgs.data.sidecars import attach
 from drgs.data.videos import list_videos
-from drgs.data.view_checks import check_times, count_once, note_partial_masks
+from drgs.data.view_checks import check_times, drop_duplicates, mark_partial_masks
 from drgs.data.views import View
 from drgs.guards.registry import Registry
 from drgs.io.foreign import refuse_foreign
@@ -142,10 +142,10 @@ def load(
     if test_cameras is not None:
         dataset.test_cameras = tuple(test_cameras)
     apply_held_out(dataset)
-    count_once(dataset)
+    drop_duplicates(dataset)
     dataset.split()  # refuses numbers that cannot be
     check_times(dataset)
-    note_partial_masks(dataset.views, lazy)
+    mark_partial_masks(dataset.views, lazy)
     if semantics:
         attach(dataset, lazy)
     return dataset

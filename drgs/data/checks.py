@@ -28,7 +28,7 @@ __all__ = [
     "check_npz",
     "file_inside",
     "inverse_pose",
-    "names_of_here",
+    "local_names",
     "read_npy",
     "read_npz",
     "read_text",
@@ -66,7 +66,7 @@ def file_inside(folder: Path, name: str, where: str) -> Path:
     return folder / name
 
 
-def names_of_here(
+def local_names(
     where: str, folder: Path, names: list[str], is_there: Callable[[Path], bool] = is_file
 ) -> Callable[[str], str] | None:
     """What makes names of files of another machine, or of Windows, relative to a folder of this one.

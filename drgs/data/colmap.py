@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from drgs.data.checks import file_inside, names_of_here
+from drgs.data.checks import file_inside, local_names
 from drgs.data.colmap_model import MODEL_SUFFIXES, model_camera, model_points, model_suffix, read_model
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
@@ -18,7 +18,7 @@ from drgs.data.images import IMAGE_SUFFIXES, is_damaged
 from drgs.data.masks import mask_file
 from drgs.data.point_ply import read_point_ply
 from drgs.data.resampling import fit_to_image
-from drgs.data.view_checks import go_on_without, make_unique
+from drgs.data.view_checks import make_names_unique, report_missing_images
 from drgs.data.views import View
 from drgs.io.foreign import is_file
 
@@ -62,7 +62,7 @@ def load_colmap(
     by_id = _add_views(dataset, reconstruction, model, lazy)
     for view in dataset.views:
         view.background = background
-    go_on_without(model, [view.image_path for view in dataset.absent], len(dataset.views), strict)
+    report_missing_images(model, [view.image_path for view in dataset.absent], len(dataset.views), strict)
     xyz, colors = read_point_ply(ply) if ply else model_points(reconstruction, model)
     if len(xyz):
         dataset.points, dataset.colors = xyz, colors
@@ -84,11 +84,11 @@ def _add_views(dataset: Dataset, reconstruction: Any, model: Path, lazy: bool) -
         raise ValueError(f"{model}: must hold at least one registered image, got none; run `drgs sfm` again")
     names = [reconstruction.images[image_id].name for image_id in registered]
     path, folder = dataset.path, image_folder(dataset.path, model, names)
-    of_here = names_of_here(str(model), folder, names)
+    localize = local_names(str(model), folder, names)
     by_id = {}
     for index, image_id in enumerate(registered):
         image = reconstruction.images[image_id]
-        name = of_here(image.name) if of_here else image.name
+        name = localize(image.name) if localize else image.name
         file = file_inside(folder, name, f"{model}: image {index}")
         name = os.path.relpath(file, folder)  # without ..
         where = f"{model}: image {index} ({name})"
@@ -99,7 +99,7 @@ def _add_views(dataset: Dataset, reconstruction: Any, model: Path, lazy: bool) -
         view.camera = fit_to_image(model_camera(reconstruction, image, where), file, where, lazy)
         view.mask_path = mask_file((path if folder == path else folder.parent) / "masks", name)
         dataset.views.append(view)
-    make_unique(list(by_id.values()))
+    make_names_unique(list(by_id.values()))
     return by_id
 
 

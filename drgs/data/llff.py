@@ -15,7 +15,7 @@ from drgs.data.formats import Format
 from drgs.data.images import list_images
 from drgs.data.resampling import fit_to_image
 from drgs.data.videos import list_videos
-from drgs.data.view_checks import make_unique
+from drgs.data.view_checks import make_names_unique
 from drgs.data.views import View
 from drgs.guards.camera_checks import check_handedness
 
@@ -65,7 +65,7 @@ def load_llff(path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.
                 is_checked=not lazy,
             )
         )
-    make_unique(views)
+    make_names_unique(views)
     return Dataset(path, "llff", views)
 
 

@@ -9,9 +9,10 @@ import numpy as np
 from drgs.data.images import IMAGE_SUFFIXES, read_image, unit_range
 from drgs.io.foreign import is_file
 
-__all__ = ["mask_file", "read_mask"]
+__all__ = ["MASK_KEEP", "mask_file", "read_mask"]
 
-_KEPT = 0.5  # share of the largest number from which on a pixel of a JPEG is white
+MASK_KEEP = 0.5
+"""Weight in a mask from which on a pixel counts."""
 
 
 def mask_file(masks: Path, name: str) -> Path | None:
@@ -33,6 +34,6 @@ def read_mask(path: Path) -> np.ndarray:
     if raw.ndim == 3:
         raw = raw[..., 3] if raw.shape[2] == 4 else raw[..., 0]
     if path.suffix.lower() in (".jpg", ".jpeg"):
-        return (raw >= _KEPT * np.iinfo(raw.dtype).max).astype(np.float32)
+        return (raw >= MASK_KEEP * np.iinfo(raw.dtype).max).astype(np.float32)
     # Masks stored as 0 and 1 in 8 bits would otherwise be nearly black.
     return raw.astype(np.float32) if raw.max() <= 1 else unit_range(raw, path)

@@ -14,7 +14,7 @@ from drgs.data.dataset import Dataset
 from drgs.data.images import image_size
 from drgs.data.resampling import fit_to_image, resized_to
 from drgs.data.videos import VideoFile, VideoFrame
-from drgs.data.view_checks import go_on_without
+from drgs.data.view_checks import report_missing_images
 from drgs.data.views import View
 from drgs.io.foreign import is_file
 
@@ -110,7 +110,7 @@ def synchronous(
                     f"{view.image_path}: must be {size[0]}x{size[1]} pixels as the other frames of camera "
                     f"{recording.name}, got {found[0]}x{found[1]}; export the frames again"
                 )
-    go_on_without(where, [view.image_path for view in dataset.absent], len(dataset.views), strict)
+    report_missing_images(where, [view.image_path for view in dataset.absent], len(dataset.views), strict)
     dataset.frames = tuple(numbers)
     if len(recordings) > 1 and not any(recording.split for recording in recordings):
         dataset.test_cameras = (recordings[0].name,)

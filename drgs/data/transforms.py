@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera, c2w_from_opengl, intrinsics
-from drgs.data.checks import check_last_row, file_inside, inverse_pose, names_of_here, repaired_pose
+from drgs.data.checks import check_last_row, file_inside, inverse_pose, local_names, repaired_pose
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
 from drgs.data.images import IMAGE_SUFFIXES, image_size, is_damaged
 from drgs.data.point_ply import read_point_ply
 from drgs.data.resampling import fit_to_image
 from drgs.data.synchronous import CAMERA_NAME
-from drgs.data.view_checks import go_on_without, make_unique
+from drgs.data.view_checks import make_names_unique, report_missing_images
 from drgs.data.views import View
 from drgs.guards.camera_checks import check_handedness
 from drgs.io.foreign import is_file
@@ -88,7 +88,7 @@ def load_transforms(
     read = {file: _frames(file) for file in files}
     dataset = Dataset(path, "transforms", [])
     rows = _listed(read, dataset, lazy)
-    go_on_without(path, [view.image_path for view in dataset.absent], len(dataset.views), strict)
+    report_missing_images(path, [view.image_path for view in dataset.absent], len(dataset.views), strict)
     _name_cameras(dataset, [frame.get("time") for data in read.values() for frame in data["frames"]])
     first = _FirstImage(dataset, test_every, test_offset, test_cameras) if lazy else None
     for file, data in read.items():
@@ -163,7 +163,7 @@ def _listed(read: dict[Path, dict], dataset: Dataset, lazy: bool) -> dict[Path, 
             is_there = image is not None and (lazy or not is_damaged(image))
             (dataset.views if is_there else dataset.absent).append(view)
             rows[file].append(view if is_there else None)
-    make_unique(listed)
+    make_names_unique(listed)
     return rows
 
 
@@ -185,14 +185,14 @@ def _frames(file: Path) -> dict:
 def _with_names_of_here(file: Path, data: dict) -> dict:
     """The same with names of files of another machine or of Windows made relative to the file's folder."""
     listed = [frame["file_path"] for frame in data["frames"]]
-    of_here = names_of_here(str(file), file.parent, listed, lambda path: _image_file(path) is not None)
-    if of_here is None:
+    localize = local_names(str(file), file.parent, listed, lambda path: _image_file(path) is not None)
+    if localize is None:
         return data
 
     def renamed(value: Any) -> Any:
         if isinstance(value, list):
             return [renamed(item) for item in value]
-        return of_here(value) if isinstance(value, str) else value
+        return localize(value) if isinstance(value, str) else value
 
     frames = [frame | {key: renamed(frame[key]) for key in _FILE_KEYS if key in frame} for frame in data["frames"]]
     others = ("ply_file_path", *(f"{split}_filenames" for split in _SPLITS))

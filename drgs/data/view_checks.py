@@ -24,11 +24,11 @@ __all__ = [
     "check_cameras",
     "check_parallax",
     "check_times",
-    "count_once",
+    "drop_duplicates",
     "default_background",
-    "go_on_without",
-    "make_unique",
-    "note_partial_masks",
+    "report_missing_images",
+    "make_names_unique",
+    "mark_partial_masks",
 ]
 
 # of cameras that film what moves (docs/dynamic-data.md, Layouts)
@@ -47,7 +47,7 @@ _ALIKE = 0.05  # largest difference of these, white being 1: compression stays b
 _log = logging.getLogger(__name__)
 
 
-def go_on_without(where: Path, missing: list[Path], left: int, strict: bool) -> None:
+def report_missing_images(where: Path, missing: list[Path], left: int, strict: bool) -> None:
     """Say which images of a data set are not there, or damaged, or refuse the data set.
 
     Args:
@@ -169,7 +169,7 @@ def check_times(dataset: Dataset) -> None:
         )
 
 
-def make_unique(views: list[View]) -> None:
+def make_names_unique(views: list[View]) -> None:
     """Views are problem apart by their names, in splits, picks and file names: a repeated one gets a number."""
     taken = {view.name for view in views}
     seen: set[str] = set()
@@ -181,7 +181,7 @@ def make_unique(views: list[View]) -> None:
         seen.add(view.name)
 
 
-def count_once(dataset: Dataset) -> None:
+def drop_duplicates(dataset: Dataset) -> None:
     """Leave out photographs that are listed again, under the same name or another one, and say so.
 
     Two views are of one photograph if they have one file (or links to it), nearly one pose and files of the same bytes
@@ -266,7 +266,7 @@ def _look_alike(one: Path, other: Path) -> bool:
     return bool(np.abs(small[0] - small[1]).max() <= _ALIKE)
 
 
-def note_partial_masks(views: list[View], lazy: bool) -> None:
+def mark_partial_masks(views: list[View], lazy: bool) -> None:
     """Set `View.empty_outside` to False where some views alone are cut out, by a mask file or an alpha channel.
 
     The others show what is outside: it is not empty.

@@ -27,7 +27,7 @@ from drgs.fitting.rows import GaussianRows
 from drgs.fitting.trainer import Trainer
 from drgs.integrator import render
 from drgs.io.json_files import check_json
-from drgs.sfm.proposals import points_along_rays, subset
+from drgs.sfm.proposals import propose_along_rays, random_subset
 from drgs.sizes import at_most
 
 __all__ = ["OnlineFit"]
@@ -90,7 +90,7 @@ class OnlineFit:
         cameras = [one.camera.undistorted() for one in self._waiting]
         images = [lambda one=one: one.image().numpy() for one in self._waiting]
         most = min(self.config.density.max_gaussians, _GUESSED)
-        points, colors = points_along_rays(cameras, images, [None] * len(cameras), most, self._rng)
+        points, colors = propose_along_rays(cameras, images, [None] * len(cameras), most, self._rng)
         return self._begin(points, colors, dense=False)
 
     def drop(self, name: str) -> None:
@@ -205,7 +205,7 @@ class OnlineFit:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Points of wanted pixels whose depth is known, (P, 3), at most so many, and their colors (P, 3)."""
         known = np.flatnonzero(wanted & np.isfinite(depth) & (depth > 0))
-        chosen = known[subset(len(known), most, self._rng)]
+        chosen = known[random_subset(len(known), most, self._rng)]
         camera = frame.camera.resized(depth.shape[1], depth.shape[0])
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of pixels that no ray belongs to, whose depth is unknown

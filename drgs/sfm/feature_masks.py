@@ -8,17 +8,16 @@ from pathlib import Path
 import numpy as np
 
 from drgs.data.images import image_size, read_image, unit_range
-from drgs.data.masks import mask_file, read_mask
+from drgs.data.masks import MASK_KEEP, mask_file, read_mask
 from drgs.data.resampling import nearest_resized
 
-__all__ = ["ALPHA_MASKS", "feature_mask", "masked_photo", "masks_of"]
+__all__ = ["ALPHA_MASKS", "feature_mask", "masked_photo", "find_masks"]
 
 ALPHA_MASKS = "alpha"  # in place of a folder: the photographs' own alpha channel
-_KEPT = 0.5  # weight from which on a pixel may hold a feature
 _SHOWN = 3  # photographs without a mask that a message names
 
 
-def masks_of(photos: list[Path], masks: str | os.PathLike) -> list[Path]:
+def find_masks(photos: list[Path], masks: str | os.PathLike) -> list[Path]:
     """Where the mask of each photograph is: its mask in a folder, or, of `"alpha"`, the photograph itself.
 
     No mask is decoded.
@@ -73,7 +72,7 @@ def feature_mask(photo: Path, mask: Path) -> np.ndarray:
         weights = unit_range(raw[..., 3], photo)
     else:
         weights = nearest_resized(read_mask(mask), image_size(photo), mask)
-    kept = weights >= _KEPT
+    kept = weights >= MASK_KEEP
     if not kept.any():
         raise ValueError(
             f"{mask}: must keep something of its photo (white), is black all over; draw it again, or move the photo "

@@ -26,9 +26,9 @@ from drgs.sfm.video_frames import Picked, examine
 
 __all__ = [
     "FRAMES",
-    "Gathered",
-    "fill",
-    "gather",
+    "ImageFolder",
+    "fill_image_folder",
+    "make_image_folder",
     "joined_frames",
     "named_files",
     "recorded_frames",
@@ -45,7 +45,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True)
-class Gathered:
+class ImageFolder:
     """What was put into a folder.
 
     Attributes:
@@ -84,7 +84,7 @@ def named_files(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
                     f"{path}: must hold photographs or videos, holds none ({', '.join(_SUFFIXES)}); check the path"
                 )
             photographs += found[0]
-            videos += [video for video in found[1] if not _is_moment(video, found[0])]
+            videos += [video for video in found[1] if not _is_live_photo(video, found[0])]
         elif not path.exists() and not path.is_symlink():
             raise FileNotFoundError(f"{path}: must be photographs or a video, found none; check the path")
         elif path.suffix.lower() in IMAGE_SUFFIXES:
@@ -141,7 +141,7 @@ def _once(files: Sequence[Path]) -> list[Path]:
     return list(first.values())
 
 
-def _is_moment(video: Path, photographs: Sequence[Path]) -> bool:
+def _is_live_photo(video: Path, photographs: Sequence[Path]) -> bool:
     """Whether a video is the seconds around a photograph, which phones keep beside it under its name."""
     is_one = any(photograph.stem == video.stem for photograph in photographs)
     if is_one:
@@ -149,14 +149,14 @@ def _is_moment(video: Path, photographs: Sequence[Path]) -> bool:
     return is_one
 
 
-def gather(
+def make_image_folder(
     photographs: Sequence[Path],
     videos: Sequence[Path],
     output: LockedFolder,
     name: str = "photos",
     most: int = 150,
     progress: Callable[[str, int, int], None] | None = None,
-) -> Gathered:
+) -> ImageFolder:
     """Links to photographs, and frames of videos as JPEG, in a folder that is complete or not there at all.
 
     Photographs keep their names; where two have the same one, the name of the folder comes before that of the second.
@@ -173,24 +173,24 @@ def gather(
     """
     with temporary_folder("photos", output.path) as unfinished:
         made = unfinished / name
-        gathered = fill(made, photographs, videos, output.command, most, progress)
+        images = fill_image_folder(made, photographs, videos, output.command, most, progress)
         output.put(made, name)
-    return dataclasses.replace(gathered, folder=output.path / name)
+    return dataclasses.replace(images, folder=output.path / name)
 
 
-def fill(
+def fill_image_folder(
     folder: Path,
     photographs: Sequence[Path],
     videos: Sequence[Path],
     command: str,
     most: int = 150,
     progress: Callable[[str, int, int], None] | None = None,
-) -> Gathered:
-    """Make the folder that `gather` puts in its place.
+) -> ImageFolder:
+    """Make the folder that `make_image_folder` puts in its place.
 
     Args:
         folder: The new folder; there must be none.
-        photographs, videos, most, progress: The arguments of `gather`.
+        photographs, videos, most, progress: The arguments of `make_image_folder`.
         command: Name of the command, for frames.json.
     """
     report = progress or (lambda stage, done, total: None)
@@ -222,7 +222,7 @@ def fill(
     listed = joined_frames(listed if videos else None, photographs, names, command)
     if listed is not None:
         write_frames(folder / FRAMES, listed)
-    return Gathered(folder, len(photographs), len(rows), findings)
+    return ImageFolder(folder, len(photographs), len(rows), findings)
 
 
 def write_frames(path: Path, listed: dict[str, Any]) -> None:

@@ -21,7 +21,7 @@ from drgs.io.atomic import check_room
 from drgs.runtime import thread_count
 from drgs.sfm.matching import Progress
 
-__all__ = ["MappingProgress", "PhotoGroups", "map_photos", "posed_names", "runs", "write_model"]
+__all__ = ["MappingProgress", "PhotoGroups", "map_photos", "posed_names", "name_ranges", "write_model"]
 
 _EVERY = 0.25  # seconds between two looks at the log
 _FEW_FEATURES = 200  # with fewer of its own a photograph is blurred, dark or blank, or its mask is small
@@ -217,7 +217,7 @@ class PhotoGroups:
         others = sorted(others, key=len, reverse=True)
         placed = kept.union(*others)
         alone = tuple(name for name in names if name not in placed)
-        features, matches = _evidence(database)
+        features, matches = _counts_in(database)
         lost = [[name for name in names if name in other - kept] for other in others] + [[name] for name in alone]
         gaps = _gaps(names, kept, [group for group in lost if group], matches)
         return PhotoGroups(
@@ -243,14 +243,14 @@ class PhotoGroups:
             count = len(self.others) + 1
             found.append(
                 f"the photos fell apart into {count} models; the largest was kept, with {len(self.kept)} photos: "
-                f"{runs(self.kept, names)}"
+                f"{name_ranges(self.kept, names)}"
             )
             for number, other in enumerate(self.others, 2):
                 shared = len(set(other) & set(self.kept))
                 also = f", {shared} of them also in the kept one" if shared else ""
-                found.append(f"model {number}, left out, has {len(other)} photos{also}: {runs(other, names)}")
+                found.append(f"model {number}, left out, has {len(other)} photos{also}: {name_ranges(other, names)}")
         if self.alone:
-            found.append(f"in no model: {len(self.alone)} photos: {runs(self.alone, names)}")
+            found.append(f"in no model: {len(self.alone)} photos: {name_ranges(self.alone, names)}")
         return found + [f"what would help: {advice}" for advice in self._advice(is_masked, is_partial)]
 
     def _advice(self, is_masked: bool, is_partial: bool) -> Iterator[str]:
@@ -270,7 +270,7 @@ class PhotoGroups:
             yield "--masks, if the object was turned or moved between photos while its background stood still"
 
 
-def _evidence(database: Path) -> tuple[dict[str, int], dict[tuple[str, str], int]]:
+def _counts_in(database: Path) -> tuple[dict[str, int], dict[tuple[str, str], int]]:
     """Number of features by photograph, and of verified matches by pair."""
     from drgs.data.colmap_bindings import opened_database, pycolmap
 
@@ -318,7 +318,7 @@ def _around(ordered: Sequence[int], at: int) -> Sequence[int]:
     return ordered[max(0, right - 1) : right + 1]
 
 
-def runs(some: Sequence[str], names: Sequence[str]) -> str:
+def name_ranges(some: Sequence[str], names: Sequence[str]) -> str:
     """Names in words: those that follow each other in the list of all names as first and last."""
     place = {name: index for index, name in enumerate(names)}
     stretches: list[list[str]] = []

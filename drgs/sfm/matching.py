@@ -26,7 +26,7 @@ __all__ = [
     "quiet",
     "sequential_pairs",
     "start_extraction",
-    "state_focal_lengths",
+    "restore_focal_lengths",
 ]
 
 Progress = Callable[[str, int, int], None]
@@ -113,7 +113,7 @@ def start_extraction() -> None:
     _extractor.ask("ready", Path())
 
 
-def state_focal_lengths(database: Path, folder: Path) -> None:
+def restore_focal_lengths(database: Path, folder: Path) -> None:
     """Give cameras the focal lengths that the EXIF of photographs states, where features came from copies without it.
 
     Args:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.data.dataset import Dataset
+from drgs.data.masks import MASK_KEEP
 from drgs.data.views import View
 from drgs.display.progress import Bar
 from drgs.sfm.guided import Matches, Triangulated, detect
@@ -16,13 +17,12 @@ from drgs.sfm.match_cache import cached
 from drgs.sfm.matching import nearby_pairs
 from drgs.sfm.proposals import (
     FEWEST,
-    MASK_KEEP,
-    Hull,
+    VisualHull,
     back_project,
-    empty_share,
-    points_anywhere,
-    points_beside,
-    subset,
+    propose_in_view,
+    propose_near_triangulated,
+    random_subset,
+    uncovered_share,
 )
 
 if TYPE_CHECKING:
@@ -98,11 +98,11 @@ def initial_points(
             source = f"triangulated from {len(views)} given poses, {count} points"
             return points, colors, f"{source}; {len(points)} with proposed ones where there are none"
         tried = f" (triangulation gave {count})"
-        hull = Hull.of(views, progress)
+        hull = VisualHull.of(views, progress)
         room = None if hull is None else hull.points(min(max_points, _MAX_RANDOM), rng, progress)
         if room is not None:
             return *room, f"random where none of {len(views)} cameras sees the background, {len(room[0])} points{tried}"
-    points, colors = points_anywhere(views, min(max_points, _MAX_RANDOM), rng)
+    points, colors = propose_in_view(views, min(max_points, _MAX_RANDOM), rng)
     return points, colors, f"random where {len(views)} cameras look, {len(points)} points{tried}"
 
 
@@ -116,10 +116,10 @@ def _own_points(
     if train and data.tracks is not None:
         tracked, shown = _tracked(*data.tracks, train)
         if len(tracked) >= _MIN_TRIANGULATED:
-            proposer = _Proposer(train, Hull.of(train, progress), max_points, rng, progress)
+            proposer = _Proposer(train, VisualHull.of(train, progress), max_points, rng, progress)
             points, colors = proposer.completed(points, colors, tracked, shown)
             return points, colors, f"{data.point_source}; {len(points)} with proposed ones where there are none"
-    keep = subset(len(points), max_points, rng)
+    keep = random_subset(len(points), max_points, rng)
     note = "" if len(keep) == len(points) else f", {len(keep)} kept"
     return points[keep], colors[keep], f"{data.point_source}{note}"
 
@@ -150,10 +150,10 @@ def _completed(
     """Points and colors of `triangulated_points`."""
     if len(triangulated.points) < _MIN_TRIANGULATED:
         return triangulated.points[:0], triangulated.colors[:0]
-    hull = Hull.of(views, progress)
+    hull = VisualHull.of(views, progress)
     if hull is not None:
         # Two photographs agreed about what others say is not there.
-        triangulated = triangulated.only(~hull.is_denied(triangulated.points))
+        triangulated = triangulated.only(~hull.is_contradicted(triangulated.points))
     proposer = _Proposer(views, hull, max_points, np.random.default_rng(seed), progress)
     return proposer.completed(triangulated.points, triangulated.colors, triangulated.points, triangulated.shown)
 
@@ -171,7 +171,7 @@ class _Proposer:
     """
 
     views: list[View]
-    hull: Hull | None
+    hull: VisualHull | None
     max_points: int
     rng: np.random.Generator
     progress: Progress | None
@@ -189,13 +189,13 @@ class _Proposer:
         # What no two views show would stay empty: density control does not leave what there is. Proposed points are as
         # dense as what is triangulated, at most as many, but together they are enough; and the budget is shared by
         # area.
-        share = empty_share(self.views, tracked, shown)
+        share = uncovered_share(self.views, tracked, shown)
         # Where all is empty, the share of what is not is 0.
         as_dense = len(points) * min(1.0, share / max(1 - share, 1e-9))
         count = round(min(max(_ENOUGH - len(points), as_dense), share * self.max_points))
-        keep = subset(len(points), self.max_points - count, self.rng)
+        keep = random_subset(len(points), self.max_points - count, self.rng)
         room = None if self.hull is None else self.hull.points(count, self.rng, self.progress)
-        more, more_colors = room or points_beside(self.views, tracked, shown, count, self.rng)
+        more, more_colors = room or propose_near_triangulated(self.views, tracked, shown, count, self.rng)
         return np.concatenate([points[keep], more]), np.concatenate([colors[keep], more_colors])
 
 
@@ -285,9 +285,11 @@ def added_points(
     own = triangulated.only(mine)
     rng = np.random.default_rng(seed)
     if mine.sum() >= FEWEST:
-        more, more_colors = points_beside(views[-1:], triangulated.points, triangulated.shown[-1:], _MAX_RANDOM, rng)
+        more, more_colors = propose_near_triangulated(
+            views[-1:], triangulated.points, triangulated.shown[-1:], _MAX_RANDOM, rng
+        )
     else:
-        more, more_colors = points_anywhere(views, _MAX_RANDOM, rng)
+        more, more_colors = propose_in_view(views, _MAX_RANDOM, rng)
     return np.concatenate([own.points, more]), np.concatenate([own.colors, more_colors]), int(mine.sum())
 
 

@@ -9,24 +9,22 @@ import numpy as np
 
 from drgs.cameras import Camera
 from drgs.data.camera_layout import Focus, scene_extent
+from drgs.data.masks import MASK_KEEP
 from drgs.data.views import View
 
 __all__ = [
     "FEWEST",
-    "Hull",
-    "MASK_KEEP",
+    "VisualHull",
     "back_project",
-    "empty_share",
-    "points_along_rays",
-    "points_anywhere",
-    "points_beside",
-    "subset",
+    "uncovered_share",
+    "propose_along_rays",
+    "propose_in_view",
+    "propose_near_triangulated",
+    "random_subset",
 ]
 
 FEWEST = 3
 """Triangulated points of a view that say how far away its other pixels may be."""
-MASK_KEEP = 0.5
-"""Weight in a mask from which on a pixel counts."""
 _MOST = 1_000  # triangulated points of a view that are looked at
 _NEAREST = 4  # of these in the image, one of which says how far away a pixel is: on this side of an edge or on that
 _CELLS = 16  # along each side of an image
@@ -34,7 +32,7 @@ _JITTER = 0.05  # relative standard deviation of that distance: surfaces are sla
 _CHUNK = 2_000  # pixels at a time
 
 
-def points_beside(
+def propose_near_triangulated(
     views: list[View], points: np.ndarray, shown: np.ndarray, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """About `count` points along random pixels' rays, as far away as triangulated points that the same view shows
@@ -52,7 +50,7 @@ def points_beside(
     own = [camera.project(points[mine]) for camera, mine in zip(cameras, shown, strict=True)]
     anywhere = np.concatenate([depth for _, depth in own])
     open_pixels = [
-        _open_pixels(view, camera, places) for view, camera, (places, _) in zip(views, cameras, own, strict=True)
+        _uncovered_pixels(view, camera, places) for view, camera, (places, _) in zip(views, cameras, own, strict=True)
     ]
     shares = np.array(
         [len(pixels) / camera.width / camera.height for pixels, camera in zip(open_pixels, cameras, strict=True)]
@@ -67,7 +65,7 @@ def points_beside(
             continue
         pixels = rng.choice(allowed, number)
         if len(depths) >= FEWEST:
-            kept = subset(len(depths), _MOST, rng)
+            kept = random_subset(len(depths), _MOST, rng)
             depth = depths[kept][_one_of_nearest(places[kept], pixels, camera.width, rng)]
         else:
             depth = rng.choice(anywhere, number)
@@ -78,17 +76,17 @@ def points_beside(
     return np.concatenate(found), np.concatenate(colors)
 
 
-def empty_share(views: list[View], points: np.ndarray, shown: np.ndarray) -> float:
-    """The share of all views' pixels that have no triangulated point in their cell of the grid of `points_beside`."""
+def uncovered_share(views: list[View], points: np.ndarray, shown: np.ndarray) -> float:
+    """The share of all views' pixels that have no triangulated point in their cell of a 16 x 16 grid on the image."""
     left = whole = 0
     for view, mine in zip(views, shown, strict=True):
         camera = view.camera.undistorted()
-        left += len(_open_pixels(view, camera, camera.project(points[mine])[0]))
+        left += len(_uncovered_pixels(view, camera, camera.project(points[mine])[0]))
         whole += camera.width * camera.height
     return left / max(whole, 1)
 
 
-def _open_pixels(view: View, camera: Camera, places: np.ndarray) -> np.ndarray:
+def _uncovered_pixels(view: View, camera: Camera, places: np.ndarray) -> np.ndarray:
     """Flat indices of the pixels inside the mask in whose cell none of the places (P,2) is."""
     across, down = (-(-size // _CELLS) for size in (camera.width, camera.height))
     taken = np.zeros((_CELLS, _CELLS), bool)
@@ -115,23 +113,23 @@ def _one_of_nearest(places: np.ndarray, pixels: np.ndarray, width: int, rng: np.
     return found
 
 
-def points_anywhere(views: list[View], count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def propose_in_view(views: list[View], count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Points along random pixels' rays, kept where at least half as many cameras look as look at the best point, and
     two if two look anywhere.
     """
     cameras = [view.camera.undistorted() for view in views]
     masks = [view.mask() if view.mask_path is not None else None for view in views]
-    return points_along_rays(cameras, [view.image if view.has_image else None for view in views], masks, count, rng)
+    return propose_along_rays(cameras, [view.image if view.has_image else None for view in views], masks, count, rng)
 
 
-def points_along_rays(
+def propose_along_rays(
     cameras: list[Camera],
     images: Sequence[Callable[[], np.ndarray] | None],
     masks: Sequence[np.ndarray | None],
     count: int,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`points_anywhere` of cameras without a lens: (P, 3) world points, at most `count`, and their (P, 3) colors.
+    """`propose_in_view` of cameras without a lens: (P, 3) world points, at most `count`, and their (P, 3) colors.
 
     Args:
         cameras: The cameras that look.
@@ -169,7 +167,7 @@ def points_along_rays(
             inside[inside] = mask[rows, columns] > MASK_KEEP
         seen += inside
     candidates = np.flatnonzero(seen >= max(seen.max() / 2, min(2, seen.max())))
-    keep = candidates[subset(len(candidates), count, rng)]
+    keep = candidates[random_subset(len(candidates), count, rng)]
     return points[keep], colors[keep]
 
 
@@ -192,25 +190,28 @@ def back_project(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.nd
     return local @ c2w[:3, :3].T + c2w[:3, 3]
 
 
-def subset(count: int, limit: int, rng: np.random.Generator) -> np.ndarray:
+def random_subset(count: int, limit: int, rng: np.random.Generator) -> np.ndarray:
     """Indices of all, or of `limit` random ones in their order."""
     return np.arange(count) if count <= limit else np.sort(rng.choice(count, limit, replace=False))
 
+
+# ---------------------------------------------------------------- visual hull
 
 _FEWEST_VIEWS = 3  # two silhouettes leave most of what is between them
 _LEAST_EMPTY = 0.2  # share of the pixels that show the background; below it, it may be a color like others
 _BACKGROUND = 0.06  # largest difference of a channel from its color: a sensor's noise, a compressed edge
 _SOME = 8  # photographs that say whether there is a background at all
 _WIDTH = 400  # pixels; averages of several are less noisy
-_DENIED = 0.1  # of the photographs that show a place, part that may deny what two have agreed about: edges are soft
+_CONTRADICTED = 0.1  # share of the photographs that may deny a place that two have agreed about: edges are soft
 _ROUND = 50_000  # places at a time
 _ROUNDS = 40  # at most: 2 million places in all
-_FEWEST_FOUND = 100  # of all rounds; fewer say that silhouettes do not agree
+_FEWEST_POINTS = 100  # of all rounds; fewer say that silhouettes do not agree
 
 
 @dataclass(frozen=True)
-class Hull:
-    """What photographs say about where nothing is.
+class VisualHull:
+    """Where photographs of one moment leave room for something: nothing is where one of them shows the background. It
+    is the photo hull of Kutulakos and Seitz (2000) for two colors, the background's and all others.
 
     A photograph shows a place as empty where its pixel has the color that is behind everything (`View.background`):
     then its whole ray is empty, or looks as if it were.
@@ -232,7 +233,7 @@ class Hull:
     reach: float
 
     @classmethod
-    def of(cls, views: list[View], progress: Callable[[str, int, int], None] | None = None) -> Hull | None:
+    def of(cls, views: list[View], progress: Callable[[str, int, int], None] | None = None) -> VisualHull | None:
         """The hull of views with images; None where they say nothing about it.
 
         That is so of fewer than three views, of views of several times, of cameras that do not look at one place, and
@@ -249,14 +250,14 @@ class Hull:
         if progress:
             progress("silhouettes", 0, len(views))
         some = views[:: -(-len(views) // _SOME)]
-        if np.mean([_is_behind(view, view.image(*_size(view.camera))).mean() for view in some]) < _LEAST_EMPTY:
+        if np.mean([_is_background(view, view.image(*_size(view.camera))).mean() for view in some]) < _LEAST_EMPTY:
             return None
         smaller, images, is_empty, counts, reaches = [], [], [], [], []
         for number, (view, camera) in enumerate(zip(views, cameras, strict=True)):
             size = _size(camera)
             smaller.append(camera.resized(*size))
             images.append(view.image(*size))
-            is_empty.append(_is_behind(view, images[-1]))
+            is_empty.append(_is_background(view, images[-1]))
             mask = view.mask(*size)
             counts.append(np.ones(size[::-1], bool) if mask is None else mask > MASK_KEEP)
             reaches.append(np.linalg.norm(camera.center - focus.center) * np.hypot(*size) / 2 / smaller[-1].K[0, 0])
@@ -264,31 +265,31 @@ class Hull:
                 progress("silhouettes", number + 1, len(views))
         return cls(smaller, images, is_empty, counts, focus.center, float(np.median(reaches)))
 
-    def room(self, places: np.ndarray) -> np.ndarray:
+    def support(self, places: np.ndarray) -> np.ndarray:
         """(P,) how many photographs show each of places (P, 3), where none of these shows the background; else -1."""
         number = np.zeros(len(places), np.int64)
         left = np.arange(len(places))  # what one photograph shows as empty need not be looked at in the next
         for index in range(len(self.cameras)):
             shown, columns, rows = self._pixels(index, places[left])
             number[left[shown]] += 1
-            denied = np.zeros(len(left), bool)
-            denied[shown] = self.is_empty[index][rows, columns]
-            number[left[denied]] = -1
-            left = left[~denied]
+            contradicted = np.zeros(len(left), bool)
+            contradicted[shown] = self.is_empty[index][rows, columns]
+            number[left[contradicted]] = -1
+            left = left[~contradicted]
         return number
 
-    def is_denied(self, places: np.ndarray) -> np.ndarray:
+    def is_contradicted(self, places: np.ndarray) -> np.ndarray:
         """(P,) bool, whether more than a tenth of the photographs that show places (P, 3) show the background there.
 
         For places that two others agree about: of a hundred photographs some show each point of a surface at the edge
         of its silhouette, where a pixel decides.
         """
-        denials, number = np.zeros((2, len(places)))
+        contradictions, number = np.zeros((2, len(places)))
         for index in range(len(self.cameras)):
             shown, columns, rows = self._pixels(index, places)
             number[shown] += 1
-            denials[shown] += self.is_empty[index][rows, columns]
-        return denials > _DENIED * number
+            contradictions[shown] += self.is_empty[index][rows, columns]
+        return contradictions > _CONTRADICTED * number
 
     def colors(self, places: np.ndarray) -> np.ndarray:
         """(P, 3) float32 medians of what photographs show at places (P, 3), each of which one shows."""
@@ -315,14 +316,14 @@ class Hull:
         found, total = [], 0
         for _ in range(_ROUNDS):
             places = self.center + self.reach * _in_ball(_ROUND, rng)
-            number = self.room(places)
+            number = self.support(places)
             found.append(places[number >= max(2, number.max() / 2)])
             total += len(found[-1])
             if progress:
                 progress("room for points", min(total, count), count)
             if total >= count:
                 break
-        if total < min(count, _FEWEST_FOUND):
+        if total < min(count, _FEWEST_POINTS):
             return None
         points = np.concatenate(found)[:count]
         return points, self.colors(points)
@@ -345,7 +346,7 @@ def _size(camera: Camera) -> tuple[int, int]:
     return width, max(1, round(camera.height * width / camera.width))
 
 
-def _is_behind(view: View, image: np.ndarray) -> np.ndarray:
+def _is_background(view: View, image: np.ndarray) -> np.ndarray:
     """(H, W) bool, which pixels of an image have the color of the background."""
     return (np.abs(image - np.asarray(view.background, np.float32)) <= _BACKGROUND).all(axis=2)
 

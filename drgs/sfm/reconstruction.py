@@ -17,8 +17,8 @@ from drgs.data.images import image_size, list_images
 from drgs.data.videos import list_videos
 from drgs.io.atomic import temporary_folder
 from drgs.io.outputs import lock_folder
-from drgs.sfm.feature_masks import ALPHA_MASKS, feature_mask, masked_photo, masks_of
-from drgs.sfm.image_folder import fill, named_files, recorded_frames, usable_files
+from drgs.sfm.feature_masks import ALPHA_MASKS, feature_mask, find_masks, masked_photo
+from drgs.sfm.image_folder import fill_image_folder, named_files, recorded_frames, usable_files
 from drgs.sfm.mapping import MappingProgress, PhotoGroups, map_photos, posed_names, write_model
 from drgs.sfm.matching import FeatureOptions
 from drgs.sfm.pairing import choose_pairs
@@ -203,7 +203,7 @@ def run_sfm(
             else:
                 times = StageTimes()
                 photographs, videos = usable_files(photographs, videos, paths[0], 2, options.max_image_size)
-                filled = fill(partial / "images", photographs, videos, "sfm", options.frames, report)
+                filled = fill_image_folder(partial / "images", photographs, videos, "sfm", options.frames, report)
                 times.end("videos")
                 try:
                     summary = _reconstruct(filled.folder, partial, options, report, status)
@@ -255,7 +255,7 @@ def _checked(folder: Path, masks: str | os.PathLike | None, max_image_size: int)
     check_names(folder, names, masked=masks is not None)
     if len(names) < 2:
         raise ValueError(f"{folder}: must hold at least 2 photos, got {len(names)}; add overlapping photos")
-    return names, None if masks is None else masks_of(photos, masks)
+    return names, None if masks is None else find_masks(photos, masks)
 
 
 def _write_masked(image_dir: Path, names: list[str], masks: list[Path], partial: Path, report: Progress) -> None:
@@ -302,7 +302,7 @@ def _reconstruct(
     Leaves `database.db`, `sparse/0` and, of alpha masks, `masks` in `partial`.
     """
     from drgs.data.colmap_bindings import pycolmap
-    from drgs.sfm.matching import match, quiet, state_focal_lengths
+    from drgs.sfm.matching import match, quiet, restore_focal_lengths
 
     names, masks = _checked(image_dir, options.masks, options.max_image_size)
     is_masked = masks is not None
@@ -319,7 +319,7 @@ def _reconstruct(
     _extract(database, partial / "photos" if is_masked else readable, lenses, features, report, image_dir)
     with quiet():
         if is_masked:
-            state_focal_lengths(database, readable)
+            restore_focal_lengths(database, readable)
         times.end("features")
         pairing = choose_pairs(database, names, options.matching, is_masked, options.seed)
         match(database, pairing.pairs, seed=options.seed, guided=is_masked, progress=report)

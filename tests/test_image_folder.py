@@ -18,7 +18,7 @@ from drgs import cli
 from drgs.data import load
 from drgs.data.images import list_images
 from drgs.io.outputs import lock_folder
-from drgs.sfm.image_folder import FRAMES, gather, joined_frames, named_files, recorded_frames, usable_files
+from drgs.sfm.image_folder import FRAMES, joined_frames, make_image_folder, named_files, recorded_frames, usable_files
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_one_folder(shoot, walk, tmp_path):
     files = named_files([photos, other])
     told = []
     with lock_folder(tmp_path / "out", "sfm") as held:
-        found = gather(*files, held, "pictures", 10, lambda *step: told.append(step))
+        found = make_image_folder(*files, held, "pictures", 10, lambda *step: told.append(step))
     folder = tmp_path / "out" / "pictures"
     assert found.folder == folder
     names = [path.name for path in list_images(folder)]
@@ -114,10 +114,10 @@ def test_what_was_recorded_goes_on(shoot, tmp_path):
     """Pictures with a frames.json of ours join others; one that is not ours says nothing, a damaged one is told."""
     photos, _ = shoot
     with lock_folder(tmp_path / "out", "sfm") as held:
-        gather([], [photos / "clip.mp4"], held, "first", 5)
+        make_image_folder([], [photos / "clip.mp4"], held, "first", 5)
         files = list_images(tmp_path / "out" / "first")
-        gather(files, [], held, "second")
-        gather([photos / "IMG_1.jpg"], [], held, "third")
+        make_image_folder(files, [], held, "second")
+        make_image_folder([photos / "IMG_1.jpg"], [], held, "third")
     first, second = (rows_of(tmp_path / "out" / name) for name in ("first", "second"))
     assert second["frames"] == first["frames"]
     assert second["videos"] == first["videos"]
@@ -152,7 +152,7 @@ def test_too_few_frames_for_the_videos(shoot, tmp_path):
         lock_folder(tmp_path / "out", "sfm") as held,
         pytest.raises(ValueError, match="frames: must be at least one of each video, 2, got 1"),
     ):
-        gather([], [photos / "clip.mp4", other / "clip.mp4"], held, "pictures", 1)
+        make_image_folder([], [photos / "clip.mp4", other / "clip.mp4"], held, "pictures", 1)
     assert not (tmp_path / "out").exists()
 
 
