@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,7 +12,10 @@ from drgs.data.images import image_size, read_image, unit_range
 from drgs.data.masks import MASK_KEEP, mask_file, read_mask
 from drgs.data.resampling import nearest_resized
 
-__all__ = ["ALPHA_MASKS", "feature_mask", "masked_photo", "find_masks"]
+if TYPE_CHECKING:
+    from drgs.sfm.matching import Progress
+
+__all__ = ["ALPHA_MASKS", "find_masks", "write_masked_photos"]
 
 ALPHA_MASKS = "alpha"  # in place of a folder: the photographs' own alpha channel
 _SHOWN = 3  # photographs without a mask that a message names
@@ -53,7 +57,7 @@ def find_masks(photos: list[Path], masks: str | os.PathLike) -> list[Path]:
     return [file for file in found if file is not None]
 
 
-def feature_mask(photo: Path, mask: Path) -> np.ndarray:
+def _feature_mask(photo: Path, mask: Path) -> np.ndarray:
     """(H,W) uint8 of the photograph's size: 255 where features may lie, else 0.
 
     Args:
@@ -81,7 +85,7 @@ def feature_mask(photo: Path, mask: Path) -> np.ndarray:
     return np.where(kept, np.uint8(255), np.uint8(0))
 
 
-def masked_photo(photo: Path, kept: np.ndarray) -> np.ndarray:
+def _masked_photo(photo: Path, kept: np.ndarray) -> np.ndarray:
     """(H,W) or (H,W,3) of the photograph's own bit depth: its mean color where nothing is kept.
 
     Detectors then find no features there, of which they keep the strongest alone, and descriptors near the outline hold
@@ -89,10 +93,41 @@ def masked_photo(photo: Path, kept: np.ndarray) -> np.ndarray:
 
     Args:
         photo: The photograph.
-        kept: (H,W) uint8, 0 where nothing is kept, as `feature_mask` makes it.
+        kept: (H,W) uint8, 0 where nothing is kept, as `_feature_mask` makes it.
     """
     pixels = read_image(photo)
     pixels = np.ascontiguousarray(pixels[..., :3]) if pixels.ndim == 3 else pixels
     # The mean is a float64; the photograph keeps its own 8 or 16 bits.
     pixels[kept == 0] = pixels[kept > 0].mean(axis=0).astype(pixels.dtype)
     return pixels
+
+
+def write_masked_photos(image_dir: Path, names: list[str], masks: list[Path], target: Path, report: Progress) -> None:
+    """Write what COLMAP detects features in: `photos` without their surroundings, and `masks` of their sizes, black or
+    white, `NAME.EXT.png`.
+
+    Args:
+        image_dir, names: The photographs.
+        masks: Their masks, as `find_masks` lists them.
+        target: Folder that gets both folders.
+        report: Called with ("masks", done, total).
+    """
+    import cv2
+
+    (target / "photos").mkdir()
+    (target / "masks").mkdir()
+    for done, (name, mask) in enumerate(zip(names, masks, strict=True)):
+        report("masks", done, len(names))
+        kept = _feature_mask(image_dir / name, mask)
+        pixels = _masked_photo(image_dir / name, kept)
+        # OpenCV writes blue first.
+        pixels = pixels[..., ::-1] if pixels.ndim == 3 else pixels
+        for file, image in ((target / "masks" / f"{name}.png", kept), (target / "photos" / name, pixels)):
+            suffix = file.suffix.lower()
+            if image.dtype != np.uint8:  # whatever its name: COLMAP goes by the content, and JPEG has 8 bits
+                suffix = ".png"
+            elif suffix not in (".png", ".tif", ".tiff", ".bmp"):  # COLMAP decodes no WebP
+                suffix = ".jpg"
+            best = [cv2.IMWRITE_JPEG_QUALITY, 100] if suffix == ".jpg" else []
+            file.write_bytes(cv2.imencode(suffix, image, best)[1].tobytes())
+    report("masks", len(names), len(names))

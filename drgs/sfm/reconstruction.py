@@ -11,13 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from drgs.data.images import image_size, list_images
 from drgs.data.videos import list_videos
 from drgs.io.atomic import temporary_folder
 from drgs.io.outputs import lock_folder
-from drgs.sfm.feature_masks import ALPHA_MASKS, feature_mask, find_masks, masked_photo
+from drgs.sfm.feature_masks import ALPHA_MASKS, find_masks, write_masked_photos
 from drgs.sfm.image_folder import fill_image_folder, named_files, recorded_frames, usable_files
 from drgs.sfm.mapping import MappingProgress, PhotoGroups, map_photos, posed_names, write_model
 from drgs.sfm.matching import FeatureOptions
@@ -258,31 +256,6 @@ def _checked(folder: Path, masks: str | os.PathLike | None, max_image_size: int)
     return names, None if masks is None else find_masks(photos, masks)
 
 
-def _write_masked(image_dir: Path, names: list[str], masks: list[Path], partial: Path, report: Progress) -> None:
-    """What COLMAP looks for features in: `photos` without their surroundings, and `masks` of their sizes, black or
-    white, `NAME.EXT.png`.
-    """
-    import cv2
-
-    (partial / "photos").mkdir()
-    (partial / "masks").mkdir()
-    for done, (name, mask) in enumerate(zip(names, masks, strict=True)):
-        report("masks", done, len(names))
-        kept = feature_mask(image_dir / name, mask)
-        pixels = masked_photo(image_dir / name, kept)
-        # OpenCV writes blue first.
-        pixels = pixels[..., ::-1] if pixels.ndim == 3 else pixels
-        for file, image in ((partial / "masks" / f"{name}.png", kept), (partial / "photos" / name, pixels)):
-            suffix = file.suffix.lower()
-            if image.dtype != np.uint8:  # whatever its name: COLMAP goes by the content, and JPEG has 8 bits
-                suffix = ".png"
-            elif suffix not in (".png", ".tif", ".tiff", ".bmp"):  # COLMAP decodes no WebP
-                suffix = ".jpg"
-            best = [cv2.IMWRITE_JPEG_QUALITY, 100] if suffix == ".jpg" else []
-            file.write_bytes(cv2.imencode(suffix, image, best)[1].tobytes())
-    report("masks", len(names), len(names))
-
-
 def _check_output(output: LockedFolder, folders: _Folders) -> None:
     """Raise ValueError, before minutes of work, unless what is to be replaced is an earlier result."""
     places = ["sparse", *(path.name for path in output.path.glob("database.db*"))]
@@ -307,7 +280,7 @@ def _reconstruct(
     names, masks = _checked(image_dir, options.masks, options.max_image_size)
     is_masked = masks is not None
     if masks is not None:
-        _write_masked(image_dir, names, masks, partial, report)
+        write_masked_photos(image_dir, names, masks, partial, report)
     database = partial / "database.db"
     times = StageTimes()
     with quiet():

@@ -158,12 +158,7 @@ def _registered(
     from drgs.data.colmap_bindings import opened_database, pycolmap
     from drgs.sfm.matching import extract, match, quiet
 
-    for folder in ("photos", "models", "sparse/0"):
-        (partial / folder).mkdir(parents=True)
-    for path in _photographs(scene / "images"):
-        link_or_copy(path, partial / "photos" / path.name)
-    for name, file in new.items():
-        link_or_copy(file, partial / "photos" / name)
+    _link_photographs(scene, new, partial)
     database = partial / "database.db"
     shutil.copyfile(scene / "database.db", database)
     before = pycolmap.Reconstruction(str(scene / "sparse/0"))
@@ -207,6 +202,18 @@ def _registered(
     write_model(model, partial / "sparse/0")
     report("mapping", len(kept), len(names))
     return Registration(summary, tuple(new), posed, moved)
+
+
+def _link_photographs(scene: Path, new: dict[str, Path], partial: Path) -> None:
+    """Make the folders of `_registered`: `photos`, with all photographs under their names in the data set, and empty
+    ones for models.
+    """
+    for folder in ("photos", "models", "sparse/0"):
+        (partial / folder).mkdir(parents=True)
+    for path in _photographs(scene / "images"):
+        link_or_copy(path, partial / "photos" / path.name)
+    for name, file in new.items():
+        link_or_copy(file, partial / "photos" / name)
 
 
 def _shared_camera(cameras: list[Any], files: list[Path]) -> int | None:
