@@ -12,7 +12,7 @@ from test_active import SIZE, config, lazily, plan, write_still
 from drgs import cli
 from drgs.cameras import Camera, orbit
 from drgs.data import load
-from drgs.data.camera_lists import described, is_camera_list, load_cameras_json, save_cameras_json
+from drgs.data.camera_lists import camera_to_json, is_camera_list, load_cameras_json, save_cameras_json
 from drgs.files import save_ply
 from drgs.train import fit
 from drgs.viewing.placed_views import read_ranking
@@ -90,7 +90,7 @@ def test_cameras_of_any_lens_and_time_come_back(tmp_path):
     cameras = orbit((0, 0, 0), 3.0, 2, width=12, height=9)
     bent = dataclasses.replace(cameras[1], model="opencv", distortion=(0.1, 0.01, 0.0, 0.0), time=0.5, name="bent")
     save_cameras_json(tmp_path / "inria.json", cameras)
-    both = [*json.loads((tmp_path / "inria.json").read_text()), described(bent)]
+    both = [*json.loads((tmp_path / "inria.json").read_text()), camera_to_json(bent)]
     for written in (both, {"cameras": both}, {"schema": 1, "command": "x", "cameras": "words", "views": both}):
         path = tmp_path / "some.json"
         path.write_text(json.dumps(written))
@@ -133,7 +133,7 @@ def test_a_data_set_is_no_list_of_cameras(tmp_path):
     camera = Camera(K=np.diag([9.0, 9, 1]), w2c=np.eye(4), width=4, height=4, name="a")
     path = tmp_path / "selection.json"
     path.write_text(
-        json.dumps({"schema": 1, "command": "select", "cameras": [], "picks": [{"camera": described(camera)}]})
+        json.dumps({"schema": 1, "command": "select", "cameras": [], "picks": [{"camera": camera_to_json(camera)}]})
     )
     assert is_camera_list(path)
     assert [camera.name for camera in load_cameras_json(path)] == ["a"]
@@ -150,7 +150,7 @@ def test_a_camera_that_is_a_name_is_no_pose(tmp_path):
 
 def test_a_transposed_pose_is_refused(tmp_path):
     """Its rotation is one, too, and its position would be 0."""
-    value = described(orbit((0, 0, 0), 3.0, 1, width=12, height=9)[0])
+    value = camera_to_json(orbit((0, 0, 0), 3.0, 1, width=12, height=9)[0])
     value["c2w"] = np.transpose(value["c2w"]).tolist()
     path = tmp_path / "some.json"
     path.write_text(json.dumps([value]))

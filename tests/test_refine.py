@@ -11,7 +11,7 @@ from scenes_random import gaussians
 
 from drgs import cli, fisher
 from drgs.cameras import Camera, orbit
-from drgs.data.camera_lists import described
+from drgs.data.camera_lists import camera_to_json
 from drgs.files import save_ply
 from drgs.information.criteria import criterion_named
 from drgs.select import Refine, Scoring, select
@@ -168,7 +168,7 @@ def test_command(tmp_path, capsys):
     path = tmp_path / "cloud.ply"
     save_ply(scene(40), path)
     cameras = tmp_path / "cameras.json"
-    cameras.write_text(json.dumps([described(facing(x, name=f"c{x}")) for x in (-1.0, 1.0)]))
+    cameras.write_text(json.dumps([camera_to_json(facing(x, name=f"c{x}")) for x in (-1.0, 1.0)]))
     out = tmp_path / "select.json"
     common = [str(path), "--train", str(cameras), "--candidates", "orbit", "--count", "4", "-o", str(out)]
     assert cli.main(["select", *common, "--refine", "6", "--refine-box=-9,-9,-9,9,9,9"]) == 0

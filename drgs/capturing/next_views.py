@@ -13,7 +13,7 @@ import torch
 
 from drgs.capturing.places import Place, meters_of, places_around
 from drgs.data.camera_layout import upright
-from drgs.data.camera_lists import described
+from drgs.data.camera_lists import camera_to_json
 from drgs.display.progress import Bar
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import fitted_views, load_run
@@ -136,7 +136,7 @@ def _place_json(place: Place, meters: float | None) -> dict[str, Any]:
         "base": place.base,
         "origin": place.origin.tolist(),
         "text": place.words(meters),
-        "camera": described(place.camera),
+        "camera": camera_to_json(place.camera),
     }
 
 

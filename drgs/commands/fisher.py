@@ -28,7 +28,7 @@ from drgs import fisher
 from drgs.commands.orbits import Wish
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import check_lenses, evenly, known_views, other_views, timed
-from drgs.data.camera_lists import described
+from drgs.data.camera_lists import camera_to_json
 from drgs.display import pictures, tables
 from drgs.display.progress import Bar
 from drgs.gain import Information, Prior, check, information_gain, variances
@@ -256,7 +256,7 @@ class MappedView:
     def to_json(self) -> dict[str, Any]:
         """As fisher.json holds it."""
         fields = {name: getattr(self, name) for name in ("name", "camera", "files", "gain")}
-        fields |= {"camera": described(self.camera)}
+        fields |= {"camera": camera_to_json(self.camera)}
         fields |= {name: dataclasses.asdict(getattr(self, name)) for name in KINDS}
         blocks = self.blocks.items()
         fields |= {"blocks": {b: {kind: dataclasses.asdict(x) for kind, x in maps.items()} for b, maps in blocks}}

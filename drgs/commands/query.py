@@ -14,7 +14,7 @@ from drgs.commands.orbits import Wish
 from drgs.commands.painters import OPAQUE
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import check_lenses, seen_views
-from drgs.data.camera_lists import described
+from drgs.data.camera_lists import camera_to_json
 from drgs.data.checks import read_npy
 from drgs.display import pictures
 from drgs.display.progress import Bar
@@ -187,7 +187,7 @@ def _view(
     files = [f"{name}.mask.png", f"{name}.png"]
     pictures.write_png(folder / files[0], mask[..., None].repeat(3, 2).astype("uint8") * 255)
     pictures.write_png(folder / files[1], mask_picture(out.rgb.cpu().numpy(), mask))
-    return {"camera": described(camera), "files": files, "pixels": int(mask.sum()), "of": mask.size}
+    return {"camera": camera_to_json(camera), "files": files, "pixels": int(mask.sum()), "of": mask.size}
 
 
 def _summary(args: Query, report: dict) -> str:

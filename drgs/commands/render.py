@@ -39,7 +39,7 @@ from drgs.commands.painters import PAINTINGS, painters
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import captured_cameras, check_lenses, drawn_views
 from drgs.data.camera_layout import middle_camera
-from drgs.data.camera_lists import described, save_cameras_json
+from drgs.data.camera_lists import camera_to_json, save_cameras_json
 from drgs.display import pictures
 from drgs.display.mp4 import Mp4, need_mp4
 from drgs.display.progress import Bar, duration
@@ -264,7 +264,7 @@ def render_views(
                 movie.write(rgb)
             seen = seen or bool(alpha.any())
             counts = {key: _number(out.certificate.get(key)) for key in ("rays", "redone")}
-            views.append({"camera": described(camera), "files": files, "seconds": seconds, **counts})
+            views.append({"camera": camera_to_json(camera), "files": files, "seconds": seconds, **counts})
             if advance:
                 advance()
     if not seen:

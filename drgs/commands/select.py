@@ -11,7 +11,7 @@ import torch
 from drgs.commands.orbits import Wish
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import check_lenses, known_views, other_views, timed
-from drgs.data.camera_lists import described
+from drgs.data.camera_lists import camera_to_json
 from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.information.criteria import criterion_named
@@ -83,11 +83,11 @@ def _report(
     """What the JSON file holds."""
     shown = [{"index": i, "name": camera.name} for i, camera in enumerate(candidates)]
     timely = [{**one, "time": camera.time} for one, camera in zip(shown, candidates, strict=True)]
-    cameras = [{"camera": described(camera)} for camera in candidates]
+    cameras = [{"camera": camera_to_json(camera)} for camera in candidates]
     picks = selection.picks_json(shown, cameras)
     for record, pick in zip(picks, selection.picks, strict=True):
         if pick.camera is not None:
-            record |= {"camera": described(pick.camera), "start": pick.start}
+            record |= {"camera": camera_to_json(pick.camera), "start": pick.start}
     return {
         "schema": SCHEMA,
         "command": "select",

@@ -32,7 +32,7 @@ from drgs import runtime
 from drgs.commands.orbits import Wish
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import seen_views
-from drgs.data.camera_lists import described
+from drgs.data.camera_lists import camera_to_json
 from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.io.journal import SCHEMA
@@ -152,7 +152,7 @@ class _Report:
             "scene": self.scene,
             "gaussians": self.gaussians,
             "source": self.source,
-            "views": [described(camera) for camera in self.views],
+            "views": [camera_to_json(camera) for camera in self.views],
             "full": {clock: dataclasses.asdict(found) for clock, found in self.full.items()},
             "fields": self.fields,
             "seed": self.seed,

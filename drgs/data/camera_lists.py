@@ -1,8 +1,8 @@
 """Lists of cameras in JSON.
 
-What is read is one form, wherever cameras are named: a list of cameras, or an object with such a list, as commands
-write it (`cameras`, else the `camera` of each of its `picks`, else of its `views`). A camera is what `described` makes,
-of any lens, or as INRIA's `cameras.json` has it: pinhole, no skew, position and rotation of c2w.
+Every command that takes cameras reads one form: a list of cameras, or an object with such a list, as commands write it
+(`cameras`, else the `camera` of each of its `picks`, else of its `views`). A camera is what `camera_to_json` writes, of
+any lens, or as INRIA's `cameras.json` has it: pinhole, no skew, position and rotation of c2w.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from drgs.guards.arguments import kind_of
 from drgs.io.json_files import check_json, read_json
 from drgs.io.outputs import atomic_write
 
-__all__ = ["camera_described", "described", "is_camera_list", "load_cameras_json", "save_cameras_json"]
+__all__ = ["camera_from_json", "camera_to_json", "is_camera_list", "load_cameras_json", "save_cameras_json"]
 
-_DESCRIBED = {
+_CAMERA_JSON = {
     "name": str,
     "width": int,
     "height": int,
@@ -76,8 +76,8 @@ def load_cameras_json(path: str | os.PathLike) -> list[Camera]:
     """Read cameras, in their order; of what a command wrote (selection.json, render.json, ...), those of its picks or
     views.
 
-    A camera is of `described`, or in INRIA's layout: id, img_name, width, height, position, rotation (c2w), fx, fy[,
-    cx, cy, time].
+    A camera is as `camera_to_json` writes it, or in INRIA's layout: id, img_name, width, height, position, rotation
+    (c2w), fx, fy[, cx, cy, time].
 
     Raises:
         FileNotFoundError: No such file.
@@ -87,7 +87,7 @@ def load_cameras_json(path: str | os.PathLike) -> list[Camera]:
     cameras = []
     for where, entry in _entries(path, read_json(path, "a cameras.json file")):
         if isinstance(entry, dict) and "c2w" in entry:
-            cameras.append(camera_described(where, entry))
+            cameras.append(camera_from_json(where, entry))
         else:
             cameras.append(_of_inria(where, entry))
     return cameras
@@ -142,7 +142,7 @@ def is_camera_list(path: Path) -> bool:
     return _OURS.match(start) is not None and b'"frames"' not in path.read_bytes()[:_LOOKED_AT]
 
 
-def described(camera: Camera) -> dict:
+def camera_to_json(camera: Camera) -> dict:
     """A camera of any kind as JSON, for the files of commands."""
     return {
         "name": camera.name,
@@ -156,8 +156,8 @@ def described(camera: Camera) -> dict:
     }
 
 
-def camera_described(where: str, value: object) -> Camera:
-    """The camera that `described` has made JSON of.
+def camera_from_json(where: str, value: object) -> Camera:
+    """The camera that `camera_to_json` has made JSON of.
 
     Args:
         where: The file and the place in it, for messages.
@@ -166,7 +166,7 @@ def camera_described(where: str, value: object) -> Camera:
         ValueError: If it is nothing of the kind, or no camera can be so.
     """
     advice = "write the file again"
-    check_json(where, value, _DESCRIBED, advice)
+    check_json(where, value, _CAMERA_JSON, advice)
     assert isinstance(value, dict)  # checked
     shapes = [len(row) for row in value["K"]], [len(row) for row in value["c2w"]]
     if shapes != ([3] * 3, [4] * 4):

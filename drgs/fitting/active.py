@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from drgs.data.camera_lists import described
+from drgs.data.camera_lists import camera_to_json
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
 from drgs.fitting.config import FitConfig
@@ -366,7 +366,7 @@ class ActiveViews:
             "pool_leak": self.pool_leak,
             "pool": [view.name for view in self.views],
             "start": [{"index": i, "name": self.views[i].name, **self._where(i)} for i in initial],
-            "cameras": [described(self._camera(i)) for i in self.chosen],
+            "cameras": [camera_to_json(self._camera(i)) for i in self.chosen],
             "picks": self.picks,
             "measured": self.measured,
         }

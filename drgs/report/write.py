@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.data.camera_lists import camera_described
+from drgs.data.camera_lists import camera_from_json
 from drgs.display.progress import Bar
 from drgs.fitting.records import load_run
 from drgs.information.nuisances import Nuisances
@@ -98,7 +98,7 @@ def _shown(account: Account, dataset: Dataset | None) -> Shown:
 def _ways(account: Account) -> list[tuple[Camera, np.ndarray, str]]:
     """Argument `ways` of `charts.camera_map`: the places for the next photographs."""
     where = str(account.run.path / "next.json")
-    found = [(camera_described(where, place["camera"]), np.array(place["origin"], float)) for place in account.places]
+    found = [(camera_from_json(where, place["camera"]), np.array(place["origin"], float)) for place in account.places]
     if odd := [origin for _, origin in found if origin.shape != (3,)]:
         raise ValueError(f"{where}: origin must be 3 numbers, got {len(odd[0])}; run `drgs capture --more` again")
     return [(*pair, str(place["rank"])) for pair, place in zip(found, account.places, strict=True)]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from drgs.cameras import Camera
-from drgs.data.camera_lists import camera_described
+from drgs.data.camera_lists import camera_from_json
 from drgs.io.json_files import check_json, read_json
 
 if TYPE_CHECKING:
@@ -202,7 +202,7 @@ def read_ranking(path: Path) -> Ranking:
         last = selection["picks"][-1] if selection["picks"] else {"candidates": [], "criterion": None, "policy": ""}
         rows, criterion, policy = last["candidates"], last["criterion"], last["policy"]
     cameras = [
-        dataclasses.replace(camera_described(f"{where}: {row['name']}", row["camera"]), name=row["name"])
+        dataclasses.replace(camera_from_json(f"{where}: {row['name']}", row["camera"]), name=row["name"])
         for row in rows
         if isinstance(row.get("camera"), dict)  # of a fit of what moves it is a name
     ]
