@@ -345,7 +345,7 @@ def test_a_sure_start_asks_for_no_proposals(tmp_path, rng, monkeypatch):
     assert again
     assert record["restarted"]
     assert record["triangulated"] > 100
-    monkeypatch.setattr("drgs.sfm.points.points_beside", None)
+    monkeypatch.setattr("drgs.sfm.points.propose_near_triangulated", None)
     assert told("auto", 1000) == (False, record | {"restarted": False})
 
 
