@@ -427,15 +427,6 @@ def test_scene_extent():
     assert scene_extent(cameras[:1], points) == pytest.approx(3.3)
 
 
-@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".bmp"])
-def test_image_size_agrees_with_decoding(tmp_path, suffix):
-    """Header and decoder agree."""
-    from drgs.data.images import image_size
-
-    write_image(tmp_path / f"a{suffix}", gradient(37, 21))
-    assert image_size(tmp_path / f"a{suffix}") == (37, 21)
-
-
 def test_barrel_lens_that_folds_back_is_masked():
     """Past the fold a photo shows something else: masked, without a warning."""
     camera = Camera(intrinsics(20, 20, 12, 8), np.eye(4), WIDTH, HEIGHT, "opencv", (-1.0, 0, 0, 0))

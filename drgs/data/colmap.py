@@ -179,13 +179,13 @@ def _tracks(reconstruction: Any, by_id: dict[int, View]) -> tuple[np.ndarray, di
     """Points, and view name -> indices of those that it shows; None where no point has a track."""
     keys = sorted(reconstruction.point3D_ids())
     points = [reconstruction.points3D[key] for key in keys[:: -(-len(keys) // _MOST_TRACKS) or 1]]
-    found: dict[str, list[int]] = {view.name: [] for view in by_id.values()}
+    seen: dict[str, list[int]] = {view.name: [] for view in by_id.values()}
     for index, point in enumerate(points):
         for image_id in {element.image_id for element in point.track.elements} & by_id.keys():
-            found[by_id[image_id].name].append(index)
-    if not any(found.values()):
+            seen[by_id[image_id].name].append(index)
+    if not any(seen.values()):
         return None
-    return np.array([point.xyz for point in points]), {name: np.array(x, np.int64) for name, x in found.items()}
+    return np.array([point.xyz for point in points]), {name: np.array(x, np.int64) for name, x in seen.items()}
 
 
 def _reprojection(reconstruction: Any) -> float | None:

@@ -199,7 +199,7 @@ def _frame_folder(camera: Path) -> Path:
 
 def _images_of(reconstruction: Any, model: Path, names: Sequence[str]) -> dict[str, list[tuple[int, Camera]]]:
     """Name of a camera -> the images of it in the model, by name, and the camera of each; without those of none."""
-    by_number, found = defaultdict(list), defaultdict(list)
+    by_number, images_of = defaultdict(list), defaultdict(list)
     for name in names:
         if number := _NUMBER.search(name):
             by_number[int(number[1])].append(name)
@@ -212,8 +212,8 @@ def _images_of(reconstruction: Any, model: Path, names: Sequence[str]) -> dict[s
             same = by_number[int(number[1])]
             owner = same[0] if len(same) == 1 and len(parts) == 1 else None
         if owner:
-            found[owner].append((image_id, model_camera(reconstruction, image, f"{model}: image {image.name}")))
-    return {name: found[name] for name in names if name in found}
+            images_of[owner].append((image_id, model_camera(reconstruction, image, f"{model}: image {image.name}")))
+    return {name: images_of[name] for name in names if name in images_of}
 
 
 def _numbered(folder: Path) -> dict[int, Path]:

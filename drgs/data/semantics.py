@@ -247,19 +247,19 @@ def plain_labels(path: Path) -> np.ndarray:
 
 def _numbers_in(paths: tuple[Path, ...]) -> list[int]:
     """The numbers in label images, without 0 and the largest one."""
-    found: set[int] = set()
+    numbers: set[int] = set()
     with Bar("classes in labels", len(paths)) as bar:
         for path in paths:
             raw = plain_labels(path)
-            found |= set(np.unique(raw).tolist()) - {0, np.iinfo(raw.dtype).max}
+            numbers |= set(np.unique(raw).tolist()) - {0, np.iinfo(raw.dtype).max}
             bar.advance()
-    if paths and not found:
+    if paths and not numbers:
         _log.warning(
             "%s: label images hold only 0 and the largest number, which are no class; name them in classes.txt beside "
             "the folder (`0 background`, `255 object`)",
             paths[0].parent,
         )
-    return sorted(found)
+    return sorted(numbers)
 
 
 CLASS_FILES = ("classes.json", "classes.txt", "info_semantic.json")
@@ -302,14 +302,14 @@ def _json_rows(path: Path) -> list[tuple[str, int, str]]:
     rows = data.get("classes") if isinstance(data, dict) else data
     if not isinstance(rows, list):
         raise ValueError(f"{path}: must be a list of classes, or an object with one named `classes`; {_ADVICE}")
-    found = []
+    classes = []
     for index, row in enumerate(rows):
         where = f"{path}: class {index}"
         if not isinstance(row, str):
             check_json(where, row, {"id": int, "name": str}, _ADVICE)
         number, name = (index + 1, row) if isinstance(row, str) else (row["id"], row["name"])
-        found.append((where, number, _name(where, name)))
-    return found
+        classes.append((where, number, _name(where, name)))
+    return classes
 
 
 def _text_rows(path: Path) -> list[tuple[str, int, str]]:
@@ -321,14 +321,14 @@ def _text_rows(path: Path) -> list[tuple[str, int, str]]:
     if any(numbered) and not all(numbered):
         line = rows[numbered.index(False)][0]
         raise ValueError(f"{path}: line {line} must be `NUMBER NAME` as other lines are, is not; correct it")
-    found = []
+    classes = []
     for index, (line, words) in enumerate(rows, 1):
         where = f"{path}: line {line}"
         if any(numbered) and len(words[0]) > 9:
             raise ValueError(f"{where} must begin with a number of at most 9 digits, does not; correct it")
         number, name = (int(words[0]), " ".join(words[1:])) if any(numbered) else (index, " ".join(words))
-        found.append((where, number, _name(where, name)))
-    return found
+        classes.append((where, number, _name(where, name)))
+    return classes
 
 
 def _name(where: str, name: str) -> str:

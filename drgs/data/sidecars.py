@@ -55,7 +55,7 @@ def attach(dataset: Dataset, lazy: bool) -> None:
     Raises:
         FileNotFoundError, ValueError: Maps of other images, one file for two images, or as `Semantics.checked`.
     """
-    found: dict[str, Path] = {}
+    folder_of: dict[str, Path] = {}
     bases = _search_folders(dataset)
     labels = (*LABEL_FOLDERS, SEGMENTS) if dataset.format == "train_meta" else LABEL_FOLDERS
     for kind, names in (("teacher", TEACHER_FOLDERS), ("labels", labels)):
@@ -64,32 +64,32 @@ def attach(dataset: Dataset, lazy: bool) -> None:
             files = _feature_maps(folder) if kind == "teacher" else _label_images(folder)
             matched = _match_views(dataset.views, folder, files)
             if matched:
-                found[kind] = folder
+                folder_of[kind] = folder
                 for view, path in matched:
                     setattr(view, f"{kind.removesuffix('s')}_path", path)
                 break
             _report_unmatched(kind, folder, files, dataset.views)
-    if not found:
+    if not folder_of:
         return
     classes = [base / name for name in CLASS_FILES for base in bases if (base / name).is_file()]
     embeddings = [base / _EMBEDDINGS for base in bases if (base / _EMBEDDINGS).is_file()]
     moving = [base / _MOVING for base in bases if (base / _MOVING).is_file()]
     semantics = Semantics(
-        teacher=found["teacher"].name if "teacher" in found else "",
-        labels=found["labels"].name if "labels" in found else "",
+        teacher=folder_of["teacher"].name if "teacher" in folder_of else "",
+        labels=folder_of["labels"].name if "labels" in folder_of else "",
         maps=tuple(view.teacher_path for view in dataset.views if view.teacher_path),
         label_images=tuple(view.label_path for view in dataset.views if view.label_path),
         class_file=classes[0] if classes else None,
         embedding_file=embeddings[0] if embeddings else None,
         moving_file=moving[0] if moving else None,
     )
-    if "teacher" in found:
+    if "teacher" in folder_of:
         train = dataset.split()[0]
         without = [view.name for view in train if view.teacher_path is None]
         if without:
             _log.warning(
                 "%s: %d of the %d training views have no map (%s); of these, only colors can be fitted",
-                found["teacher"],
+                folder_of["teacher"],
                 len(without),
                 len(train),
                 ", ".join(without[:_SHOWN]) + (", ..." if len(without) > _SHOWN else ""),
@@ -138,7 +138,7 @@ def _match_views(views: list[View], folder: Path, files: dict[str, Path]) -> lis
     """The views that have a file, and which; ValueError if two photographs have the same."""
     cameras = {view.camera_name for view in views} - {""}
     frames = _by_camera(files, cameras, folder.name) if cameras else {}
-    found: list[tuple[View, Path]] = []
+    matched: list[tuple[View, Path]] = []
     owners: dict[Path, View] = {}
     for view in views:
         path = _of_frame(view, files, frames) if view.camera_name else _of_photograph(view, folder, files)
@@ -150,8 +150,8 @@ def _match_views(views: list[View], folder: Path, files: dict[str, Path]) -> lis
                 "put them into subfolders as the images"
             )
         owners[path] = view
-        found.append((view, path))
-    return found
+        matched.append((view, path))
+    return matched
 
 
 def _of_frame(view: View, files: dict[str, Path], frames: dict[tuple[str, int], Path]) -> Path | None:
@@ -182,7 +182,7 @@ def _by_camera(files: dict[str, Path], cameras: set[str], folder: str) -> dict[t
         ValueError: Two files of one frame.
     """
     prefixes = {"", "frame_", "rgb_", f"{folder}_", f"{LABEL_FOLDERS[0]}_"}
-    found: dict[tuple[str, int], Path] = {}
+    file_of: dict[tuple[str, int], Path] = {}
     for key, path in files.items():
         name = PurePosixPath(key)
         owners = [name.parent.name] if name.parent.name else cameras
@@ -194,10 +194,10 @@ def _by_camera(files: dict[str, Path], cameras: set[str], folder: str) -> dict[t
             if frame is None or frame["prefix"] not in prefixes:
                 continue
             owner = camera, int(frame["number"])
-            if owner in found:
-                raise ValueError(f"{path}: must be the only one of its frame, {found[owner]} is too; remove one")
-            found[owner] = path
-    return found
+            if owner in file_of:
+                raise ValueError(f"{path}: must be the only one of its frame, {file_of[owner]} is too; remove one")
+            file_of[owner] = path
+    return file_of
 
 
 def _report_unmatched(kind: str, folder: Path, files: dict[str, Path], views: list[View]) -> None:

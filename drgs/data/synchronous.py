@@ -189,7 +189,7 @@ def late_cameras(pictures: Mapping[str, np.ndarray]) -> list[LateCamera]:
         return []
     table = np.array(list(curves.values()))
     pairs = np.array([[_correlation(a, b) for b in table] for a in table])
-    found = []
+    late = []
     for index, (name, curve) in enumerate(curves.items()):
         rest = np.delete(np.arange(len(table)), index)
         among = pairs[np.ix_(rest, rest)][np.triu_indices(len(rest), 1)]
@@ -201,8 +201,8 @@ def late_cameras(pictures: Mapping[str, np.ndarray]) -> list[LateCamera]:
         best = max(shifts, key=lambda s: (agreement[s], -abs(s)))
         if best and agreement[best] >= _AGREES and agreement[best] - agreement[0] >= _GAIN:
             shift = best + _peak(*(agreement.get(best + step, -1.0) for step in (-1, 0, 1)))
-            found.append(LateCamera(name, shift, agreement[best], agreement[0]))
-    return found
+            late.append(LateCamera(name, shift, agreement[best], agreement[0]))
+    return late
 
 
 def _energy(pictures: np.ndarray) -> np.ndarray:

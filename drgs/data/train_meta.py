@@ -99,23 +99,23 @@ def _cameras(file: Path) -> tuple[dict[int, dict[int, _Shot]], int]:
     if not count or {len(data[key]) for key in ("k", "w2c", "cam_id")} != {count}:
         lengths = ", ".join(f"{key} {len(data[key])}" for key in ("k", "w2c", "fn", "cam_id"))
         raise ValueError(f"{file}: k, w2c, fn and cam_id must be lists of one length by time, got {lengths}; {_ADVICE}")
-    found: dict[int, dict[int, _Shot]] = {}
+    shots: dict[int, dict[int, _Shot]] = {}
     for time in range(count):
         rows = [data[key][time] for key in ("k", "w2c", "fn", "cam_id")]
         if len({len(row) for row in rows}) > 1:
             raise ValueError(f"{file}: time {time}: k, w2c, fn and cam_id must name the same cameras; {_ADVICE}")
         for k, w2c, name, camera in zip(*rows, strict=True):
             where = f"{file}: time {time}, camera {camera}"
-            if time in found.setdefault(camera, {}):
+            if time in shots.setdefault(camera, {}):
                 raise ValueError(f"{where}: must be there once, is there twice; remove one")
             parts = PurePosixPath(name).parts
             if name.startswith("/") or ".." in parts or not parts:
                 raise ValueError(f"{where}: fn must name an image inside {_IMAGES}, got {name[:80]!r}; rename it")
             file_inside(file.parent / _IMAGES, name, f"{where}: fn")
-            found[camera][time] = _Shot(_camera(where, data, k, w2c), name)
-    if not found:
+            shots[camera][time] = _Shot(_camera(where, data, k, w2c), name)
+    if not shots:
         raise ValueError(f"{file}: must list at least one camera, lists none; {_ADVICE}")
-    return dict(sorted(found.items())), count
+    return dict(sorted(shots.items())), count
 
 
 def _camera(where: str, data: dict, k: Any, w2c: Any) -> Camera:

@@ -120,11 +120,11 @@ def check_cameras(views: list[View]) -> None:
     centers = np.stack([view.camera.center for view in views])
     # Cameras on stands may have been calibrated anew for every time.
     near = max(1e-3 * float(np.ptp(centers, axis=0).max()), 1e-6 * max(1.0, float(np.abs(centers).max())))
-    found: list[np.ndarray] = []
+    distinct: list[np.ndarray] = []
     for center in centers:
-        if len(found) < _FEW_PLACES and all(np.abs(center - other).max() > near for other in found):
-            found.append(center)
-    places = len(found)
+        if len(distinct) < _FEW_PLACES and all(np.abs(center - other).max() > near for other in distinct):
+            distinct.append(center)
+    places = len(distinct)
     if len(times) >= 2 and 2 <= places < _FEW_PLACES:
         _log.warning(
             "the %d training views of %d times are from %d places only: from others it will look far worse than "
@@ -238,7 +238,7 @@ def _copies(views: list[View]) -> dict[int, int]:
         alike["file", file.st_dev, file.st_ino, *about].append(index)
         alike["size", file.st_size, *about].append(index)
         alike["pose", (np.round(poses[index] / _EXACT) + 0.0).tobytes(), *about].append(index)  # -0.0 is 0.0
-    found: dict[int, int] = {}
+    first_of: dict[int, int] = {}
     for (kind, *_), members in alike.items():
         for n, index in enumerate(members):
             path = Path(views[index].image_path or "")
@@ -248,11 +248,11 @@ def _copies(views: list[View]) -> dict[int, int]:
                 same = kind == "file" or path == before
                 same = same or bool(is_near and (kind == "name" or filecmp.cmp(path, before, shallow=False)))
                 if same or (kind == "pose" and _look_alike(path, before)):
-                    found[index] = min(found.get(index, index), other)
+                    first_of[index] = min(first_of.get(index, index), other)
                     break
-    for index in sorted(found):  # a copy of a copy is one of the first
-        found[index] = found.get(found[index], found[index])
-    return found
+    for index in sorted(first_of):  # a copy of a copy is one of the first
+        first_of[index] = first_of.get(first_of[index], first_of[index])
+    return first_of
 
 
 def _look_alike(one: Path, other: Path) -> bool:

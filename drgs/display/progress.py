@@ -1,4 +1,4 @@
-"""What is going on, on stderr: a bar on a terminal, and where stderr is a file or a pipe a line now and then.
+"""Progress on stderr: a bar on a terminal, and where stderr is a file or a pipe a line now and then.
 
 Bars nest; the innermost one is shown. A thread writes the lines, so that work which stays away from Python for minutes
 (COLMAP, a kernel that is compiled, a slow view) is reported as well.
@@ -20,7 +20,7 @@ __all__ = ["Bar", "duration", "quietly"]
 FIRST = 1.0  # seconds after which a stage is worth its first line
 EVERY = 10.0  # seconds between two lines at first; they become rarer, up to LEAST_OFTEN
 LEAST_OFTEN = 30.0
-_TELLING = 24  # steps after which a rate is believed: kernels are compiled in a fit's first ones, of every renderer
+_STEADY_AFTER = 24  # steps after which a rate is believed: kernels are compiled in a fit's first ones
 _bars: list[Bar] = []  # that are open, the innermost last
 _output: _Lines | _Terminal | Any = None  # None while none of them is shown
 
@@ -36,8 +36,8 @@ class Bar:
     """How far something is, for the length of a `with` block.
 
     Args:
-        label: Name of what is going on.
-        total: Number of steps; None: nobody knows.
+        label: Name of the stage.
+        total: Number of steps; None: unknown.
         show: Whether it is shown; None: if the bar around it is, so that library functions may have bars.
         done: Number of steps done before, which took no time.
         lines_only: Whether it is left out on a terminal.
@@ -51,7 +51,7 @@ class Bar:
         self.done = done
         self.text = ""
         self.is_drawn = not lines_only
-        self.is_told = False
+        self.is_reported = False
         self._show = show
         self._before = done
         self._marks: list[tuple[int, float]] = []  # steps done, and when
@@ -64,7 +64,7 @@ class Bar:
         return self
 
     def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
-        if error is None and self.is_told and self.total is not None:
+        if error is None and self.is_reported and self.total is not None:
             self.note(self.line())
         _close(self)
 
@@ -78,15 +78,15 @@ class Bar:
         Args:
             done: Number of steps done.
             total: Number of steps.
-            label: Name of what is going on. Another one is another stage, whose time starts now.
+            label: Name of the stage. Another one is another stage, whose time starts now.
             text: What else to say, e.g. how good the result is so far.
         """
         if label is not None and label != self.label:
-            if self.is_told and self.total is not None:
+            if self.is_reported and self.total is not None:
                 self.note(self.line())
             self.label = label
             self.began = time.monotonic()
-            self.is_told = False
+            self.is_reported = False
             self._before = done
             self._marks = [(done, self.began)]
         if done != self.done:
@@ -118,9 +118,9 @@ class Bar:
         return f"{self.label}: {', '.join(parts)}"
 
     def _left(self, now: float) -> float:
-        """Seconds until all steps are done, by the later half of those done so far; 0 where that tells nothing yet."""
+        """Seconds until all steps are done, by the later half of those done so far; 0 where these say nothing yet."""
         steps = self.done - self._before
-        if not self.total or steps < max(1, min(_TELLING, self.total // 10)):
+        if not self.total or steps < max(1, min(_STEADY_AFTER, self.total // 10)):
             return 0.0
         done, reached = self._marks[-1]
         first, began = self._marks[bisect.bisect_right(self._marks, (self._before + steps // 2, math.inf)) - 1]
@@ -174,8 +174,8 @@ class _Lines:
             now = time.monotonic()
             pause = min(LEAST_OFTEN, max(EVERY, 0.05 * (now - self._began)))
             for bar in [bar for bar in _bars if bar.is_shown][-1:]:
-                if now - self._last >= pause or (not bar.is_told and now - bar.began >= FIRST):
-                    bar.is_told = True
+                if now - self._last >= pause or (not bar.is_reported and now - bar.began >= FIRST):
+                    bar.is_reported = True
                     self.note(bar.line())
 
     def draw(self, bar: Bar) -> None:

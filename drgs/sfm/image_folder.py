@@ -244,12 +244,12 @@ def recorded_frames(folder: Path) -> dict[str, Any] | None:
     path = folder / FRAMES
     if not path.is_file():
         return None
-    found = read_json(path, "a list of frames that drgs wrote", "gather the frames again")
-    if not isinstance(found, dict) or not {"schema", "command", "frames"} <= found.keys():
+    content = read_json(path, "a list of frames that drgs wrote", "gather the frames again")
+    if not isinstance(content, dict) or not {"schema", "command", "frames"} <= content.keys():
         return None
     shape = {"videos": list, "frames": [{"file": str, "video": str}], "findings": list}
-    check_json(f"{path}", found, shape, "gather the frames again")
-    return found
+    check_json(f"{path}", content, shape, "gather the frames again")
+    return content
 
 
 def joined_frames(
@@ -295,25 +295,27 @@ def _picked(videos: Sequence[Path], most: int, report: Callable[[str, int, int],
     """Frames of each video; of several, as many of each as its share of those that are wanted."""
     if most < max(1, len(videos)):
         raise ValueError(f"frames: must be at least one of each video, {len(videos)}, got {most}; ask for more")
-    found = []
+    examined = []
     for video in videos:
-        found.append(examine(video, lambda done, total, video=video: report(f"looking at {video.name}", done, total)))
-    wanted = [min(one.wanted, most) for one in found]
+        examined.append(
+            examine(video, lambda done, total, video=video: report(f"looking at {video.name}", done, total))
+        )
+    wanted = [min(one.wanted, most) for one in examined]
     shares = wanted
     if sum(wanted) > most:  # one of each, and the rest by what is wanted
         rest = most - len(wanted)
         shares = [1 + int(rest * (one - 1) / max(sum(wanted) - len(wanted), 1)) for one in wanted]
-    return [one.pick(share) for one, share in zip(found, shares, strict=True)]
+    return [one.pick(share) for one, share in zip(examined, shares, strict=True)]
 
 
 def _stems(videos: Sequence[Path]) -> list[str]:
     """What the names of frames begin with, of each video another: frames of one follow each other by name."""
-    found = list[str]()
+    stems = list[str]()
     for video in videos:
         numbered = (f"{video.stem}_{k}" for k in itertools.count(2))
         names = itertools.chain((video.stem, f"{video.resolve().parent.name}_{video.stem}"), numbered)
-        found.append(next(name for name in names if name not in found))
-    return found
+        stems.append(next(name for name in names if name not in stems))
+    return stems
 
 
 def _free_name(folder: Path, path: Path) -> str:

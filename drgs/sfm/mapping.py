@@ -238,20 +238,22 @@ class PhotoGroups:
         """
         if len(self.kept) == len(names):
             return []
-        found = []
+        sentences = []
         if self.others:
             count = len(self.others) + 1
-            found.append(
+            sentences.append(
                 f"the photos fell apart into {count} models; the largest was kept, with {len(self.kept)} photos: "
                 f"{name_ranges(self.kept, names)}"
             )
             for number, other in enumerate(self.others, 2):
                 shared = len(set(other) & set(self.kept))
                 also = f", {shared} of them also in the kept one" if shared else ""
-                found.append(f"model {number}, left out, has {len(other)} photos{also}: {name_ranges(other, names)}")
+                sentences.append(
+                    f"model {number}, left out, has {len(other)} photos{also}: {name_ranges(other, names)}"
+                )
         if self.alone:
-            found.append(f"in no model: {len(self.alone)} photos: {name_ranges(self.alone, names)}")
-        return found + [f"what would help: {advice}" for advice in self._advice(is_masked, is_partial)]
+            sentences.append(f"in no model: {len(self.alone)} photos: {name_ranges(self.alone, names)}")
+        return sentences + [f"what would help: {advice}" for advice in self._advice(is_masked, is_partial)]
 
     def _advice(self, is_masked: bool, is_partial: bool) -> Iterator[str]:
         """What would bring more photographs into the kept model, the surest first, by what the database shows."""

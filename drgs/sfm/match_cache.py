@@ -59,21 +59,21 @@ def cached(views: list[View], triangulate: Callable[[], Triangulated]) -> Triang
 
 def _digest(views: list[View]) -> str:
     """Hash of all that triangulation depends on: content of photographs and masks, cameras, and the code."""
-    found = hashlib.blake2b(_code(), digest_size=20)
+    digest = hashlib.blake2b(_code(), digest_size=20)
     for view in views:
         for field in dataclasses.fields(view.camera):
             value = getattr(view.camera, field.name)
             value = value.detach().cpu().numpy() if hasattr(value, "detach") else value
-            found.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
-        found.update(repr((view.background, view.keeps_lens, view.mask_path is None)).encode())
+            digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+        digest.update(repr((view.background, view.keeps_lens, view.mask_path is None)).encode())
         if view.frame is not None:  # a video has gigabytes
             status = view.frame.path.stat()
             row = view.frame.path.resolve(), status.st_size, status.st_mtime_ns, view.frame.index
-            found.update(repr(row).encode())
+            digest.update(repr(row).encode())
         for path in (view.image_path, view.mask_path):
             if path is not None:
-                found.update(_content(path))
-    return found.hexdigest()
+                digest.update(_content(path))
+    return digest.hexdigest()
 
 
 def _read(path: Path, count: int) -> Triangulated | None:
@@ -114,16 +114,16 @@ def _write(path: Path, kept: Triangulated) -> None:
 
 def _bound(folder: Path) -> None:
     """Delete the files that were used longest ago until the others are small enough; no file that is not of ours."""
-    found = []
+    files = []
     for path in folder.iterdir():
         with contextlib.suppress(OSError):  # another process deletes, too
             status = path.lstat()
             if _OURS.fullmatch(path.name):
-                found.append((status.st_mtime, status.st_size, path))
+                files.append((status.st_mtime, status.st_size, path))
             elif is_left_over(path) and time.time() - status.st_mtime > _LEFT:
                 path.unlink()
-    total = sum(size for _, size, _ in found)
-    for _, size, path in sorted(found):
+    total = sum(size for _, size, _ in files)
+    for _, size, path in sorted(files):
         if total <= _LARGEST:
             break
         with contextlib.suppress(OSError):
@@ -133,11 +133,11 @@ def _bound(folder: Path) -> None:
 
 def _content(path: Path) -> bytes:
     """Hash of a file."""
-    found = hashlib.blake2b(digest_size=20)
+    digest = hashlib.blake2b(digest_size=20)
     with path.open("rb") as file:
         while chunk := file.read(_CHUNK):
-            found.update(chunk)
-    return found.digest()
+            digest.update(chunk)
+    return digest.digest()
 
 
 @functools.cache
@@ -145,9 +145,9 @@ def _code() -> bytes:
     """Hash of the modules that read photographs and match them, and of the version of their features."""
     import cv2
 
-    found = hashlib.blake2b(cv2.__version__.encode(), digest_size=20)
+    digest = hashlib.blake2b(cv2.__version__.encode(), digest_size=20)
     package = Path(__file__).parents[1]
     rooms = (*sorted((package / "data").glob("*.py")), *sorted((package / "sfm").glob("*.py")))
     for path in (*rooms, package / "cameras.py", package / "lenses.py"):
-        found.update(_content(path))
-    return found.digest()
+        digest.update(_content(path))
+    return digest.digest()

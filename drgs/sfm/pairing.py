@@ -135,13 +135,13 @@ def global_descriptors(database: Path, names: list[str], seed: int = 0) -> np.nd
         few = len(features) > _SAMPLE
         samples.append(features[np.sort(rng.choice(len(features), _SAMPLE, replace=False))] if few else features)
     centers = _centers(np.concatenate(samples), rng)
-    found = np.zeros((len(names), len(centers), 128), np.float32)
+    descriptors = np.zeros((len(names), len(centers), 128), np.float32)
     for index, features in enumerate(_features(database, names)):
         if len(features):
             label, _ = vq(features, centers)
-            np.add.at(found[index], label, features - centers[label])
-    found /= np.maximum(np.linalg.norm(found, axis=2, keepdims=True), 1e-12)
-    flat = found.reshape(len(names), -1)
+            np.add.at(descriptors[index], label, features - centers[label])
+    descriptors /= np.maximum(np.linalg.norm(descriptors, axis=2, keepdims=True), 1e-12)
+    flat = descriptors.reshape(len(names), -1)
     flat = np.sign(flat) * np.sqrt(np.abs(flat))
     return flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
 

@@ -94,9 +94,9 @@ def leave_out(
     Raises:
         ValueError: Fewer are left.
     """
-    found = {photo: fault_of(photo) for photo in photos}
-    kept = [photo for photo in photos if not found[photo]]
-    faults = [fault for fault in found.values() if fault]
+    faults_of = {photo: fault_of(photo) for photo in photos}
+    kept = [photo for photo in photos if not faults_of[photo]]
+    faults = [fault for fault in faults_of.values() if fault]
     if faults and len(kept) < fewest:
         raise ValueError(f"{where}: must hold at least {fewest} {what} that can be used, got {len(kept)}; {faults[0]}")
     for fault in faults[:_FAULTS]:

@@ -344,15 +344,15 @@ def _shown_beside(views: list[View], points: np.ndarray, shown: np.ndarray) -> t
     """The points, and which views show them: `shown`, and where they are as far away as the nearest point that the view
     shows by its tracks in their part of the picture. Tracks alone are short: errors add up from one to the next.
     """
-    found = shown.copy()
+    visible = shown.copy()
     for row, view in enumerate(views):
         inside, pixels, depth = _inside(view, points)
         cells = (pixels * _CELLS / max(view.camera.width, view.camera.height)).astype(int) @ (1, _CELLS)
         nearest = np.full(_CELLS * _CELLS, np.inf)
         mine = shown[row, inside]
         np.minimum.at(nearest, cells[mine], depth[mine])
-        found[row, inside[np.abs(depth / nearest[cells] - 1) < _TRACK_DEPTH]] = True
-    return points, found
+        visible[row, inside[np.abs(depth / nearest[cells] - 1) < _TRACK_DEPTH]] = True
+    return points, visible
 
 
 def _shown_by_depth(views: list[View], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -365,14 +365,14 @@ def _shown_by_depth(views: list[View], rng: np.random.Generator) -> tuple[np.nda
             known = np.flatnonzero(depth)
             pixels = rng.choice(known, min(share, len(known)), replace=False)
             points.append(back_project(view.camera, pixels, depth.reshape(-1)[pixels]))
-    found = np.concatenate([np.empty((0, 3)), *points])
-    shown = np.zeros((len(views), len(found)), bool)
+    drawn = np.concatenate([np.empty((0, 3)), *points])
+    shown = np.zeros((len(views), len(drawn)), bool)
     for row, view in enumerate(views):
         if (depth := view.depth()) is not None:
-            inside, pixels, own = _inside(view, found)
+            inside, pixels, own = _inside(view, drawn)
             columns, rows = pixels.astype(int).T
             shown[row, inside] = np.abs(depth[rows, columns] / own - 1) < _MAP_DEPTH
-    return found, shown
+    return drawn, shown
 
 
 def _inside(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

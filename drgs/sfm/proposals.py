@@ -57,7 +57,7 @@ def propose_near_triangulated(
     )
     # Where no pixel is open all shares are 0, and so are the numbers, not NaN.
     numbers = np.floor(count * np.cumsum(np.append(0, shares)) / max(shares.sum(), 1e-12)).astype(int)
-    found, colors = [], []
+    proposed, colors = [], []
     for view, camera, (places, depths), allowed, number in zip(
         views, cameras, own, open_pixels, np.diff(numbers), strict=True
     ):
@@ -69,11 +69,11 @@ def propose_near_triangulated(
             depth = depths[kept][_one_of_nearest(places[kept], pixels, camera.width, rng)]
         else:
             depth = rng.choice(anywhere, number)
-        found.append(back_project(camera, pixels, depth * np.exp(_JITTER * rng.normal(size=number))))
+        proposed.append(back_project(camera, pixels, depth * np.exp(_JITTER * rng.normal(size=number))))
         colors.append(view.image().reshape(-1, 3)[pixels])
-    if not found:
+    if not proposed:
         return np.empty((0, 3)), np.empty((0, 3), dtype=np.float32)
-    return np.concatenate(found), np.concatenate(colors)
+    return np.concatenate(proposed), np.concatenate(colors)
 
 
 def uncovered_share(views: list[View], points: np.ndarray, shown: np.ndarray) -> float:
@@ -104,13 +104,13 @@ def _one_of_nearest(places: np.ndarray, pixels: np.ndarray, width: int, rng: np.
     centers = np.stack([pixels % width, pixels // width], axis=-1) + 0.5
     count = min(_NEAREST, len(places))
     which = rng.integers(0, count, len(pixels))
-    found = np.empty(len(pixels), np.int64)
+    chosen = np.empty(len(pixels), np.int64)
     for start in range(0, len(pixels), _CHUNK):
         part = slice(start, start + _CHUNK)
         squares = ((centers[part, None] - places[None]) ** 2).sum(axis=2)
         nearest = np.argpartition(squares, count - 1, axis=1)[:, :count]
-        found[part] = nearest[np.arange(len(nearest)), which[part]]
-    return found
+        chosen[part] = nearest[np.arange(len(nearest)), which[part]]
+    return chosen
 
 
 def propose_in_view(views: list[View], count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -293,11 +293,11 @@ class VisualHull:
 
     def colors(self, places: np.ndarray) -> np.ndarray:
         """(P, 3) float32 medians of what photographs show at places (P, 3), each of which one shows."""
-        found = np.full((len(self.cameras), len(places), 3), np.nan, np.float32)
+        seen = np.full((len(self.cameras), len(places), 3), np.nan, np.float32)
         for index in range(len(self.cameras)):
             shown, columns, rows = self._pixels(index, places)
-            found[index, shown] = self.images[index][rows, columns]
-        return np.nanmedian(found, axis=0)
+            seen[index, shown] = self.images[index][rows, columns]
+        return np.nanmedian(seen, axis=0)
 
     def points(
         self, count: int, rng: np.random.Generator, progress: Callable[[str, int, int], None] | None = None
@@ -313,19 +313,19 @@ class VisualHull:
             (P, 3) world points and (P, 3) float32 colors, the medians of what photographs show there; None where
             photographs leave no room that they agree on.
         """
-        found, total = [], 0
+        kept, total = [], 0
         for _ in range(_ROUNDS):
             places = self.center + self.reach * _in_ball(_ROUND, rng)
             number = self.support(places)
-            found.append(places[number >= max(2, number.max() / 2)])
-            total += len(found[-1])
+            kept.append(places[number >= max(2, number.max() / 2)])
+            total += len(kept[-1])
             if progress:
                 progress("room for points", min(total, count), count)
             if total >= count:
                 break
         if total < min(count, _FEWEST_POINTS):
             return None
-        points = np.concatenate(found)[:count]
+        points = np.concatenate(kept)[:count]
         return points, self.colors(points)
 
     def _pixels(self, index: int, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -143,13 +143,13 @@ class ExaminedVideo:
         """What is wrong with the video, the longest stretches first."""
         name, times = self._video.path.name, self._times
         motion = np.array([look.motion for look in self._looks])
-        found = list[tuple[float, Finding]]()
+        findings = list[tuple[float, Finding]]()
 
         def add(stretches: Sequence[tuple[int, int]], kind: str, text: str, advice: str) -> None:
             for start, end in stretches:
                 if times[end] - times[start] >= _SHORTEST:
                     where = f"{name}, {times[start]:.1f} to {times[end]:.1f} s"
-                    found.append((times[end] - times[start], Finding(kind, f"{where}: {text}", advice)))
+                    findings.append((times[end] - times[start], Finding(kind, f"{where}: {text}", advice)))
 
         aside = "step sideways while you turn, or walk around what you film"
         add(self._turns, "turn", "the camera only turns, which shows no depth", aside)
@@ -165,14 +165,14 @@ class ExaminedVideo:
         is_still = not self._turns and self.wanted <= max(most, rate * length) and not is_blank.all()
         if is_still and length >= shortest:
             text = f"{name}: the camera hardly moves in {length:.1f} s"
-            found.append((length, Finding("still", text, "walk around what you film")))
+            findings.append((length, Finding("still", text, "walk around what you film")))
         far = [frame for frame in frames[1:] if frame.motion > _LONGEST_STEP]
         if len(far) > 0.1 * len(frames):
             text = f"{name}: {len(far)} of {len(frames)} frames share little with the one before"
             most = min(self.wanted, self._video.count)
             more = f"ask for more frames (--frames {most}), or " if most > len(frames) else ""
-            found.append((length, Finding("overlap", text, f"{more}film more slowly")))
-        return [finding for _, finding in sorted(found, key=lambda pair: -pair[0])]
+            findings.append((length, Finding("overlap", text, f"{more}film more slowly")))
+        return [finding for _, finding in sorted(findings, key=lambda pair: -pair[0])]
 
 
 def pick_frames(path: Path, most: int = 150, progress: Callable[[int, int], None] | None = None) -> Picked:
@@ -222,13 +222,13 @@ def examine(path: Path, progress: Callable[[int, int], None] | None = None) -> E
 
 def _sharpest(path: Path, indices: Sequence[int]) -> tuple[float, int, np.ndarray]:
     """Sharpness and number of the sharpest of some frames, and (h, w) uint8 of it, small."""
-    found = []
+    candidates = []
     for index in indices:
         gray = VideoFrame(path, index).read_gray(_SHARP_AT)
         # Noise is no sharpness: of single pixels it is a large part of the Laplacian's variance.
         sharpness = float(cv2.Laplacian(cv2.GaussianBlur(gray, (0, 0), 0.8), cv2.CV_32F).var())
-        found.append((sharpness, index, gray))
-    sharpness, index, gray = max(found, key=lambda one: one[0])
+        candidates.append((sharpness, index, gray))
+    sharpness, index, gray = max(candidates, key=lambda one: one[0])
     return sharpness, index, shrunk(gray, _WIDTH)
 
 
