@@ -180,11 +180,7 @@ def _registered(
         pairing = choose_new_pairs(database, old, list(new), options.seed)
         match(database, pairing.pairs, seed=options.seed, progress=report)
         times.end("matching")
-        pipeline = pycolmap.IncrementalPipelineOptions()
-        pipeline.random_seed = options.seed
-        pipeline.multiple_models = False
-        pipeline.fix_existing_frames = True
-        pipeline.constant_cameras = {camera.camera_id for camera in cameras}
+        pipeline = _held_pipeline(options.seed, cameras)
         mapping = MappingProgress(len(names), report, status, before.num_reg_images())
         models = map_photos(database, readable, partial / "models", pipeline, mapping, base=scene / "sparse/0")
         times.end("mapping")
@@ -214,6 +210,18 @@ def _link_photographs(scene: Path, new: dict[str, Path], partial: Path) -> None:
         link_or_copy(path, partial / "photos" / path.name)
     for name, file in new.items():
         link_or_copy(file, partial / "photos" / name)
+
+
+def _held_pipeline(seed: int, cameras: list[Any]) -> Any:
+    """pycolmap's options of mapping that holds the poses that are there, and these lenses."""
+    from drgs.data.colmap_bindings import pycolmap
+
+    pipeline = pycolmap.IncrementalPipelineOptions()
+    pipeline.random_seed = seed
+    pipeline.multiple_models = False
+    pipeline.fix_existing_frames = True
+    pipeline.constant_cameras = {camera.camera_id for camera in cameras}
+    return pipeline
 
 
 def _shared_camera(cameras: list[Any], files: list[Path]) -> int | None:
