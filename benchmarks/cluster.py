@@ -30,7 +30,7 @@ import drgs  # noqa: E402
 from drgs.cameras import Camera, intrinsics_from_fov, look_at  # noqa: E402
 from drgs.cluster.connect import opened  # noqa: E402
 from drgs.cluster.payloads import Payload  # noqa: E402
-from drgs.files import write_json  # noqa: E402
+from drgs.io.outputs import write_json  # noqa: E402
 from drgs.select import Selection, select  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
 

@@ -12,9 +12,9 @@ import pytest
 
 from drgs import cli
 from drgs.commands import cite
-from drgs.files import SCHEMA
 from drgs.fitting.config import FitConfig, SelectionConfig
 from drgs.fitting.semantic_record import SemanticRecord
+from drgs.io.journal import SCHEMA
 from drgs.settings import RenderSettings
 
 CORE = {"drgs", "jakob2022drjit", "mitsuba3", "kerbl2023gaussians", "li2025nextbestview"}

@@ -19,12 +19,13 @@ from drgs.data import load
 from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.data.images import read_image
 from drgs.data.point_ply import read_point_ply
-from drgs.files import SCHEMA, Run, load_ply, load_state, save_ply, save_state
+from drgs.files import Run, load_ply, load_state, save_ply, save_state
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import Frame
 from drgs.fitting.records import check_checkpoint, fitted_views
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.trainer import Trainer
+from drgs.io.journal import SCHEMA
 
 
 def attempt(read, path, versions) -> None:

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from drgs.files import atomic_write, write_json
+from drgs.files import atomic_write
 from drgs.io import locks, outputs
 from drgs.io.atomic import temporary_folder
-from drgs.io.outputs import check_file, lock_folder, replacing
+from drgs.io.outputs import check_file, lock_folder, replacing, write_json
 
 
 def put(path: Path, text: str) -> None:

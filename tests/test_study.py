@@ -19,9 +19,10 @@ from test_data import write_transforms
 from test_dynamic_data import cameras, coded, write_poses, write_video
 
 from drgs import train
-from drgs.files import Run, write_json
+from drgs.files import Run
 from drgs.fitting.config import FitConfig
 from drgs.io.locks import InUse
+from drgs.io.outputs import write_json
 from drgs.studies import cells as engine
 from drgs.studies.cells import Metric, Study, distinct_seeds, run_cell, run_cells
 from drgs.studies.experiments import EXPERIMENTS

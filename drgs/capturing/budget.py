@@ -224,7 +224,7 @@ def plan_poses(
     Args:
         folder, names: The photographs, at least two.
         budget: Seconds of the whole capture.
-        decode: As `drgs.data.checks.read_image`.
+        decode: As `drgs.data.images.read_image`.
     """
     largest = max(image_size(folder / names[0]))
     chosen = [names[len(names) // 3], names[min(len(names) // 3 + 1, len(names) - 1)]]
@@ -304,8 +304,8 @@ def _write_small(image: np.ndarray, target: Path) -> None:
     """A photograph as PNG of at most `_MEASURED_SIZE` pixels along the longer side."""
     import cv2
 
-    image = np.ascontiguousarray(image[..., 2::-1] if image.ndim == 3 else image)
-    target.write_bytes(cv2.imencode(".png", shrunk(image, _MEASURED_SIZE))[1].tobytes())
+    image = image[..., 2::-1] if image.ndim == 3 else image
+    target.write_bytes(cv2.imencode(".png", shrunk(np.ascontiguousarray(image), _MEASURED_SIZE))[1].tobytes())
 
 
 def _pose_seconds(count: int, features: float, pair: float, scale: float) -> float:

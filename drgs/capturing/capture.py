@@ -45,7 +45,7 @@ class CaptureOptions:
         output: The run folder.
         budget: Seconds for the whole capture; None: sizes and steps are those of the fit's configuration.
         frames: Largest number of frames of all videos together.
-        masks: Folder of masks, or `alpha`, as `drgs.data.sfm.run_sfm` takes them; None without.
+        masks: Folder of masks, or `alpha`, as `drgs.sfm.reconstruction.run_sfm` takes them; None without.
         seed: Seed of everything random.
         resume: Go on with a capture that was stopped.
         add: The photographs join those of a capture that is done.
@@ -97,7 +97,7 @@ class Photographs:
         self._kept: dict[tuple[Path, int, int], np.ndarray] = {}
 
     def decode(self, path: Path) -> np.ndarray:
-        """The pixels of an image file, as `drgs.data.checks.read_image` has them, with its errors."""
+        """The pixels of an image file, as `drgs.data.images.read_image` has them, with its errors."""
         try:
             file = path.resolve()
             status = file.stat()

@@ -54,7 +54,7 @@ def of_photographs(
 
     Args:
         folder, names: The photographs, in the order in which they were taken.
-        decode: As `drgs.data.checks.read_image`.
+        decode: As `drgs.data.images.read_image`.
     """
     import cv2
 
@@ -63,9 +63,8 @@ def of_photographs(
         for name in names:
             image = decode(folder / name)
             plain = image if image.ndim == 2 else np.ascontiguousarray(image[..., :3]).mean(axis=2)
-            plain = shrunk(
-                (plain / (255.0 if image.dtype == np.uint8 else 65535.0)).astype(np.float32), _SHARPNESS_SIZE
-            )
+            plain = (plain / (255.0 if image.dtype == np.uint8 else 65535.0)).astype(np.float32)
+            plain = shrunk(plain, _SHARPNESS_SIZE)
             sharp.append(float(cv2.Laplacian(plain, cv2.CV_32F).var()))
             gray.append(float(plain.mean()))
             bar.advance()

@@ -76,7 +76,8 @@ def add_poses(capture: Capture) -> Outcome:
         before = capture.record.batches[0].plan.get("poses", {})
         size = {key: before[key] for key in ("max_image_size",) if key in before}
         with _explained(capture), Bar("poses") as bar:
-            joined = register(scene, files, SfmOptions(seed=capture.options.seed, **size), bar.stage, _shown_by(bar))
+            options = SfmOptions(seed=capture.options.seed, **size)
+            joined = register(scene, files, options, bar.stage, _shown_by(bar))
         summary = joined.summary
         capture.poses_changed()
         posed = _posed(capture, files)

@@ -20,14 +20,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drgs.capturing import diagnosis
-from drgs.capturing.budget import duration, plan_frames
+from drgs.capturing.budget import plan_frames
 from drgs.capturing.capture import Capture, CaptureOptions, Clock, Photographs, config_of
 from drgs.capturing.fit import fit_photographs
 from drgs.capturing.opening import new_files, open_record
 from drgs.capturing.poses import add_poses, find_poses, given_poses
 from drgs.capturing.record import FOLDER, CaptureRecord, DoneStep, inputs_of
 from drgs.data.images import list_images
-from drgs.display.progress import Bar
+from drgs.display.progress import Bar, duration
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import is_run
 from drgs.fitting.resume import lock_run

@@ -45,7 +45,7 @@ class View:
             else empty.
         frame: The frame of a video, where the photograph is one; `image_path` is None then.
         keeps_lens: Images and what belongs to them are as they were taken, of `camera` itself, not undistorted.
-        decode: Decodes the image file, as `drgs.data.checks.read_image`; a capture's keeps what it has decoded.
+        decode: Decodes the image file, as `drgs.data.images.read_image`; a capture's keeps what it has decoded.
         is_checked: False while the camera's size is what the camera file states and no image has been opened.
     """
 

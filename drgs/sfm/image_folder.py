@@ -116,7 +116,7 @@ def usable_files(
         where: What was named, for the message.
         fewest: How many photographs there must be where there are no videos.
         max_image_size: Pixels on the longer side that features are found at; 0 for the photographs' own.
-        decode: As `drgs.data.checks.read_image`, which it may keep the pictures of.
+        decode: As `drgs.data.images.read_image`, which it may keep the pictures of.
     Raises:
         ValueError: Fewer are left; the message says what is wrong with the first of the others.
     """
