@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.commands.options import View
     from drgs.commands.painters import Painter
-    from drgs.commands.scene_input import SELECTION, SceneInput, ranking_of
     from drgs.viewing.server import Viewer
 
 __all__ = ["run", "subject_of", "watched_files"]
