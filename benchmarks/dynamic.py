@@ -40,8 +40,8 @@ from drgs.data import load  # noqa: E402
 from drgs.deform import DynamicGaussians  # noqa: E402
 from drgs.ellipsoids import Gaussians, semi_axes  # noqa: E402
 from drgs.files import Run  # noqa: E402
+from drgs.fitting.components.motion import MotionComponent, Smoothness  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
-from drgs.fitting.dynamics import Motion, Smoothness  # noqa: E402
 from drgs.fitting.frames import Frame  # noqa: E402
 from drgs.fitting.records import load_run  # noqa: E402
 from drgs.fitting.rows import GaussianRows  # noqa: E402
@@ -94,8 +94,8 @@ def trainer(g: Gaussians, shown: list[Frame], gates: torch.Tensor | None) -> Tra
     rows = GaussianRows(
         {**{k: v for k, v in tensors.items() if k != "sh"}, "sh_dc": g.sh[:, :1], "sh_rest": g.sh[:, 1:]}
     )
-    motion = None if gates is None else Motion(config, [k / (TIMES - 1) for k in range(TIMES)])
-    made = Trainer(config, shown, rows, 1.0, motion=motion)
+    motion = [] if gates is None else [MotionComponent([k / (TIMES - 1) for k in range(TIMES)])]
+    made = Trainer(config, shown, rows, 1.0, motion)
     made.step()
     if gates is not None:
         with torch.no_grad():
@@ -116,9 +116,9 @@ def steps(made: dict[str, Trainer], turns: int) -> dict[str, float]:
 
 def profile(fit: Trainer, turns: int) -> dict[str, float]:
     """CPU seconds of the parts that a field adds, each by itself."""
-    scene = fit.parts.scene(fit.rows)
+    scene = fit.scene()
     fitted = [x for x in scene.parameters().values() if x.requires_grad]
-    smooth = next(term for term in fit.parts.terms if isinstance(term, Smoothness))
+    smooth = next(term for x in fit.components for term in x.terms if isinstance(term, Smoothness))
 
     def there_and_back():
         seen = scene.at(0.3)
@@ -132,7 +132,7 @@ def profile(fit: Trainer, turns: int) -> dict[str, float]:
         "field, forward": alone(lambda: scene.at(0.3)),
         "field, forward and backward": alone(there_and_back),
         "regularizers": alone(lambda: smooth(None, None, None).backward()),
-        "optimizer": sum(alone(network.optimizer.step) for network in fit.parts.networks),
+        "optimizer": sum(alone(network.optimizer.step) for network in fit.networks),
     }
 
 

@@ -17,7 +17,7 @@ from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import Frame, frames_for
 from drgs.fitting.losses import LossTerm
 from drgs.fitting.renderers import RendererSchedule
-from drgs.fitting.start import start
+from drgs.fitting.start import start_plain
 from drgs.metrics import through_renderers
 from drgs.settings import RenderSettings
 
@@ -70,9 +70,8 @@ def fitted(
     dataset = load(DATA / scene)
     train, test = split_of(dataset, config)
     frames = frames_for(train, config.data)
-    trainer, *_ = start(dataset, train, frames, config, None, None, False, 0)
-    parts = trainer.parts
-    trainer.parts = dataclasses.replace(parts, terms=[*parts.terms, *terms(frames)])
+    trainer = start_plain(dataset, train, frames, config)
+    trainer.terms = [*trainer.terms, *terms(frames)]
     if cycle:
         trainer.renderers = RendererSchedule(config.max_steps, ((0.0, tuple(cycle)),))
     took: list[float] = []

@@ -37,9 +37,9 @@ from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
 import drgs  # noqa: E402
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, look_at  # noqa: E402
 from drgs.display.pictures import write_png  # noqa: E402
+from drgs.fitting.components.lens import lost_share  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.fitting.frames import load_frames  # noqa: E402
-from drgs.fitting.lenses import lost_share  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "lenses.jsonl"

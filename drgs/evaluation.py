@@ -6,19 +6,19 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from drgs.display.pictures import file_names
+from drgs.fitting.components.base import RunViews
+from drgs.fitting.components.table import COMPONENTS
 from drgs.fitting.frames import frames_for, load_dataset
-from drgs.fitting.poses import displacement
 from drgs.fitting.records import fit_record, fitted_views, load_run
 from drgs.fitting.renderers import renderers_to_measure
 from drgs.fitting.stages import moving_labels
-from drgs.metrics import VIEW_PICTURES, Lpips, evaluate, refined_scores, through_renderers, write_metrics
+from drgs.metrics import VIEW_PICTURES, Lpips, evaluate, through_renderers, write_metrics
 from drgs.sizes import reduced_size
 
 if TYPE_CHECKING:
     from drgs.data import Dataset, View
-    from drgs.deform import DynamicGaussians
     from drgs.fitting.frames import Frame
-    from drgs.fitting.records import LoadedRun
+    from drgs.fitting.records import FitRecord, LoadedRun
     from drgs.fitting.segments import Segmentation
     from drgs.io.outputs import LockedFolder
     from drgs.io.run import Run
@@ -52,63 +52,70 @@ def evaluate_run(
         ValueError: If there is no such view, a photograph is not as large as `scale` asks for, or the run or its data
             set is damaged.
     """
-    recorded = fit_record(run)
-    loaded = load_run(run)
-    g, scene = loaded.gaussians, loaded.scene
-    config = recorded.config
-    # Of an active run, images may be missing that were never picked.
-    dataset = load_dataset(
-        recorded.data,
-        config,
-        lazy=recorded.is_active,
-        points=False,
-        strict=strict,
-        semantics=recorded.semantics is not None or bool(recorded.times),  # labels say what moves
-    )
+    recorded, loaded = fit_record(run), load_run(run)
+    scene, config = loaded.scene, recorded.config
+    dataset = _dataset_of(recorded, strict)
     stated = {view.name: view.camera for view in dataset.split()[0]}
     train, test = recorded.with_refined_poses(dataset).split()
-    chosen: dict[str, Any] = {}
+    more: dict[str, Any] = {} if scale == 1 else {"scale": scale}
     if recorded.is_active:  # the rest of the training split was never seen
-        chosen = {"fitted": fitted_views(run), "pool_leak": run.config().get("pool_leak")}
-        train = [view for view in train if view.name in chosen["fitted"]]
+        more |= {"fitted": fitted_views(run), "pool_leak": run.config().get("pool_leak")}
+        train = [view for view in train if view.name in more["fitted"]]
     views = {"test": test, "train": train, "all": train + test}[split]
     if not views:
         raise ValueError(f"eval: split {split} must hold a view, holds none ({dataset.split_rule()}); use --split")
     frames = frames_for(views, config.data, _most_pixels(views, config.data.max_pixels, scale))
-    names = file_names([frame.name for frame in frames])
-    kinds = VIEW_PICTURES if recorded.semantics else VIEW_PICTURES[:1]
-    output.check(f"renders/{split}/{name}.{kind}" for name in names for kind in kinds)
-    segmentation = _segmentation(loaded, dataset, frames)
+    _check_pictures(output, recorded, split, frames)
     result = evaluate(
         scene,
         frames,
         config.settings,
         lpips=lpips,
         pictures=run.renders / split,
-        segmentation=segmentation,
+        segmentation=_segmentation(loaded, dataset, frames),
         moving=moving_labels(dataset) if recorded.times else frozenset(),
     )
-    refined: dict[str, Any] = {}
-    if recorded.refined:
-        told = refined_scores(scene, frames, config.settings) if split == "test" and scale == 1 else {}
-        moved = displacement([stated[view.name] for view in train], [view.camera for view in train])
-        refined = {"poses": {**moved, **told}}
-    lenses = config.data.undistort == "off"
-    wanted = renderers_to_measure(config.renderers, config.settings, renderer, lenses)
-    renderers = through_renderers(scene, frames, wanted, split)
+    cameras = [stated[view.name] for view in train], [view.camera for view in train]
+    held_out = frames if split == "test" and scale == 1 else []
+    more |= _component_metrics(RunViews(scene, config.settings, bool(recorded.refined), *cameras, held_out))
+    wanted = renderers_to_measure(config.renderers, config.settings, renderer, config.data.undistort == "off")
     return write_metrics(
         run,
         split,
         frames,
         result,
         split_rule=dataset.split_rule(),
-        gaussians=len(g),
+        gaussians=len(loaded.gaussians),
         **{name: getattr(loaded, name) for name in ("step", "seconds", "bad_steps")},
-        renderers=renderers,
-        **({} if scale == 1 else {"scale": scale}),
-        **chosen,
-        **refined,
-        **({} if loaded.moving is None else {"motion": _who_moves(loaded.moving)}),
+        renderers=through_renderers(scene, frames, wanted, split),
+        **more,
+    )
+
+
+def _check_pictures(output: LockedFolder, recorded: FitRecord, split: str, frames: list[Frame]) -> None:
+    """Refuse a folder where pictures that drgs did not draw are in the way."""
+    kinds = VIEW_PICTURES if recorded.semantics else VIEW_PICTURES[:1]
+    names = file_names([frame.name for frame in frames])
+    output.check(f"renders/{split}/{name}.{kind}" for name in names for kind in kinds)
+
+
+def _component_metrics(run: RunViews) -> dict[str, Any]:
+    """What components say of a run that is measured again."""
+    metrics: dict[str, Any] = {}
+    for component in COMPONENTS.values():
+        metrics |= component.run_metrics(run)
+    return metrics
+
+
+def _dataset_of(recorded: FitRecord, strict: bool) -> Dataset:
+    """The data set of a run, where it is; `strict` as of `evaluate_run`."""
+    return load_dataset(
+        recorded.data,
+        recorded.config,
+        lazy=recorded.is_active,  # images may be missing that were never picked
+        points=False,
+        strict=strict,
+        semantics=recorded.semantics is not None or bool(recorded.times),  # labels say what moves
     )
 
 
@@ -149,10 +156,4 @@ def _segmentation(loaded: LoadedRun, dataset: Dataset, frames: list[Frame]) -> S
             f"{dataset.path}: must have the classes that the run was fitted with ({', '.join(record.classes[:5])}, "
             f"...), has {', '.join(now.names[:5])}, ...; restore its class names"
         )
-    return segmentation_of(loaded.gaussians, loaded.decoder, loaded.classes, record, frames)
-
-
-def _who_moves(scene: DynamicGaussians) -> dict:
-    moving = int(scene.moving.sum())
-    told = {"moving": moving, "share": moving / max(len(scene), 1)}
-    return told | ({} if scene.lives is None else {"living": int(scene.living.sum())})
+    return segmentation_of(loaded.gaussians, loaded.decoder, loaded.classes, record.labels, record.teacher, frames)

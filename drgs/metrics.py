@@ -16,7 +16,7 @@ import torch
 from drgs.display.pictures import file_names, write_png
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
-from drgs.fitting.losses import psnr_of
+from drgs.fitting.losses import psnr
 from drgs.guards.archives import check_archive
 from drgs.integrator import render
 from drgs.io.journal import SCHEMA
@@ -43,7 +43,6 @@ __all__ = [
     "evaluate",
     "flip",
     "psnr",
-    "refined_scores",
     "renderers_table",
     "ssim",
     "through_renderers",
@@ -84,23 +83,6 @@ _LPIPS_MIN_SIDE = 64  # pixels: the AlexNet backbone pools smaller images to not
 _SSIM_MIN_SIDE = 11  # pixels of a side of its window, which is not padded
 _CORRECTIONS = 5  # fits of the color correction, each to the pixels that the one before it left unsaturated
 _SATURATED = 0.5 / 255  # distance from 0 or 1 within which a value of 8 bits says nothing
-
-
-def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float:
-    """Peak signal-to-noise ratio in dB, see `DEFINITIONS`.
-
-    Args:
-        image, target: (H, W, 3) in [0, 1].
-        mask: (H, W) weights in [0, 1], or None.
-    """
-    error = (image.double() - target.double()).square().mean(2)
-    if mask is not None:
-        if not bool((mask > 0).any()):
-            raise ValueError("psnr: the mask must keep at least one pixel, keeps none; drop this view")
-        mse = float((error * mask).sum() / mask.double().sum())
-    else:
-        mse = float(error.mean())
-    return psnr_of(mse)
 
 
 def cc_psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float:
@@ -520,29 +502,6 @@ def renderers_table(metrics: Mapping[str, Any]) -> tuple[str, tuple[str, ...], l
 
 def _decibels(value: Any) -> str:
     return f"{value:.2f}" if isinstance(value, float | int) else "-"
-
-
-def refined_scores(scene: Scene, frames: list[Frame], settings: RenderSettings) -> dict:
-    """PSNR of views whose cameras are refined against their own photographs first, with the scene as it is.
-
-    What a view lacks apart from the error of its pose: no number to compare with those of other programs.
-
-    Returns:
-        `psnr_refined`, the mean, and `views`, a list of name and `psnr_refined`; empty without views.
-    """
-    from drgs.fitting.poses import refined_against
-
-    views = []
-    with Bar("refining held-out cameras", len(frames)) as bar:
-        for frame in frames:
-            camera = refined_against(scene, frame, settings)
-            with torch.no_grad():  # a measure
-                image = render(colors_only(scene, camera.time), camera, settings).rgb.cpu().clamp(0, 1)
-            views.append({"name": frame.name, "psnr_refined": psnr(image, frame.image(), frame.mask)})
-            bar.advance()
-    if not views:
-        return {}
-    return {"psnr_refined": float(np.mean([view["psnr_refined"] for view in views])), "views": views}
 
 
 def write_metrics(run: Run, split: str, frames: list[Frame], result: dict, **fields: Any) -> dict:

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,12 +19,13 @@ import torch
 
 from drgs import metrics, runtime
 from drgs.codecs.ply import save_ply
-from drgs.data.camera_lists import save_cameras_json
 from drgs.data.view_checks import check_cameras, check_parallax
 from drgs.display.pictures import file_names, write_png
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
 from drgs.fitting.active import ActiveViews
+from drgs.fitting.components.base import Component, Setup, check_conflicts
+from drgs.fitting.components.table import components_of
 from drgs.fitting.config import (
     DataConfig,
     DensityConfig,
@@ -37,20 +37,12 @@ from drgs.fitting.config import (
     SavingConfig,
     SelectionConfig,
 )
-from drgs.fitting.exposure import NETWORK as EXPOSURE
 from drgs.fitting.frames import Frame, frames_for, warn_of_late_cameras
-from drgs.fitting.lenses import lens_choice
-from drgs.fitting.parts import parts_of, with_exposure, with_poses
-from drgs.fitting.photographs import check_photographs, estimated_of, join, photographs_record
-from drgs.fitting.poses import CAMERAS, POSE_NETWORK
 from drgs.fitting.records import config_record, pick_seconds, seconds_of
 from drgs.fitting.renderers import renderers_to_measure
 from drgs.fitting.resume import keep_previous, last_checkpoint, lock_run
-from drgs.fitting.semantic_record import SemanticRecord, check_same_teacher
-from drgs.fitting.skybox import visible_share
-from drgs.fitting.stages import moving_labels
-from drgs.fitting.start import motion_of, start
-from drgs.fitting.telling import told
+from drgs.fitting.stages import fitted_times
+from drgs.fitting.start import start
 from drgs.fitting.threads import fewer_torch_threads, one_thread
 from drgs.fitting.trainer import StepResult, Trainer
 from drgs.guards.memory import is_out_of_memory
@@ -64,7 +56,6 @@ from drgs.runtime.machine import peak_memory
 if TYPE_CHECKING:
     from drgs.data import Dataset
     from drgs.ellipsoids import Gaussians
-    from drgs.fitting.parts import Parts
     from drgs.selection.pool import Workers
 
 __all__ = [
@@ -82,8 +73,6 @@ __all__ = [
     "Trainer",
     "fit",
 ]
-
-_log = logging.getLogger(__name__)
 
 Pace = Callable[[int, int], int]
 """Steps done, steps of the whole fit -> steps that the whole fit is to have."""
@@ -114,7 +103,7 @@ def fit(
     out_dir: str | Path,
     config: FitConfig | None = None,
     *,
-    parts: Parts | None = None,
+    components: Sequence[Callable[[], Component]] | None = None,
     resume: bool = False,
     progress: bool = True,
     workers: Workers | None = None,
@@ -132,11 +121,11 @@ def fit(
         config: What to do; the defaults if left out. With a `selection` the fit begins with a few views and chooses
             more on the way; the data set is best loaded with `lazy=True` and without points, so that nothing of views
             that are not chosen is read.
-        parts: Terms of the loss, rates, networks and what is rendered; default those of `config`. Every fit must have
-            its own: they hold networks and their optimizers.
+        components: Classes, or other makers, of what the fit has besides photographs and Gaussians
+            (docs/extending.md); default all of `drgs.fitting.components.table.COMPONENTS`.
         resume: Continue from the last checkpoint, or from the start if there is none yet.
         progress: Show it on stderr: a bar on a terminal, lines elsewhere.
-        workers: Processes that compute what candidates of an active fit tell, as `drgs.select` takes them.
+        workers: Processes that score the candidates of an active fit, as `drgs.select` takes them.
         pace: Called after every step with the steps done and those of the whole fit; returns how many the whole fit is
             to have. Where that is another number, schedules go on from the share that is then done, and config.json
             says so. Only where nothing moves and all views are fitted to.
@@ -146,15 +135,18 @@ def fit(
     Raises:
         ValueError: On a bad config, data set or run folder, when another process writes there, and when losses stay
             not finite.
+        NotImplementedError: If components cannot stand beside each other.
         MemoryError: When there is none left; the last checkpoint stays.
         KeyboardInterrupt: On Ctrl-C, SIGTERM and SIGHUP, after a checkpoint and the PLY have been written.
     """
     config = config or FitConfig()
     runtime.backend()  # sets torch's threads too, at first use
     threads = one_thread() if config.deterministic else contextlib.nullcontext()
-    with lock_run(Run(out_dir), "fit", resume, [dataset.path]), threads, Bar("fit", show=progress):
+    run, first = Run(out_dir), None if begin is None else Path(begin)
+    with lock_run(run, "fit", resume, [dataset.path]), threads, Bar("fit", show=progress):
         try:
-            return _fit(dataset, out_dir, config, parts, resume, workers, pace, None if begin is None else Path(begin))
+            setup, plan = _prepared(dataset, config, components, workers, pace, first)
+            return _fit(run, setup, plan, resume, pace, first)
         except (MemoryError, RuntimeError) as error:
             if not is_out_of_memory(error):
                 raise
@@ -164,165 +156,119 @@ def fit(
             ) from error
 
 
-def _fit(
+def _prepared(
     dataset: Dataset,
-    out_dir: str | Path,
     config: FitConfig,
-    parts: Parts | None,
-    resume: bool,
+    components: Sequence[Callable[[], Component]] | None,
     workers: Workers | None,
-    pace: Pace | None = None,
-    begin: Path | None = None,
-) -> FitResult:
-    """`fit` in a run folder that is claimed: what there is to fit or to go on from, all steps, and the metrics."""
+    pace: Pace | None,
+    begin: Path | None,
+) -> tuple[Setup, ActiveViews | None]:
+    """What is known of a fit before photographs are decoded, and its views if they are chosen on the way; refuses what
+    does not go together.
+    """
     train, test = dataset.split(config.data.test_every, config.data.test_offset, config.data.test_cameras)
     if train:
         check_parallax(train)
         check_cameras(train)
-    lenses = None
-    if config.data.undistort == "auto":
-        with Bar("lenses") as bar:
-            lenses = lens_choice(config, train)
-            if lenses.words():
-                bar.note(lenses.words())
-        config = config.replace(data=dataclasses.replace(config.data, undistort=lenses.undistort))
-    run = Run(out_dir)
-    motion = motion_of(config, train, test) if parts is None else None
     selection = config.selection
-    if pace is not None and (selection or motion is not None):
-        raise ValueError("fit: pace must be None where views are chosen on the way or things move; leave it out")
-    if begin is not None and (selection or motion is not None or parts is not None):
-        raise ValueError(
-            "fit: begin must be None where views are chosen on the way, things move or parts are a caller's own; "
-            "leave it out"
-        )
-    check_photographs(config, motion is not None)
-    plan = ActiveViews(train, config, motion is not None, workers) if selection else None
+    given = {"selection": selection, "begin": begin, "pace": pace}
+    if selection and (other := next((name for name in ("begin", "pace") if given[name] is not None), None)):
+        raise ValueError(f"fit: {other} must be None where views are chosen on the way; leave it out")
+    times = fitted_times(config, train, test)
+    ways = frozenset(name for name, value in given.items() if value is not None)
+    setup = Setup(dataset, config, train, test, train, times, components_of(components), ways)
+    check_conflicts(setup)
+    plan = ActiveViews(train, config, bool(times), workers) if selection else None
     if selection and selection.measure and not test:
         raise ValueError("active: --measure must have held-out views, got none; hold some out (--test-every)")
-    # Parts of a caller's own say themselves what is fitted to what.
-    begun = [plan.views[i] for i in plan.chosen] if plan else train
-    taught = SemanticRecord.of(dataset, config, begun) if parts is None else None
-    if plan and parts is None:
-        plan.check_blocks({"semantic": taught is not None, "deformation": motion is not None})
-    tensors, header = _checkpoint(run, plan, taught) if resume else (None, None)
-    frames = plan.frames() if plan else frames_for(train, config.data)
-    held_out = frames_for(test, config.data)
-    if plan is None and tensors is None:
-        warn_of_late_cameras(dataset, [*frames, *held_out])
-    if begin is not None and taught is not None:
-        raise ValueError("fit: begin must be None where features are fitted, too; ignore semantics, or fit anew")
-    if taught and taught.embeddings:
-        from drgs.fitting.segments import check_references
+    if plan:
+        setup.views = [plan.views[i] for i in plan.chosen]
+    for component in setup.components:
+        component.prepare(setup)
+    check_conflicts(setup)  # again, as what `auto` means is known now
+    if plan:
+        plan.check_blocks(dict(x.block for x in setup.components if x.block and x.setting(setup) is None))
+        setup.picked_points, setup.reserved = plan.compared_points, plan.reserved
+    return setup, plan
 
-        check_references(held_out)
+
+def _fit(
+    run: Run, setup: Setup, plan: ActiveViews | None, resume: bool, pace: Pace | None, begin: Path | None
+) -> FitResult:
+    """`fit` in a run folder that is claimed: from the first Gaussians, or a checkpoint, to the metrics."""
+    tensors, header = _checkpoint(run, plan) if resume else (None, None)
+    setup.frames = plan.frames() if plan else frames_for(setup.train, setup.config.data)
+    setup.held_out = frames_for(setup.test, setup.config.data)
+    if not setup.frames:
+        raise ValueError("fit: there must be at least one training view, got none; add photographs")
+    if plan is None and tensors is None:
+        warn_of_late_cameras(setup.dataset, [*setup.frames, *setup.held_out])
+    for component in setup.components:
+        component.begin(setup, tensors is not None)
     if tensors is not None and header is not None:
-        made = parts or parts_of(config, header["extent"], taught.channels if taught else None)
-        if parts is None and EXPOSURE in header.get("networks", ()):
-            made = with_exposure(made, frames, config)
-        if parts is None and POSE_NETWORK in header.get("networks", ()):
-            made = with_poses(made, frames, config, header["extent"])
-        trainer = Trainer.from_state(config, frames, tensors, header, str(run.path), made, motion)
-        seconds = seconds_of(run, header) or 0.0
-        exposure = evidence = choice = None
-        source = header["point_source"]
-        config = trainer.config  # with the renderers that it began with
+        components = list(setup.components)
+        trainer = Trainer.from_state(setup.config, setup.frames, tensors, header, str(run.path), components)
+        source, seconds = header["point_source"], seconds_of(run, header) or 0.0
     else:
-        views, room = (plan.start_views(), plan.reserved) if plan else (train, 0)
-        looks = plan is not None and parts is None and config.data.exposure != "off"
-        compared = plan.compared_points(dataset.points) if plan and looks else None
-        trainer, source, exposure, evidence, choice = start(
-            dataset, views, frames, config, parts, taught, plan is not None, room, motion, compared, begin
-        )
-        if plan and exposure is not None:
-            plan.exposure = exposure.to_json(plan.names)
+        setup.views = plan.start_views() if plan else setup.train
+        trainer, source = start(setup, begin)
         seconds = 0.0
-    recorded = config_record(dataset, config, plan, taught, frames, held_out, source, motion.times if motion else ())
-    recorded |= photographs_record(run, trainer, exposure, evidence, choice)
-    earlier = run.config() if resume and (run.path / "config.json").is_file() else {}
-    began = earlier.get("begin", None if begin is None else str(begin))
-    recorded |= {} if began is None else {"begin": began}
-    recorded |= {"exposure": plan.exposure} if plan and plan.exposure else {}
-    recorded |= {"lenses": lenses.to_json()} if lenses and lenses.lost else {}
-    poses = trainer.parts.poses
-    _check_pictures(out_dir, config.max_steps, held_out, taught is not None)
+    before = run.config() if resume and (run.path / "config.json").is_file() else {}
+    recorded = config_record(setup, trainer, source, plan, before, begin)
+    _check_pictures(run, setup, trainer)
     run.start(recorded, resume=resume)
-    if taught:
-        taught.write_embeddings(run.path, dataset.semantics)
+    for component in trainer.components:
+        component.write_files(run.path)
     if plan:
         plan.write(run)  # forgets picks that no checkpoint knows of
     run.log("resume" if trainer.step_index else "start", step=trainer.step_index, gaussians=len(trainer.rows))
-    moving = moving_labels(dataset) if motion else frozenset()
-
-    def measured(pictures: Path | None = None) -> dict:
-        shown = _segmentation(trainer, taught, run, held_out)
-        return metrics.evaluate(
-            trainer.scene(), held_out, config.settings, pictures=pictures, segmentation=shown, moving=moving
-        )
-
-    joins = _Joins(dataset.points, recorded, parts is None) if plan else None
-    loop = _Loop(run, trainer, held_out, source, seconds, plan, taught, measured, joins)
-    if pace is not None:
-        loop.keep_pace(pace, recorded)
+    loop = _Loop(run, trainer, setup, plan, source, seconds, recorded, pace)
     if begin is not None and trainer.step_index == 0:
         loop.save()  # the run shows from now on what it begins with
-    with fewer_torch_threads(), Bar("fit", config.max_steps, done=trainer.step_index) as bar:
+    with fewer_torch_threads(), Bar("fit", trainer.config.max_steps, done=trainer.step_index) as bar:
         if len(named := [settings.nearest_preset()[0] for settings in trainer.renderers.all_settings]) > 1:
             bar.note(f"every step has one of the renderers {', '.join(named)}; --for fast fits for one alone")
         loop.run(bar)
-    g, scene = trainer.gaussians(), trainer.scene()
-    moved = None
-    if motion is not None:
-        with Bar("timing the deformation") as bar:
-            moved = motion.report(trainer.rows, bar.update)
-    refined: dict[str, Any] = {}
-    if poses is not None:
-        with Bar("poses") as bar:
-            bar.note(poses.words())
-        refined = {"poses": {**poses.displacement(), **metrics.refined_scores(scene, held_out, config.settings)}}
-    result = measured(run.renders / "test")
+    return _finished(loop)
+
+
+def _finished(loop: _Loop) -> FitResult:
+    """Measure what was fitted, and write metrics.json."""
+    run, trainer, setup, plan = loop.run_folder, loop.trainer, loop.setup, loop.plan
+    gaussians, config, held_out = trainer.gaussians(), trainer.config, setup.held_out
+    chosen: dict[str, Any] = {"fitted": plan.names, "pool_leak": plan.pool_leak} if plan else {}
+    reported: dict[str, Any] = {}
+    for component in trainer.components:
+        reported |= component.metrics(trainer, held_out)
+    result = loop.measured(run.renders / "test")
     written = metrics.write_metrics(
         run,
         "test",
         held_out,
         result,
-        split_rule=recorded["split_rule"],
-        gaussians=len(g),
+        split_rule=loop.recorded["split_rule"],
+        gaussians=len(gaussians),
         step=trainer.step_index,
         seconds=loop.seconds,
         bad_steps=trainer.bad_steps,
         renderers=metrics.through_renderers(
-            scene,
+            trainer.scene(),
             held_out or trainer.photographs(),
             renderers_to_measure(config.renderers, config.settings, lenses=config.data.undistort == "off"),
             "test" if held_out else "train",
             None if held_out else metrics.TRAIN_VIEWS,
         ),
-        **({"fitted": plan.names, "pool_leak": plan.pool_leak} if plan else {}),
-        **({"motion": moved} if moved else {}),
-        **refined,
-        **_skybox_summary(trainer),
-        **({"transients": trainer.transients.summary(trainer.frames)} if trainer.transients.found else {}),
+        **chosen,
+        **reported,
     )
-    done: dict[str, Any] = {"peak_memory": peak_memory(), **({"motion": moved} if moved else {})}
-    run.log("done", step=trainer.step_index, seconds=loop.seconds, mean=written["mean"], **done)
-    return FitResult(g, written, run, loop.seconds)
+    # `drgs eval` writes other metrics.json, without what only the fit can say.
+    memory = peak_memory()
+    run.log("done", step=trainer.step_index, seconds=loop.seconds, mean=written["mean"], peak_memory=memory, **reported)
+    return FitResult(gaussians, written, run, loop.seconds)
 
 
-def _skybox_summary(trainer: Trainer) -> dict[str, Any]:
-    """What metrics.json is to say of a skybox: how many Gaussians it has, and how much of it photographs show."""
-    count = trainer.rows.skybox
-    if not count:
-        return {}
-    frames = trainer.photographs()
-    frames = frames[:: -(-len(frames) // metrics.TRAIN_VIEWS)]
-    share = visible_share(trainer.gaussians(), count, frames, trainer.config.settings)
-    return {"skybox": {"gaussians": count, "visible": share}}
-
-
-def _checkpoint(
-    run: Run, plan: ActiveViews | None, taught: SemanticRecord | None
-) -> tuple[dict[str, torch.Tensor], dict] | tuple[None, None]:
+def _checkpoint(run: Run, plan: ActiveViews | None) -> tuple[dict[str, torch.Tensor], dict] | tuple[None, None]:
     """The last checkpoint of the same fit, if there is one; the plan goes on from the views that it has."""
     tensors, header = last_checkpoint(run)
     if tensors is None or header is None:
@@ -336,27 +282,17 @@ def _checkpoint(
     if plan:
         plan.restore(tensors, header, str(run.path))
         plan.picks = pick_seconds(run, plan.picks)
-    check_same_teacher(taught, SemanticRecord.from_json(header.get("semantics"), str(run.state)), str(run.path))
     return tensors, header
 
 
-def _segmentation(trainer: Trainer, taught: SemanticRecord | None, run: Run, frames: list[Frame]) -> Any:
-    """What `metrics.evaluate` takes to measure the labels of a fit; None without features."""
-    if taught is None:
-        return None
-    from drgs.fitting.segments import segmentation_of
-
-    decoder: Any = trainer.network("decoder")
-    return segmentation_of(trainer.gaussians(), decoder, taught.read_classes(run.path), taught, frames)
-
-
-def _check_pictures(out_dir: str | Path, max_steps: int, held_out: list[Frame], semantics: bool) -> None:
+def _check_pictures(run: Run, setup: Setup, trainer: Trainer) -> None:
     """Refuse, before the first step, a folder where pictures that drgs did not draw are in the way."""
-    every = _preview_every(max_steps)
-    names = [_preview_name(step) for step in range(every, max_steps + 1, every)]
-    kinds = metrics.VIEW_PICTURES if semantics else metrics.VIEW_PICTURES[:1]
-    names += [f"test/{name}.{kind}" for name in file_names([frame.name for frame in held_out]) for kind in kinds]
-    with lock_folder(out_dir, "fit", [f"renders/{name}" for name in names]):
+    steps = trainer.config.max_steps
+    every = _preview_every(steps)
+    names = [_preview_name(step) for step in range(every, steps + 1, every)]
+    kinds = [metrics.VIEW_PICTURES[0], *(kind for component in trainer.components for kind in component.pictures)]
+    names += [f"test/{name}.{kind}" for name in file_names([frame.name for frame in setup.held_out]) for kind in kinds]
+    with lock_folder(run.path, "fit", [f"renders/{name}" for name in names]):
         pass
 
 
@@ -368,21 +304,6 @@ def _preview_name(step: int) -> str:
     return f"preview_{step:06d}.png"
 
 
-@dataclasses.dataclass(frozen=True)
-class _Joins:
-    """What photographs that join an active fit have to do with.
-
-    Attributes:
-        points: (P, 3) points of the data set; None where they are not read.
-        recorded: Contents of config.json, which changes where more is known of exposure.
-        looks: Whether photographs have unknowns that the config asks for: the parts are not the caller's own.
-    """
-
-    points: np.ndarray | None
-    recorded: dict[str, Any]
-    looks: bool
-
-
 class _Loop:
     """Steps, and the files that are due at them."""
 
@@ -390,37 +311,46 @@ class _Loop:
         self,
         run: Run,
         trainer: Trainer,
-        held_out: list[Frame],
+        setup: Setup,
+        plan: ActiveViews | None,
         source: str,
         seconds: float,
-        plan: ActiveViews | None,
-        taught: SemanticRecord | None,
-        measured: Callable[[], dict],
-        joins: _Joins | None = None,
+        recorded: dict[str, Any],
+        pace: Pace | None = None,
     ) -> None:
+        """
+        Args:
+            run: The run folder.
+            trainer, setup, plan: The fit, what it began with, and its views if they are chosen on the way.
+            source: Where the first Gaussians came from, in words.
+            seconds: Wall time of the steps so far.
+            recorded: Contents of config.json, which changes with the pace and with photographs that join.
+            pace: As of `fit`.
+        """
         self.run_folder = run
         self.trainer = trainer
-        self.held_out = held_out
+        self.setup = setup
+        self.held_out = setup.held_out
+        self.plan = plan
         self.source = source
         self.seconds = seconds
-        self.plan = plan
-        self.taught = taught
-        self._measured = measured
-        self._joins = joins
-        self._pace: Pace | None = None
-        self._recorded: dict[str, Any] = {}
+        self.recorded = recorded
+        self._pace = pace
         self._recent: list[StepResult] = []
         self._psnr: float | None = None  # of the last steps
         self._saved: tuple[int, int] | None = None  # steps and views of the last checkpoint
         self._saved_at = time.monotonic()
 
-    def keep_pace(self, pace: Pace, recorded: dict[str, Any]) -> None:
-        """Ask after every step how many the fit is to have; `recorded`, contents of config.json, change with them."""
-        self._pace = pace
-        self._recorded = recorded
+    def measured(self, pictures: Path | None = None) -> dict:
+        """Metrics of the held-out views as things are now; `pictures` as of `drgs.metrics.evaluate`."""
+        trainer = self.trainer
+        options: dict[str, Any] = {}
+        for component in trainer.components:
+            options |= component.evaluation(trainer, self.held_out)
+        return metrics.evaluate(trainer.scene(), self.held_out, trainer.config.settings, pictures=pictures, **options)
 
     def _follow_pace(self, pace: Pace, bar: Bar) -> None:
-        """Have as many steps as asked for, and record it."""
+        """Have as many steps as `pace` says, and record it."""
         trainer = self.trainer
         done, before = trainer.step_index, trainer.config.max_steps
         wanted = max(done, pace(done, before))
@@ -429,8 +359,8 @@ class _Loop:
         if wanted == done:
             wanted = done + 1  # schedules have an end that is not behind them
         trainer.reschedule(wanted)
-        self._recorded["fit"] = trainer.config.to_json()
-        self.run_folder.record(self._recorded)
+        self.recorded["fit"] = trainer.config.to_json()
+        self.run_folder.record(self.recorded)
         self.run_folder.log("rescheduled", step=done, before=before, max_steps=wanted)
         bar.update(done, wanted)
 
@@ -455,13 +385,13 @@ class _Loop:
                     self.save()  # measuring and choosing may take minutes, and can be interrupted anywhere
                     with interrupts.at_once():
                         if self.plan.is_to_be_measured:
-                            self.plan.add_measured(trainer.step_index, self._measured())
+                            self.plan.add_measured(trainer.step_index, self.measured())
                         self._pick(self.plan, bar)
                 began = time.perf_counter()
                 step = trainer.step()
                 self.seconds += time.perf_counter() - began
                 done = trainer.step_index
-                for line in told(step.events):
+                for line in (line for event in step.events for line in trainer.describe(event)):
                     bar.note(f"step {done - 1}: {line}")
                 self._log(step)
                 if step.psnr is not None:
@@ -480,23 +410,22 @@ class _Loop:
             self.save()  # of a fit that went on from its last step
 
     def save(self) -> None:
-        """The checkpoint, then what is made of it, for which there may be no room: cameras and the PLY, which knows no
-        time and holds what moves at rest. Nothing where all of it is there.
+        """The checkpoint, then what is made of it, for which there may be no room: files of components, and the PLY,
+        which knows no time and holds what moves at rest. Nothing where all of it is there.
         """
         now = self.trainer.step_index, len(self.trainer.frames)
         if now == self._saved:
             return
         tensors, header = self.trainer.state()
         header |= {"point_source": self.source}
-        header |= {"semantics": self.taught.to_json()} if self.taught else {}
         if self.plan:
             more_tensors, more_header = self.plan.state()
             tensors, header = tensors | more_tensors, header | more_header
         keep_previous(self.run_folder)
         save_state(self.run_folder.state, tensors, header)
         self.run_folder.log("checkpoint", step=self.trainer.step_index, seconds=self.seconds)
-        if self.trainer.parts.poses is not None:
-            save_cameras_json(self.run_folder.path / CAMERAS, self.trainer.parts.poses.cameras())
+        for component in self.trainer.components:
+            component.write_files(self.run_folder.path)
         save_ply(self.trainer.gaussians(), self.run_folder.point_cloud)
         self._saved = now
         self._saved_at = time.monotonic()
@@ -504,13 +433,15 @@ class _Loop:
     def _pick(self, plan: ActiveViews, bar: Bar) -> None:
         """Choose one more view, and add its photograph and points to the fit."""
         trainer = self.trainer
-        decoder: Any = trainer.network("decoder")
-        seen, estimated = trainer.photographs(), estimated_of(trainer)
-        frame, record = plan.pick(trainer.scene(), seen, trainer.step_index, decoder, estimated)
-        self._join(plan, frame)
-        if start := plan.new_start():
-            trainer.restart(*start)
-            record["points"] = len(start[0])
+        scoring = plan.scoring
+        for component in trainer.components:
+            scoring = component.scoring(scoring)
+        scoring = scoring.over(trainer.nuisances)
+        frame, record = plan.pick(trainer.scene(), trainer.photographs(), trainer.step_index, scoring)
+        self._join(frame)
+        if again := plan.new_start():
+            trainer.restart(*again)
+            record["points"] = len(again[0])
         else:
             points, colors, dense = plan.points(frame, trainer.scene())
             if len(points):
@@ -527,23 +458,18 @@ class _Loop:
             f"by {plan.active.policy} among {len(record['candidates'])} in {record['seconds']:.1f} s)"
         )
 
-    def _join(self, plan: ActiveViews, frame: Frame) -> None:
-        """Begin with what is unknown of a photograph that was picked, and record what was found."""
-        trainer, joins = self.trainer, self._joins
-        if joins is None or not joins.looks:
-            trainer.add_unknowns(frame)
-            return
-        found = join(trainer, plan, frame, joins.points)
-        if found is None:
-            return
-        used = trainer.parts.exposure is not None
-        told = {key: x for key, x in found.to_json(plan.names).items() if key != "gains"}
-        self.run_folder.log("exposure", step=trainer.step_index, **told, used=used)
-        joins.recorded["exposure"] = plan.exposure
-        joins.recorded.pop("estimated", None)
-        if estimated := estimated_of(trainer):
-            joins.recorded["estimated"] = estimated
-        self.run_folder.record(joins.recorded)
+    def _join(self, frame: Frame) -> None:
+        """Let components begin with a photograph that was picked, and record what they found."""
+        trainer = self.trainer
+        events = [x for component in trainer.components for x in component.join(trainer, frame, self.setup)]
+        for event in events:
+            self.run_folder.log(event.pop("event"), step=trainer.step_index, **event)
+        if events:
+            self.recorded.pop("estimated", None)
+            self.recorded |= {"estimated": trainer.nuisances} if trainer.nuisances else {}
+            for component in trainer.components:
+                self.recorded |= component.record(trainer, self.recorded)
+            self.run_folder.record(self.recorded)
 
     def _log(self, step: StepResult) -> None:
         """The events of a step, and every so often the averages of the last ones."""
@@ -554,23 +480,19 @@ class _Loop:
         if done % _LOG_EVERY == 0 or done == self.trainer.config.max_steps:
             psnr = [x.psnr for x in self._recent if x.psnr is not None]
             loss = [x.loss for x in self._recent if math.isfinite(x.loss)]
-            features = [value for x in self._recent if math.isfinite(value := x.terms.get("features", math.nan))]
+            fields: dict[str, Any] = {}
+            for component in self.trainer.components:
+                fields |= component.log_fields(self.trainer, [x.terms for x in self._recent])
             self.run_folder.log(
                 "train",
                 step=done,
                 loss=float(np.mean(loss)) if loss else None,
                 psnr=float(np.mean(psnr)) if psnr else None,
-                **({"features": float(np.mean(features))} if features else {}),
                 gaussians=len(self.trainer.rows),
-                **({} if (moving := self._moving()) is None else {"moving": moving}),
+                **fields,
                 seconds=self.seconds,
             )
             self._recent = []
-
-    def _moving(self) -> float | None:
-        """Part of the Gaussians that move, in the dynamic stage of a fit that has one."""
-        trainer = self.trainer
-        return None if trainer.motion is None else trainer.motion.share(trainer.rows)
 
     def _preview(self, bar: Bar, is_interrupted: Callable[[], bool]) -> None:
         """One picture, and the PSNR of all held-out views, unless the fit is interrupted."""

@@ -21,10 +21,10 @@ from drgs import cli, fisher, reference
 from drgs.cameras import c2w_to_opengl, orbit
 from drgs.data.camera_lists import load_cameras_json
 from drgs.files import Run, load_state
-from drgs.fitting.exposure import Exposure, ExposureEstimate, exposure_network
+from drgs.fitting.components.exposure import ExposureComponent, ExposureEstimate, exposure_network
+from drgs.fitting.components.poses import CAMERAS, Poses, pose_network
 from drgs.fitting.frames import Frame
 from drgs.fitting.networks import Network
-from drgs.fitting.poses import CAMERAS, Poses, pose_network
 from drgs.fitting.records import fit_record
 from drgs.fitting.rows import GaussianRows
 from drgs.information.nuisances import Nuisances
@@ -165,12 +165,12 @@ def test_photographs_look_as_before_when_another_joins(uneven):
     def shown(frame):
         with torch.no_grad():
             out = drgs.render(trainer.gaussians(), frame.camera, FAST)
-            return trainer.parts.exposure(out, frame).rgb
+            return trainer.shown(out, frame).rgb
 
     before = [shown(frame) for frame in frames]
     new = dataclasses.replace(frames[0], name="new")
     logs = np.array([[0.1], [0.3], [-0.4]]) * np.array([1.0, 0.5, -1.0])
-    trainer.add_unknowns(new, estimate(logs, [0, 0, 0]))
+    trainer.component("exposure").extend(trainer, new, estimate(logs, [0, 0, 0]))
     trainer.add_frame(new)
     gains = trainer.network("exposure").log_gains.detach()
     assert float(gains.mean(dim=0).abs().max()) < 1e-7
@@ -185,7 +185,6 @@ def test_photographs_look_as_before_when_another_joins(uneven):
 def begun(folder, **fields):
     """A trainer of two views, with gains of 0 where exposure is asked for."""
     from drgs.fitting.frames import load_frames
-    from drgs.fitting.parts import parts_of, with_exposure
     from drgs.sfm.points import initial_points
 
     views = lazily(folder).split()[0][:2]
@@ -193,8 +192,9 @@ def begun(folder, **fields):
     frames = load_frames(views, settings.data.max_pixels)
     points, colors, _ = initial_points(views, 0, 60)
     rows = GaussianRows.from_points(torch.from_numpy(points), torch.from_numpy(colors))
-    parts = with_exposure(parts_of(settings, 3.0), frames, settings)
-    return Trainer(settings, frames, rows, 3.0, parts)
+    exposure = ExposureComponent()
+    exposure.use(settings, frames)
+    return Trainer(settings, frames, rows, 3.0, [exposure])
 
 
 def test_colors_are_scaled_in_every_direction():
@@ -340,10 +340,9 @@ def test_auto_ends_when_more_photographs_say_otherwise(even, tmp_path, monkeypat
     """What the first few points said is taken back: gains and their network go, and nothing is eliminated any more;
     resumed after that, the fit ends in the same bits.
     """
-    import drgs.fitting.exposure
-    import drgs.fitting.photographs
+    import drgs.fitting.components.exposure
 
-    true = drgs.fitting.exposure.estimate_exposure
+    true = drgs.fitting.components.exposure.estimate_exposure
 
     def fooled(frames, *rest, **options):
         found = true(frames, *rest, **options)
@@ -352,8 +351,7 @@ def test_auto_ends_when_more_photographs_say_otherwise(even, tmp_path, monkeypat
         logs = np.linspace(-0.2, 0.2, len(frames))[:, None] * np.ones(3)
         return dataclasses.replace(found, log_gains=logs)
 
-    monkeypatch.setattr(drgs.fitting.exposure, "estimate_exposure", fooled)
-    monkeypatch.setattr(drgs.fitting.photographs, "estimate_exposure", fooled)
+    monkeypatch.setattr(drgs.fitting.components.exposure, "estimate_exposure", fooled)
     settings = config(exposure="auto", deterministic=True, selection=plan(policy="fisher", add=3))
     fit(lazily(even), tmp_path / "run", settings, progress=True)
     assert [event["used"] for event in events(tmp_path / "run", "exposure")] == [True, False, False]
@@ -513,13 +511,3 @@ def test_information_in_a_fit_is_that_of_the_oracle(uneven, tmp_path, monkeypatc
             truth = projected(J, N).square().sum(0)
             assert float((found[name] - truth).abs().max()) <= 1e-4 * float(whole[name].max()), name
             assert float(found[name].sum()) < 0.99 * float(whole[name].sum()), name
-
-
-def test_a_module_of_gains_is_found_by_its_kind(uneven):
-    """Parts of a caller's own, without gains, are left as they are."""
-    trainer = begun(uneven, exposure="points")
-    assert isinstance(trainer.network("exposure"), Exposure)
-    before = trainer.rows.tensors["sh_dc"].clone()
-    trainer.add_unknowns(dataclasses.replace(trainer.frames[0], name="new"))
-    assert torch.equal(trainer.rows.tensors["sh_dc"], before)
-    assert len(trainer.network("exposure").log_gains) == 2

@@ -12,8 +12,8 @@ import pytest
 
 from drgs import cli
 from drgs.commands import cite
+from drgs.fitting.components.semantics import SemanticRecord
 from drgs.fitting.config import FitConfig, SelectionConfig
-from drgs.fitting.semantic_record import SemanticRecord
 from drgs.io.journal import SCHEMA
 from drgs.settings import RenderSettings
 

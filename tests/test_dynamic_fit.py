@@ -9,6 +9,7 @@ import shutil
 import signal
 import sys
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,10 +23,9 @@ from drgs.deform import DynamicGaussians, FieldConfig
 from drgs.display.pictures import to_bytes, write_png
 from drgs.ellipsoids import Gaussians
 from drgs.files import Run, load_ply, load_state, save_state
+from drgs.fitting.components.motion import FIELD, MotionComponent, is_held_open, moving_share
 from drgs.fitting.density import add_gaussians
-from drgs.fitting.dynamics import FIELD, Motion
 from drgs.fitting.frames import load_frames
-from drgs.fitting.parts import parts_of
 from drgs.fitting.records import load_run
 from drgs.fitting.renderers import ANY
 from drgs.fitting.rows import GaussianRows
@@ -177,14 +177,14 @@ def test_what_is_not_finite_is_named(dataset, tmp_path, monkeypatch):
     """After ten steps in a row the fit stops with the name of the first bad gradient; the last checkpoint before
     these stays, whenever the next one is due.
     """
-    begin = Motion.begin
+    begin = MotionComponent.begin_field
 
     def broken(self, rows, parts, extent):
         parts = begin(self, rows, parts, extent)
         self.field.mlp["quats"][3].weight.register_hook(lambda grad: grad * math.nan)
         return parts
 
-    monkeypatch.setattr(Motion, "begin", broken)
+    monkeypatch.setattr(MotionComponent, "begin_field", broken)
     with pytest.raises(
         ValueError, match=r"10 steps in a row .*, first the gradient of deformation\.mlp\.quats\.3\.weight;"
     ):
@@ -221,7 +221,7 @@ def test_nothing_of_it_where_nothing_can_move(dataset, tmp_path, monkeypatch):
     """Views of one time, or of none, or that are to be taken for such, are fitted without the code of deformations, and
     to the same bits.
     """
-    for name in ("drgs.deform", "drgs.dynamics", "drgs.dynamics.hexplane", "drgs.fitting.dynamics"):
+    for name in ("drgs.deform", "drgs.dynamics", "drgs.dynamics.hexplane", "drgs.fitting.components.motion"):
         monkeypatch.setitem(sys.modules, name, None)  # an import of it would fail
     how, found = config(deterministic=True, max_steps=4), []
     for name, times in (("one", (0.0,)), ("none", (None,))):
@@ -242,9 +242,9 @@ def rows_of(count: int = 12) -> GaussianRows:
 def test_density_control_copies_gates(dataset):
     """A copy moves if its original does, and what is added from points may move."""
     how = config()
-    motion, rows = Motion(how, TIMES), rows_of()
-    parts = motion.begin(rows, parts_of(how, 1.0), 1.0)
-    assert {network.name for network in parts.networks} == set(FIELD)
+    motion, rows = MotionComponent(TIMES), rows_of()
+    motion.begin_field(how, rows, 1.0)
+    assert {network.name for network in motion.networks} == set(FIELD)
     with torch.no_grad():
         rows.tensors["motion"][:] = torch.arange(12.0) - 6
     draw = torch.Generator().manual_seed(0)
@@ -252,8 +252,8 @@ def test_density_control_copies_gates(dataset):
     gates, colors = rows.tensors["motion"], rows.tensors["means"]
     nearest = torch.cdist(colors[12:], colors[:12]).argmin(1)  # jitter is a tenth of their size
     assert torch.equal(gates[12:], gates[nearest])
-    assert motion.share(rows) == float((gates >= 0).float().mean())
-    assert torch.equal(motion.new_gates(2, rows)["motion"], torch.full((2,), 2.0))
+    assert moving_share(rows) == float((gates >= 0).float().mean())
+    assert torch.equal(motion.new_rows(None, 2)["motion"], torch.full((2,), 2.0))
 
 
 def test_closed_gates_open_again():
@@ -261,10 +261,10 @@ def test_closed_gates_open_again():
     if nothing speaks for them.
     """
     how = config(max_steps=104, static_share=4 / 104)
-    motion, rows = Motion(how, TIMES), rows_of()
-    parts = motion.begin(rows, parts_of(how, 1.0), 1.0)
+    motion, rows = MotionComponent(TIMES), rows_of()
+    motion.begin_field(how, rows, 1.0)
     torch.nn.init.ones_(motion.field.mlp["means"][3].bias)
-    rate = parts.rates["motion"]
+    rate = motion.rates["motion"]
     with torch.no_grad():
         rows.tensors["motion"][:6] = -3
     for step, moving, held in (
@@ -275,13 +275,13 @@ def test_closed_gates_open_again():
         (68, 12, True),
         (69, 12, False),
     ):
-        motion.prepare(rows, step)
-        scene = parts.scene(rows)
+        motion.prepare_gates(how, rows, step)
+        scene = motion.scene(SimpleNamespace(rows=rows), rows.gaussians())
         assert int(scene.moving.sum()) == moving
         (grad,) = torch.autograd.grad(scene.at(0.5).means.sum(), rows.tensors["motion"])
         assert bool((grad[:6] != 0).all()) == (moving == 12)
         assert bool((grad[6:] != 0).all())
-        assert (rate(step / how.max_steps) == 0) == held == motion.is_held_open(step)
+        assert (rate(step / how.max_steps) == 0) == held == is_held_open(how, step)
 
 
 def test_claims_of_a_header_are_not_believed(dataset, tmp_path):

@@ -1,4 +1,4 @@
-"""Claims of drgs.fitting.exposure: gains are recovered, the gauge holds exactly, and a fit with gains goes on."""
+"""Claims of components.exposure: gains are recovered, the gauge holds exactly, and a fit with gains goes on."""
 
 import dataclasses
 import json
@@ -13,8 +13,8 @@ from test_train import config, dataset  # noqa: F401 (a fixture)
 from drgs.cameras import orbit
 from drgs.data import load
 from drgs.files import load_state
-from drgs.fitting import start
-from drgs.fitting.exposure import Exposure, estimate_exposure, exposure_network
+from drgs.fitting.components import exposure as exposures
+from drgs.fitting.components.exposure import Exposure, estimate_exposure, exposure_network
 from drgs.fitting.frames import Frame
 from drgs.fitting.records import fit_record
 from drgs.tracing.call import Output
@@ -169,7 +169,7 @@ def test_a_fit_without_gains_says_that_photographs_differ(tmp_path, capsys, gain
 
 def test_auto_is_as_photographs_that_short_fits_did_not_see_say(tmp_path, monkeypatch, capsys):
     """Gains that are clear by points are fitted if, and only if, such photographs gain; line and record say it."""
-    monkeypatch.setitem(start._TRIAL, "max_steps", 20)
+    monkeypatch.setitem(exposures._TRIAL, "max_steps", 20)
     write_photographs(tmp_path / "data", GAINS)
     settings = config(max_steps=1, exposure="auto")
     run = fit(load(tmp_path / "data"), tmp_path / "run", settings, progress=True).run

@@ -78,7 +78,9 @@ def test_the_page_is_a_package(site):
     """Every entry point that it names is in a module that it shows."""
     for value in re.findall(r" = (\S+:\S+)", next(site.glob("*.dist-info/entry_points.txt")).read_text()):
         module, _, attribute = value.partition(":")
-        assert re.search(rf"^(def )?{attribute}\b", (site / f"{module.replace('.', '/')}.py").read_text(), flags=re.M)
+        assert re.search(
+            rf"^(def |class )?{attribute}\b", (site / f"{module.replace('.', '/')}.py").read_text(), flags=re.M
+        )
 
 
 def test_a_policy_and_a_criterion_by_name(site, folder):

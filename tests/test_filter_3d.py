@@ -1,4 +1,4 @@
-"""Claims of drgs.fitting.filter_3d: the formulas in float64, and fits whose pictures and files have the filter."""
+"""Claims of components.filter_3d: the formulas in float64, and fits whose pictures and files have the filter."""
 
 from __future__ import annotations
 
@@ -16,9 +16,8 @@ from drgs.commands.eval import run as run_eval
 from drgs.commands.options import Eval
 from drgs.ellipsoids import semi_axes
 from drgs.files import load_state, save_state
-from drgs.fitting.filter_3d import VARIANCES, Filter3D, filtered, sampling_rates
+from drgs.fitting.components.filter_3d import VARIANCES, Filter3D, filtered, sampling_rates
 from drgs.fitting.records import check_checkpoint, load_run
-from drgs.fitting.start import motion_of
 from drgs.train import Trainer, fit
 
 
@@ -125,14 +124,14 @@ def test_a_run_shows_and_saves_the_filtered_ones(dataset, tmp_path):  # noqa: F8
 def test_rates_follow_density_control(dataset):  # noqa: F811
     """After a step with density control there is a variance a Gaussian, of where it was then; later steps keep them."""
     trainer = trainer_of(dataset, config(filter_3d="on"))
-    before = trainer.parts.filter_3d.variances
+    before = trainer.component("filter_3d").filter.variances
     assert len(before) == len(trainer.rows)
     while not any(event["event"] == "density" and event["added"] for event in trainer.step().events):
         pass
-    after = trainer.parts.filter_3d.variances
+    after = trainer.component("filter_3d").filter.variances
     assert len(after) == len(trainer.rows) > len(before)
     trainer.step()
-    assert torch.equal(trainer.parts.filter_3d.variances, after)
+    assert torch.equal(trainer.component("filter_3d").filter.variances, after)
     trainer.add_points(torch.zeros(2, 3), torch.zeros(2, 3), 0.1, 1.0)
     assert len(trainer.scene()) == len(trainer.rows) == len(after) + 2
 
@@ -163,21 +162,19 @@ def test_a_resumed_fit_keeps_its_rates(dataset, tmp_path):  # noqa: F811
 def test_without_it_there_is_nothing_of_it(dataset):  # noqa: F811
     """The Gaussians are the rows themselves, and a checkpoint has no rates."""
     trainer = trainer_of(dataset, config())
-    assert trainer.parts.filter_3d is None
+    assert trainer.component("filter_3d").filter is None
     assert VARIANCES not in trainer.state()[0]
     assert torch.equal(trainer.gaussians().log_scales, trainer.rows.tensors["log_scales"])
 
 
-def test_it_is_refused_where_things_move(dataset):  # noqa: F811
+def test_it_is_refused_where_things_move(dataset, tmp_path):  # noqa: F811
     """Rates of Gaussians at rest are not those of Gaussians that move; where nothing moves it is not asked."""
-    views = [
-        drgs.data.View(**{**vars(v), "camera": Camera(v.camera.K, v.camera.w2c, 32, 32, time=float(i))})
-        for i, v in enumerate(dataset.views)
-    ]
-    with pytest.raises(NotImplementedError, match="filter_3d must be off where things move"):
-        motion_of(config(filter_3d="on"), views, [])
-    assert motion_of(config(filter_3d="on", dynamics="ignore"), views, []) is None
-    assert motion_of(config(filter_3d="on"), dataset.views, []) is None
+    for i, view in enumerate(dataset.views):
+        view.camera = dataclasses.replace(view.camera, time=float(i))
+    with pytest.raises(NotImplementedError, match="filter_3d must be off where things move, got on: .*; leave"):
+        fit(dataset, tmp_path / "run", config(filter_3d="on"), progress=False)
+    still = config(filter_3d="on", dynamics="ignore", max_steps=1)
+    fit(dataset, tmp_path / "still", still, progress=False)
 
 
 def test_eval_measures_larger_pictures(dataset, tmp_path, monkeypatch):  # noqa: F811

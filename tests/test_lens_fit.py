@@ -15,10 +15,12 @@ import drgs
 from drgs.cameras import intrinsics, orbit
 from drgs.data import Dataset, View
 from drgs.display.pictures import write_png
-from drgs.files import load_state
+from drgs.fitting.components.base import Setup, check_conflicts
+from drgs.fitting.components.lens import lens_choice, lost_share
+from drgs.fitting.components.table import components_of
 from drgs.fitting.frames import load_frames
-from drgs.fitting.lenses import lens_choice, lost_share
-from drgs.train import FitConfig, SelectionConfig, fit
+from drgs.io.checkpoint import load_state
+from drgs.train import FitConfig, fit
 
 BARREL = ("opencv", (-0.3, 0.08, 0.002, -0.003))
 
@@ -111,8 +113,11 @@ def test_wide_lenses_are_kept_where_renderers_can(wide, tmp_path):
     assert again.run.config()["lenses"] == told["lenses"]
     train = wide.split()[0]
     for fields, because in (({"renderers": ("any",)}, "--for drgs"), ({"poses": "refined"}, "--poses fixed")):
-        choice = lens_choice(config(**fields), train)
-        assert choice.undistort == "on"
+        setup = Setup(wide, config(**fields), train, [], train, (), components_of())
+        lens = next(x for x in setup.components if x.name == "lens")
+        lens.prepare(setup)
+        choice = lens.choice
+        assert choice.undistort == setup.config.data.undistort == "on"
         assert because in choice.words()
     assert lens_choice(config(), train).words().endswith("they are fitted through their lenses")
     behind = any((view.camera.local_directions()[..., 2] < 0).any() for view in train)
@@ -146,8 +151,6 @@ def test_ordinary_lenses_are_taken_out(tmp_path):
         ({"renderers": ("any",)}, "renderers along rays alone, got inria, gsplat; use --for drgs"),
         ({"renderers": ("auto",)}, "renderers along rays alone, got inria, gsplat; use --for drgs"),
         ({"renderers": ("fast", "gsplat")}, "got gsplat; use --for drgs"),
-        ({"renderers": ("fast",), "poses": "refined"}, "must have poses fixed, got refined; drop --poses"),
-        ({"renderers": ("fast",), "selection": SelectionConfig(initial=2, add=1)}, "must have --views all, got active"),
         ({"renderers": ("fast",), "undistort": "yes"}, "undistort must be"),
     ],
 )
@@ -155,6 +158,20 @@ def test_what_does_not_work_is_refused(fields, told):
     """In one line, before anything is read."""
     with pytest.raises(ValueError, match=told):
         FitConfig().replace(**{"undistort": "off", **fields})
+
+
+@pytest.mark.parametrize(
+    ("fields", "ways", "told"),
+    [
+        ({"poses": "refined"}, (), "undistort must be on where poses are optimized, got off: .*; use --poses fixed"),
+        ({}, ("selection",), "undistort must be on where views are chosen on the way, got off: .*; use --views all"),
+    ],
+)
+def test_what_it_cannot_stand_beside_is_refused(fields, ways, told):
+    """Poses are refined, and candidates scored, through pinhole cameras."""
+    how = FitConfig().replace(undistort="off", renderers=("fast",), **fields)
+    with pytest.raises(NotImplementedError, match=told):
+        check_conflicts(Setup(None, how, [], [], [], (), components_of(), frozenset(ways)))
 
 
 def _psnr(g, frames):

@@ -20,9 +20,8 @@ from drgs.display.pictures import write_png
 from drgs.dynamics.lives import LIVES, Lives, living, logit_at
 from drgs.ellipsoids import Gaussians
 from drgs.files import load_state, save_state
-from drgs.fitting.births import find_births
+from drgs.fitting.components.lifespans import REFERENCE_TIMES, LifetimeTerm, find_new_gaussians
 from drgs.fitting.frames import load_frames
-from drgs.fitting.lives import BIRTHS, Lasting
 from drgs.fitting.records import load_run
 from drgs.fitting.stages import shows_first_time, spacing
 from drgs.integrator import render, render_jvp
@@ -237,7 +236,7 @@ def test_births_are_where_the_ball_is(tmp_path, cameras_a_time, near):
     """Residuals alone tell where it is at each time, to a part of its own size, and how fast it goes."""
     dataset = filmed(tmp_path / "data", cameras_a_time)
     frames = load_frames(dataset.views, 10**6)
-    found = find_births(frames, room(), FAST, 3.0, 500, torch.Generator().manual_seed(0))
+    found = find_new_gaussians(frames, room(), FAST, 3.0, 500, torch.Generator().manual_seed(0))
     assert len({round(float(t) * 11) for t in found.times}) >= 11  # of 12 times
     away, speed = [], []
     for point, time, velocity in zip(found.points, found.times, found.velocities, strict=True):
@@ -254,7 +253,7 @@ def test_at_five_diameters_a_frame(tmp_path):
     dataset = filmed(tmp_path / "data", 6, way=2.2 * 7.5)
     visible = [view for view in dataset.views if abs(float(ball(view.camera.time, 16.5).means[0, 0])) < 1.2]
     frames = load_frames(dataset.views, 10**6)
-    found = find_births(frames, room(), FAST, 3.0, 500, torch.Generator().manual_seed(0))
+    found = find_new_gaussians(frames, room(), FAST, 3.0, 500, torch.Generator().manual_seed(0))
     times = {view.camera.time for view in visible}
     assert len(times) == 2  # it is in the pictures at two of twelve times: 1.5 apart, five of its diameters
     assert times <= set(found.times.tolist())
@@ -263,11 +262,11 @@ def test_at_five_diameters_a_frame(tmp_path):
         assert float((points - ball(time, 16.5).means[0]).norm(dim=1).median()) < 0.15
 
 
-def test_nothing_is_born_where_nothing_is_missing(tmp_path):
+def test_nothing_is_added_where_nothing_is_missing(tmp_path):
     """Of a scene that shows what photographs do."""
     frames = load_frames(filmed(tmp_path / "data", 2, way=0.0).views, 10**6)
     still = together(room(), ball(0.5, 0.0))
-    found = find_births([frames[k] for k in (0, 1, 2)], still, FAST, 3.0, 500, torch.Generator().manual_seed(0))
+    found = find_new_gaussians([frames[k] for k in (0, 1, 2)], still, FAST, 3.0, 500, torch.Generator().manual_seed(0))
     assert not len(found.points)
 
 
@@ -279,7 +278,7 @@ def test_exposure_is_nothing_that_moves(tmp_path):
     still, found = together(room(), ball(0.5, 0.0)), []
     for exposure in (None, lambda out, frame: dataclasses.replace(out, rgb=0.6 * out.rgb)):
         draw = torch.Generator().manual_seed(0)
-        found.append(len(find_births(frames, still, FAST, 3.0, 500, draw, exposure).points))
+        found.append(len(find_new_gaussians(frames, still, FAST, 3.0, 500, draw, exposure).points))
     assert found[0] > 0
     assert found[1] == 0
 
@@ -391,8 +390,8 @@ def test_what_the_static_stage_shows(tmp_path):
 def test_only_lives_that_other_times_confirm_are_lengthened():
     """One that is shorter than the time between two photographs is left as it is."""
     widths = torch.tensor([0.05, 0.3]).log().requires_grad_()
-    rows = SimpleNamespace(tensors={BIRTHS: torch.zeros(2), LIVES[1]: widths})
-    loss = Lasting(rows, 0.1, 2.0)(None, None, None)
+    rows = SimpleNamespace(tensors={REFERENCE_TIMES: torch.zeros(2), LIVES[1]: widths})
+    loss = LifetimeTerm(rows, 0.1, 2.0)(None, None, None)
     assert float(loss) == pytest.approx(2 * 0.1 / 0.3 / 2)
     loss.backward()
     assert float(widths.grad[0]) == 0

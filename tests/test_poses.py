@@ -1,4 +1,4 @@
-"""Claims of drgs.fitting.poses: wrong poses are found again, the gauge holds, and runs remember what was refined."""
+"""Claims of components.poses: wrong poses are found again, the gauge holds, and runs remember what was refined."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import drgs
 from drgs.cameras import Camera, intrinsics, look_at, orbit
 from drgs.data.camera_lists import load_cameras_json
 from drgs.files import Run, load_state
+from drgs.fitting.components.poses import CAMERAS, PoseEvidence, Poses, motion, pose_network, refined_against
 from drgs.fitting.frames import Frame
-from drgs.fitting.poses import CAMERAS, PoseEvidence, Poses, motion, pose_network, refined_against
 from drgs.fitting.records import fit_record
 from drgs.settings import RenderSettings
 from drgs.train import fit

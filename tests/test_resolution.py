@@ -21,7 +21,6 @@ from drgs.files import Run, load_state
 from drgs.fitting import resolution, trainer
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.losses import ssim_map
-from drgs.fitting.parts import Parts, parts_of, with_exposure, with_poses
 from drgs.fitting.resolution import Resolution, halved_size
 from drgs.train import FitConfig, Trainer, fit
 
@@ -180,25 +179,22 @@ def test_everything_goes_on_with_the_same_bits(dataset):  # noqa: F811
     use = {"exposure": "learned", "poses": "refined", "filter_3d": "on", "transients": "mask"}
     settings = config(max_steps=80, num_downscales=1, **use)
 
-    def begun() -> tuple[list[Frame], Parts]:
-        frames = trainer_of(masked(dataset), settings).frames
-        parts = with_exposure(parts_of(settings, 3.0), frames, settings)
-        return frames, with_poses(parts, frames, settings, 3.0, 2.0)
-
-    frames, parts = begun()
-    made = Trainer(settings, frames, trainer_of(dataset, settings).rows, 3.0, parts)
+    frames = trainer_of(masked(dataset), settings).frames
+    made = Trainer(settings, frames, trainer_of(dataset, settings).rows, 3.0)
+    made.component("exposure").use(settings, frames)
+    made.component("poses").use(made, 2.0)
     told = [event["event"] for _ in range(33) for event in made.step().events]
     assert "transients" in told
-    frames, parts = begun()
+    frames = trainer_of(masked(dataset), settings).frames
     tensors, header = made.state()
     tensors = {name: x.clone() for name, x in tensors.items()}
-    again = Trainer.from_state(settings, frames, tensors, json.loads(json.dumps(header)), "checkpoint", parts)
+    again = Trainer.from_state(settings, frames, tensors, json.loads(json.dumps(header)), "checkpoint")
     ends = []
     for each in (made, again):
         told = [event for _ in range(10) for event in each.step().events if event["event"] == "resolution"]
         assert told == [{"event": "resolution", "halvings": 0, "width": SIZE, "height": SIZE}]
         ends.append(each.state()[0])
-        assert {camera.width for camera in each.parts.poses.cameras()} == {SIZE}
+        assert {camera.width for camera in each.component("poses").module.cameras()} == {SIZE}
     assert ends[0].keys() == ends[1].keys()
     assert all(torch.equal(x, ends[1][name]) for name, x in ends[0].items())
     assert {name.split(".")[0] for name in ends[0]} >= {"exposure", "poses", "filter_3d"}
@@ -212,14 +208,14 @@ def test_reach_and_information_of_poses_are_of_the_full_size(dataset, seen):  # 
     for times in (0, 1):
         settings = config(max_steps=20, num_downscales=times)
         plain = trainer_of(dataset, settings)
-        made = Trainer(
-            settings, plain.frames, plain.rows, 3.0, with_poses(plain.parts, plain.frames, settings, 3.0, 2.0)
-        )
+        made = Trainer(settings, plain.frames, plain.rows, 3.0)
+        made.component("poses").use(made, 2.0)
+        poses = made.component("poses").module
         made.step_index = 3  # the first at which poses are fitted
         made.step()
-        assert made.parts.poses.has_begun
-        assert {camera.width for camera in made.parts.poses.cameras()} == {SIZE}
-        found.append((made.parts.poses.shifts, made.parts.poses.whitening))
+        assert poses.has_begun
+        assert {camera.width for camera in poses.cameras()} == {SIZE}
+        found.append((poses.shifts, poses.whitening))
     assert [side for side, *_ in seen] == [SIZE, SIZE // 2]
     assert all(torch.equal(x, y) for x, y in zip(*found, strict=True))
 

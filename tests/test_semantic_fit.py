@@ -21,16 +21,17 @@ from drgs.display.pictures import write_png
 from drgs.features.pictures import label_colors
 from drgs.features.segmentation import Classes, classify
 from drgs.files import Run
-from drgs.fitting import semantics
 from drgs.fitting import trainer as trainer_module
 from drgs.fitting.active import ActiveViews
+from drgs.fitting.components import semantics
+from drgs.fitting.components.base import Setup
+from drgs.fitting.components.semantics import SemanticRecord
+from drgs.fitting.components.table import components_of
 from drgs.fitting.config import SelectionConfig
 from drgs.fitting.frames import load_frames
-from drgs.fitting.parts import parts_of
 from drgs.fitting.records import load_run
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.segments import segmentation_of
-from drgs.fitting.semantic_record import SemanticRecord
 from drgs.fitting.trainer import Trainer
 from drgs.tracing.weights import Weights
 from drgs.train import fit
@@ -84,12 +85,16 @@ def semantic_trainer(data, **fields):
     cfg = config(**{**SHORT, "max_steps": 40, **fields})
     frames = load_frames(data.split()[0], cfg.data.max_pixels, cfg.data.mask)
     points, colors = torch.from_numpy(data.points), torch.from_numpy(data.colors)
-    rows = GaussianRows.from_points(points, colors, features=cfg.features.feature_width)
-    return Trainer(cfg, frames, rows, 3.0, parts_of(cfg, 3.0, CHANNELS))
+    rows, train = GaussianRows.from_points(points, colors), data.split()[0]
+    components = components_of()
+    setup = Setup(data, cfg, train, [], train, (), components, frames=frames)
+    semantics = next(x for x in components if x.name == "semantics")
+    semantics.prepare(setup)
+    return Trainer(cfg, frames, rows, 3.0, components, setup)
 
 
 def decoder_of(trainer):
-    return trainer.parts.networks[0].module
+    return trainer.network("decoder")
 
 
 def test_the_distance_goes_a_few_cells_at_a_time(monkeypatch, rng):
@@ -169,7 +174,7 @@ def test_features_leave_the_geometry_alone(taught, size, monkeypatch):
         grads.append({name: trainer.rows.tensors[name].grad for name in GEOMETRY})
     assert set(computed) == {1}, "by the second trainer"
     plain = semantic_trainer(taught)
-    plain.parts = parts_of(plain.config, 3.0)
+    plain.components = components_of()
     plain.rows = GaussianRows({k: x for k, x in plain.rows.tensors.items() if k != "features"})
     plain.step()
     for name in GEOMETRY:
@@ -205,7 +210,7 @@ def test_views_without_a_map_show_no_features(taught, monkeypatch):
 def test_outside_a_mask_a_teacher_has_no_say(taught):
     """What the map says where the mask keeps nothing does not change the term; where it keeps all, it does."""
     trainer = semantic_trainer(taught)
-    term, frame = trainer.parts.terms[-1], trainer.frames[0]
+    term, frame = trainer.component("semantics").terms[0], trainer.frames[0]
     trainer.rows.tensors["features"].data.normal_(generator=torch.Generator().manual_seed(1))
     g = trainer.gaussians()
     shown = drgs.render(g, frame.camera, FAST)
@@ -229,7 +234,12 @@ def test_without_a_teacher_no_feature_code_runs(dataset, taught, tmp_path, monke
     """A data set without maps, and one whose maps are to be ignored, are fitted without importing anything of
     features, to the same bits, and leave the same files.
     """
-    for name in ("features", "features.decoder", "features.segmentation", "features.teacher", "fitting.semantics"):
+    for name in (
+        "features",
+        "features.decoder",
+        "features.segmentation",
+        "features.teacher",
+    ):
         monkeypatch.setitem(sys.modules, f"drgs.{name}", None)  # importing it raises ImportError
     fields = {"max_steps": 6, "save_every": 3, "deterministic": True}
     plain = fit(dataset, tmp_path / "plain", config(**fields), progress=False)
@@ -301,8 +311,8 @@ def test_a_resumed_fit_has_the_same_bits(run, taught, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"feature_width": 5}, "width of its semantics was 4 and is 5"),
-        ({"semantics": "ignore"}, "teacher of its semantics was 'rgb_feature_langseg' and is None"),
+        ({"feature_width": 5}, "feature_width was 4 and is 5"),
+        ({"semantics": "ignore"}, "semantics was 'auto' and is 'ignore'"),
         ({"teacher": "sam_embeddings"}, "teacher of its semantics was 'rgb_feature_langseg' and is 'sam_embeddings'"),
         ({"class_file": None}, "classes of its semantics was"),
     ],
@@ -471,15 +481,17 @@ def test_without_labels_the_teacher_is_the_reference(taught):
     g, decoder = trainer.gaussians(), decoder_of(trainer)
     classes, known = Classes(("a", "b", "c"), embeddings()), SemanticRecord.of(taught, trainer.config, taught.views)
     frames = [dataclasses.replace(frame, labels=None) for frame in load_frames(taught.split()[1], 10**6)]
-    segmentation = segmentation_of(g, decoder, classes, known, frames)
+    segmentation = segmentation_of(g, decoder, classes, known.labels, known.teacher, frames)
     result = metrics.evaluate(g, frames, FAST, segmentation=segmentation)["segmentation"]
     assert (result["reference"], result["folder"]) == ("teacher", "rgb_feature_langseg")
     assert (result["teacher"], result["run"]["images"]) == (None, 2)
     names = Classes(("a", "b", "c"))
-    told = metrics.evaluate(g, frames, FAST, segmentation=segmentation_of(g, decoder, names, known, frames))
+    told = metrics.evaluate(
+        g, frames, FAST, segmentation=segmentation_of(g, decoder, names, known.labels, known.teacher, frames)
+    )
     assert told["segmentation"] is None
     assert "text_embeddings.npy" in told["reasons"]["segmentation"]
-    assert "has no decoder" in segmentation_of(g, None, classes, known, frames)
+    assert "has no decoder" in segmentation_of(g, None, classes, known.labels, known.teacher, frames)
     assert "segmentation" not in metrics.evaluate(g.replace(features=None), frames, FAST)
 
 
@@ -491,7 +503,8 @@ def test_a_reference_is_nothing_outside_a_mask(taught):
     left[:, : SIZE // 2] = 1
     g, known = trainer.gaussians(), SemanticRecord.of(taught, trainer.config, taught.views)
     frames = [dataclasses.replace(frame, mask=left)]
-    segmentation = segmentation_of(g, decoder_of(trainer), Classes(("a", "b", "c"), embeddings()), known, frames)
+    classes = Classes(("a", "b", "c"), embeddings())
+    segmentation = segmentation_of(g, decoder_of(trainer), classes, known.labels, known.teacher, frames)
     result = metrics.evaluate(g, frames, FAST, segmentation=segmentation)["segmentation"]
     assert result["run"]["pixels"] == int((frame.labels()[:, : SIZE // 2] > 0).sum())
 

@@ -1,4 +1,4 @@
-"""Claims of drgs.fitting.skybox on a ball of Gaussians before painted hills that are far away."""
+"""Claims of drgs.fitting.components.skybox on a ball of Gaussians before painted hills that are far away."""
 
 from __future__ import annotations
 
@@ -17,16 +17,15 @@ from drgs.data import Dataset, View
 from drgs.display.pictures import write_png
 from drgs.ellipsoids import Gaussians
 from drgs.files import load_ply, load_state, save_state
-from drgs.fitting import skybox as skyboxes
+from drgs.fitting.components import skybox as skyboxes
+from drgs.fitting.components.filter_3d import Filter3D
+from drgs.fitting.components.poses import Poses
+from drgs.fitting.components.skybox import RADIUS, Skybox, far_evidence, visible_share, why_not
 from drgs.fitting.density import add_gaussians, explore, relocate
-from drgs.fitting.filter_3d import Filter3D
 from drgs.fitting.frames import Frame, load_frames
-from drgs.fitting.losses import Opacity, Scale
-from drgs.fitting.parts import parts_of, with_skybox
-from drgs.fitting.poses import Poses
+from drgs.fitting.losses import Opacity, Scale, terms_of
 from drgs.fitting.records import check_checkpoint
 from drgs.fitting.rows import GaussianRows
-from drgs.fitting.skybox import RADIUS, Skybox, far_evidence, visible_share, why_not
 from drgs.fitting.trainer import Trainer
 from drgs.integrator import Output
 from drgs.train import FitConfig, SelectionConfig, fit
@@ -112,8 +111,8 @@ def rows_with_skybox() -> GaussianRows:
     frames = photographs()
     skybox = Skybox.around(frames, 3.3, 40)
     rows = GaussianRows.from_points(ball().means[:60], torch.full((60, 3), 0.5), 0.3)
-    rows.add_skybox(skybox.rows())
-    assert rows.skybox == len(skybox)
+    rows.add_far(skybox.rows())
+    assert rows.far == len(skybox)
     return rows
 
 
@@ -128,7 +127,7 @@ def test_where_the_shell_is():
     assert distance.min() > 0.99 * RADIUS
     assert distance.max() < 2.01 * RADIUS
     alone = GaussianRows.from_points(ball().means[:1], torch.zeros(1, 3))
-    alone.add_skybox(skybox.rows())
+    alone.add_far(skybox.rows())
     shown = alone.gaussians().detach().take(slice(0, len(skybox)))
     for settings in (FAST, drgs.RenderSettings.preset("gsplat"), drgs.RenderSettings.preset("inria")):
         out = drgs.render(shown, frames[0].camera, settings)
@@ -227,7 +226,7 @@ def test_resumed_fit_has_the_same_bits(tmp_path):
     frames = photographs()
     config = FitConfig().replace(**SETTINGS, skybox="on", deterministic=True).replace(max_steps=30)
     rows = rows_with_skybox()
-    whole = Trainer(config, frames, rows, 3.3, with_skybox(parts_of(config, 3.3), rows.skybox))
+    whole = Trainer(config, frames, rows, 3.3)
     while whole.step_index < 12:
         whole.step()
     tensors, header = whole.state()
@@ -240,7 +239,7 @@ def test_resumed_fit_has_the_same_bits(tmp_path):
         while trainer.step_index < 30:
             trainer.step()
     one, two = whole.rows.state(), again.rows.state()
-    assert again.rows.skybox == rows.skybox
+    assert again.rows.far == rows.far
     assert all(torch.equal(one[name], two[name]) for name in one)
     with pytest.raises(ValueError, match=r"skybox must be in 1\.\.\d+, got 5000"):
         check_checkpoint(tmp_path / "x", tensors, {**header, "skybox": 5000})
@@ -249,7 +248,7 @@ def test_resumed_fit_has_the_same_bits(tmp_path):
 def test_density_control_leaves_it_alone():
     """Transparent ones of it stay where they are, and no copy of it is made."""
     rows = rows_with_skybox()
-    count = rows.skybox
+    count = rows.far
     with torch.no_grad():
         rows.tensors["logit_opacities"][:5] = -9
         rows.tensors["logit_opacities"][count : count + 10] = -9
@@ -267,17 +266,17 @@ def test_terms_leave_it_out():
     rows = rows_with_skybox()
     config = FitConfig().replace(**SETTINGS)
     gaussians = rows.gaussians()
-    others = gaussians.take(slice(rows.skybox, None))
+    others = gaussians.take(slice(rows.far, None))
     output = Output(torch.zeros(HEIGHT, WIDTH, 3), torch.zeros(HEIGHT, WIDTH))
     frame = photographs()[0]
-    plain, without = parts_of(config, 3.3), with_skybox(parts_of(config, 3.3), rows.skybox)
+    plain, without = terms_of(config, 3.3), terms_of(config, 3.3, rows.far)
     for kind, name in ((Opacity, "logit_opacities"), (Scale, "log_scales")):
-        of_all, of_others = (next(x for x in parts.terms if isinstance(x, kind)) for parts in (plain, without))
+        of_all, of_others = (next(x for x in terms if isinstance(x, kind)) for terms in (plain, without))
         value = of_others(output, frame, gaussians)
         assert float(value.detach()) == pytest.approx(float(of_all(output, frame, others).detach()), rel=1e-6)
         gradient = torch.autograd.grad(value, rows.tensors[name], retain_graph=True)[0]
-        assert float(gradient[: rows.skybox].abs().max()) == 0
-        assert float(gradient[rows.skybox :].abs().min()) > 0
+        assert float(gradient[: rows.far].abs().max()) == 0
+        assert float(gradient[rows.far :].abs().min()) > 0
 
 
 def test_what_shows_of_it():
@@ -288,14 +287,14 @@ def test_what_shows_of_it():
         {name: x.detach() for name, x in near.parameters().items() if name != "sh"}
         | {"sh_dc": near.sh.detach(), "sh_rest": torch.zeros(len(near), 0, 3)}
     )
-    rows.add_skybox(Skybox.around(frames, 3.3, 40).rows())
+    rows.add_far(Skybox.around(frames, 3.3, 40).rows())
     all_of_it = rows.gaussians()
     is_open = [drgs.render(near, frame.camera, FAST).alpha < 0.5 for frame in frames]
     truth = float(torch.stack(is_open).float().mean())
     assert 0.3 < truth < 0.9
-    assert visible_share(all_of_it, rows.skybox, frames, FAST) == pytest.approx(truth, abs=1e-6)
+    assert visible_share(all_of_it, rows.far, frames, FAST) == pytest.approx(truth, abs=1e-6)
     masked = [dataclasses.replace(x, mask=mask.float()) for x, mask in zip(frames, is_open, strict=True)]
-    assert visible_share(all_of_it, rows.skybox, masked, FAST) == 1
+    assert visible_share(all_of_it, rows.far, masked, FAST) == 1
 
 
 def test_it_comes_before_the_first_step():
@@ -305,13 +304,13 @@ def test_it_comes_before_the_first_step():
     trainer = Trainer(config, frames, GaussianRows.from_points(ball().means[:60], torch.full((60, 3), 0.5)), 3.3)
     trainer.step()
     with pytest.raises(ValueError, match="a skybox must be there before the first step"):
-        trainer.rows.add_skybox(Skybox.around(frames, 3.3, 40).rows())
+        trainer.rows.add_far(Skybox.around(frames, 3.3, 40).rows())
 
 
 def test_refused_where_views_are_chosen(tmp_path):
     """In one line, before anything is fitted."""
     config = FitConfig().replace(**SETTINGS, skybox="on").replace(selection=SelectionConfig())
-    with pytest.raises(NotImplementedError, match="skybox must be off or auto where views are chosen on the way or"):
+    with pytest.raises(NotImplementedError, match="skybox must be off or auto where views are chosen on the way, got"):
         fit(dataset_of(photographs(), tmp_path), tmp_path / "run", config, progress=False)
 
 
@@ -320,7 +319,7 @@ def test_refused_where_things_move(tmp_path):
     dataset = dataset_of(photographs(), tmp_path)
     for i, view in enumerate(dataset.views):
         view.camera = dataclasses.replace(view.camera, time=float(i % 2))
-    with pytest.raises(NotImplementedError, match="skybox must be off or auto where views are chosen on the way or"):
+    with pytest.raises(NotImplementedError, match="skybox must be off or auto where things move, got on"):
         fit(dataset, tmp_path / "run", FitConfig().replace(**SETTINGS, skybox="on"), progress=False)
     result = fit(dataset, tmp_path / "run", FitConfig().replace(**SETTINGS).replace(max_steps=4), progress=False)
     assert result.run.config()["skybox"] == {"gaussians": 0, "reason": "things move"}
@@ -391,9 +390,9 @@ def test_poses_have_the_reach_of_what_is_near():
     shifts = []
     for is_there in (False, True):
         if is_there:
-            rows.add_skybox(Skybox.around(frames, 3.3, 400).rows())
+            rows.add_far(Skybox.around(frames, 3.3, 400).rows())
         poses = Poses([frame.camera for frame in frames], 3.3, FAST, reach=1.0)
-        poses.begin(rows.gaussians(), rows.skybox)
+        poses.begin(rows.gaussians(), rows.far)
         shifts.append(poses.shifts)
     torch.testing.assert_close(*shifts, rtol=1e-12, atol=0)
 

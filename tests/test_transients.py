@@ -1,4 +1,4 @@
-"""Claims of drgs.fitting.transients on a painted wall before which somebody stands in one photograph."""
+"""Claims of drgs.fitting.components.transients on a painted wall before which somebody stands in one photograph."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from drgs.data import Dataset, View
 from drgs.display.pictures import write_png
 from drgs.ellipsoids import Gaussians
 from drgs.files import load_state, save_state
+from drgs.fitting.components.transients import TransientsComponent, line_of, masked_share, transient_masks
 from drgs.fitting.frames import Frame
 from drgs.fitting.losses import Photometric
 from drgs.fitting.records import check_checkpoint
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.trainer import Trainer
-from drgs.fitting.transients import Transients, line_of, transient_masks
 from drgs.integrator import Output
 from drgs.train import FitConfig, fit
 
@@ -131,7 +131,7 @@ def test_auto_decides_by_evidence():
     assert [event["found"] for event in events] == [True, True]
     assert events[0]["photographs"] == 1
     assert line_of(events[0]).startswith(f"1 of {VIEWS} photographs show")
-    assert trainer.transients.summary(frames)["masked"] == 1
+    assert masked_share(frames)["masked"] == 1
     assert float(frames[3].transient[there].float().mean()) > 0.7
 
 
@@ -151,13 +151,13 @@ def test_a_clean_fit_has_the_same_bits():
 
 def test_few_photographs_or_steps_are_not_looked_at():
     """Three photographs have too few neighbors, and each must have been fitted four times."""
-    looks = Transients("mask")
-    assert not looks.is_due(45, 120, 3)
-    assert looks.is_due(45, 120, 11)
-    assert not looks.is_due(45, 120, 12)
-    assert not looks.is_due(46, 120, 11)
-    assert looks.is_due(60, 120, 12)
-    assert not Transients("keep").is_due(60, 120, 12)
+    looks = TransientsComponent()
+    assert not looks.is_due("mask", 45, 120, 3)
+    assert looks.is_due("mask", 45, 120, 11)
+    assert not looks.is_due("mask", 45, 120, 12)
+    assert not looks.is_due("mask", 46, 120, 11)
+    assert looks.is_due("mask", 60, 120, 12)
+    assert not looks.is_due("keep", 60, 120, 12)
 
 
 @pytest.mark.same_bits
@@ -173,7 +173,7 @@ def test_resumed_fit_goes_on_with_its_masks(tmp_path):
     tensors, header = load_state(tmp_path / "state.safetensors")
     check_checkpoint(tmp_path / "state.safetensors", tensors, header)
     again = Trainer.from_state(whole.config, photographs()[0], tensors, header, "here")
-    assert again.transients.found
+    assert again.component("transients").present
     run_to(again, 40)
     one, two = whole.rows.state(), again.rows.state()
     assert all(torch.equal(one[name], two[name]) for name in one)

@@ -27,7 +27,7 @@ from drgs.display.pictures import shrunk
 from drgs.display.progress import Bar, duration
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import frames_for
-from drgs.fitting.start import start
+from drgs.fitting.start import start_plain
 from drgs.fitting.threads import fewer_torch_threads
 from drgs.io.atomic import temporary_folder
 from drgs.sfm.matching import FeatureOptions, extract, match, quiet, start_extraction
@@ -386,7 +386,7 @@ def _seconds_a_step(train: list[View], dataset: Dataset, config: FitConfig, is_f
     with Bar("", show=False), _unlogged(), fewer_torch_threads():  # that of how long steps take is shown
         frames = frames_for(views, config.data)
         timed = config.replace(data=dataclasses.replace(config.data, skybox="off", exposure="off", poses="fixed"))
-        trainer, *_ = start(_filled(dataset, config), views, frames, timed, None, None, False, 0)
+        trainer = start_plain(_filled(dataset, config), views, frames, timed)
         # As late in a fit, where all degrees of color are there.
         while trainer.rows.sh_degree < config.sh_degree:
             trainer.rows.raise_sh_degree()

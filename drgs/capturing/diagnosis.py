@@ -17,7 +17,7 @@ import numpy as np
 from drgs.data.images import read_image
 from drgs.display.pictures import shrunk
 from drgs.display.progress import Bar
-from drgs.fitting.exposure import estimate_exposure
+from drgs.fitting.components.exposure import estimate_exposure
 from drgs.fitting.frames import load_frames
 from drgs.sfm.findings import Finding
 from drgs.sfm.mapping import name_ranges

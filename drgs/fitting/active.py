@@ -1,4 +1,4 @@
-"""Active views: fit to a few photographs, and choose one more every so often by what it would tell.
+"""Active views: fit to a few photographs, and choose one more every so often by its information.
 
 The loops of [1]: two views, then one more every 200 steps, or, where things move, all cameras at the first time, then
 one camera at each later time (timetable.py). The optimization goes on with the Gaussians there are.
@@ -6,8 +6,8 @@ The camera file gives the poses and image sizes of all candidates. Nothing else 
 not its pixels, mask, depth or size on disk, no points or observations that it took part in; the extent of the scene
 and the initial points come from the initial views. (`--init-points all`, the rule of [1], breaks this and says so.)
 
-What is unknown of a photograph besides the scene, its exposure and its pose, begins when it joins; until then it is
-eliminated from what the view would tell (`drgs.information.complement`).
+What is unknown of a photograph besides the scene begins when it joins (`Component.join`); until then it is eliminated
+from the information of the view (`drgs.information.complement`).
 
 Reference:
     [1] Next Best View Selections for Semantic and Dynamic 3D Gaussian Splatting, arXiv 2512.22771.
@@ -35,15 +35,14 @@ from drgs.sfm.guided import Matches
 from drgs.sizes import at_most, resized_alike
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping
 
     from drgs.cameras import Camera
     from drgs.data import View
     from drgs.ellipsoids import Scene
-    from drgs.features.decoder import Decoder
     from drgs.fitting.config import FitConfig
     from drgs.information.choices import Block
-    from drgs.information.nuisances import Nuisance
+    from drgs.information.scoring import Scoring
     from drgs.selection.pool import Workers
 
 __all__ = ["SELECTION", "ActiveViews"]
@@ -66,7 +65,6 @@ class ActiveViews:
         chosen: Indices of views that may be read, in the order in which they came.
         picks: One record a pick, as in selection.json.
         measured: One record for each number of views at which the held-out views were measured on the way.
-        exposure: What the last look at exposure found, as config.json has it; None where the fit does not look.
         pool_leak: Whether initial points have seen views that were not picked.
     """
 
@@ -82,7 +80,7 @@ class ActiveViews:
             views: The training split.
             config: What the fit does; its `selection` says how views are chosen.
             moves: Whether a deformation is fitted.
-            workers: Processes that compute what candidates tell, as `drgs.select` takes them.
+            workers: Processes that score candidates, as `drgs.select` takes them.
         Raises:
             ValueError: As `Timetable.of`, and if there are no views, or no such policy.
         """
@@ -112,7 +110,6 @@ class ActiveViews:
         self.chosen = list(self.timetable.start)
         self.picks = list[dict]()
         self.measured = list[dict]()
-        self.exposure: dict | None = None
         self.pool_leak = config.data.init_points == "all"
         # Photographs of another time do not say where things are at this one.
         wanted = not self.pool_leak and self.timetable.schedule == "views"
@@ -123,17 +120,22 @@ class ActiveViews:
         self._began: int | None = None  # triangulated points of the start, once they are known
         self._sizes: dict[tuple[int, int], tuple[int, int]] = {}
 
-    def check_blocks(self, fitted: dict[Block, bool]) -> None:
+    def check_blocks(self, lacking: Mapping[Block, str]) -> None:
         """Refuse blocks that the fit does not have; else the first pick would be where that is found out.
 
         Args:
-            fitted: Block -> whether there is what it tells about.
+            lacking: Blocks of information that there are not, and what the fit is without them, in words.
         """
-        wanted = self.active.scoring.blocks or () if self.active.policy == "fisher" else ()
-        lack: dict[Block, str] = {"semantic": "a fit without a teacher's maps", "deformation": "a fit of what is still"}
-        for name, why in lack.items():
-            if name in wanted and not fitted[name]:
-                raise ValueError(f"active: blocks must be of what is fitted, got {name} for {why}; use geometry")
+        for name in self.active.scoring.blocks or () if self.active.policy == "fisher" else ():
+            if name in lacking:
+                raise ValueError(
+                    f"active: blocks must be of what is fitted, got {name} for {lacking[name]}; use geometry"
+                )
+
+    @property
+    def scoring(self) -> Scoring:
+        """How candidates are scored, as far as the selection says it."""
+        return self.active.scoring_of(self._config.settings)
 
     @property
     def names(self) -> list[str]:
@@ -294,8 +296,7 @@ class ActiveViews:
         scene: Scene,
         frames: list[Frame],
         step: int,
-        decoder: Decoder | None = None,
-        estimated: Sequence[Nuisance] = (),
+        scoring: Scoring | None = None,
     ) -> tuple[Frame, dict]:
         """Choose one more view, then read it.
 
@@ -303,20 +304,16 @@ class ActiveViews:
             scene: Scene at this step, seen by each view at its time.
             frames: The photographs seen so far; of these, too, only the cameras matter, and the masks.
             step: Steps done.
-            decoder: Decoder of the features at this step; they count in its metric.
-            estimated: Unknowns of the photographs that the fit estimates, and that are eliminated from what views tell
-                unless the selection says which are.
+            scoring: How candidates are scored, as components of the fit have completed it; default `scoring`.
         Returns:
             The photograph, and the record that was appended to `picks`.
         """
-        from drgs.information.semantics import SemanticMetric
         from drgs.select import select
 
         active = self.active
         left = self.timetable.left(len(self.picks), self.chosen)
         pixels = active.info_pixels or self._config.data.max_pixels
-        semantics = None if decoder is None else SemanticMetric(decoder.metric())
-        scoring = active.scoring_of(self._config.settings, semantics).over(estimated)
+        scoring = scoring or self.scoring
         seen = [at_most(frame.camera, pixels) for frame in frames]
         with Bar("choosing a view", len(left) + len(frames)) as bar:
             selection = select(
@@ -381,7 +378,6 @@ class ActiveViews:
         picks = [{name: x for name, x in pick.items() if name != "seconds"} for pick in self.picks]
         header = {"pool": [view.name for view in self.views], "picks": picks}
         header |= {"measured": self.measured}
-        header |= {} if self.exposure is None else {"exposure": self.exposure}
         return {"policy_rng": self._generator.get_state()}, {"active": header}
 
     def restore(self, tensors: dict[str, torch.Tensor], header: dict, where: str) -> None:
@@ -408,7 +404,6 @@ class ActiveViews:
             )
         self.picks = old["picks"]
         self.measured = old.get("measured", [])
-        self.exposure = old.get("exposure")
         self.chosen = self.chosen[: len(self.timetable.start)] + [pick["index"] for pick in self.picks]
         self._generator.set_state(tensors["policy_rng"])
 

@@ -615,15 +615,10 @@ class FitConfig(Record):
 
 
 def _check_lenses(config: FitConfig) -> None:
-    """Refuse what does not work on photographs as they were taken."""
+    """Refuse renderers that cannot draw photographs as they were taken."""
     drawn = planar_of(config.renderers, config.settings)
     if drawn:
         raise ValueError(
             f"fit: undistort off must have renderers along rays alone, got {', '.join(drawn)}; use --for drgs, or "
             "--undistort on"
         )
-    if config.data.poses != "fixed":
-        poses = config.data.poses
-        raise ValueError(f"fit: undistort off must have poses fixed, got {poses}; drop --poses, or use --undistort on")
-    if config.selection:
-        raise ValueError("fit: undistort off must have --views all, got active; use it, or --undistort on")

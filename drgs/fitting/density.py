@@ -59,8 +59,8 @@ def relocate(rows: GaussianRows, min_opacity: float, jitter: float, generator: t
     opacity = rows.tensors["logit_opacities"].detach().sigmoid()  # for a decision, which has no gradient
     is_dead = opacity <= min_opacity
     # What is far away stays where it is, and no copy of it would be of use in the scene.
-    dead = is_dead[rows.skybox :].nonzero()[:, 0] + rows.skybox
-    alive = (~is_dead[rows.skybox :]).nonzero()[:, 0] + rows.skybox
+    dead = is_dead[rows.far :].nonzero()[:, 0] + rows.far
+    alive = (~is_dead[rows.far :]).nonzero()[:, 0] + rows.far
     if not len(dead) or not len(alive):
         return 0
     source = alive[_draw(opacity[alive], len(dead), generator)]
@@ -71,9 +71,9 @@ def relocate(rows: GaussianRows, min_opacity: float, jitter: float, generator: t
 def add_gaussians(rows: GaussianRows, count: int, min_opacity: float, jitter: float, generator: torch.Generator) -> int:
     """Add `count` copies of Gaussians drawn by opacity; arguments as in `relocate`. How many were added."""
     opacity = rows.tensors["logit_opacities"].detach().sigmoid()  # weights of a draw, which has no gradient
-    if count <= 0 or len(rows) == rows.skybox:
+    if count <= 0 or len(rows) == rows.far:
         return 0
-    source = _draw(opacity[rows.skybox :], count, generator) + rows.skybox
+    source = _draw(opacity[rows.far :], count, generator) + rows.far
     rows.append(_copies(rows, source, min_opacity, jitter, generator))
     return count
 
@@ -92,7 +92,7 @@ def explore(rows: GaussianRows, rate: float, extent: float, strength: float, gen
     t = rows.tensors
     # A gate that is open below an opacity of about 0.005: visible Gaussians stay where the gradient puts them.
     gate = torch.sigmoid(100 * (0.005 - t["logit_opacities"].sigmoid()))
-    gate[: rows.skybox] = 0  # of a shell that is wide: it would be carried away
+    gate[: rows.far] = 0  # of a shell that is wide: it would be carried away
     moving = (gate > 1e-3).nonzero()[:, 0]
     noise = torch.randn(len(rows), 3, generator=generator)[moving]
     axes = semi_axes(t["quats"][moving], t["log_scales"][moving].exp())

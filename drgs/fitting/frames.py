@@ -70,7 +70,7 @@ class Frame:
         return self.image() if self.mask is None else self.image() * self.mask[..., None]
 
     def empty(self) -> torch.Tensor | None:
-        """(H, W) float32 in [0, 1], how much of each pixel is known to show nothing; None if nothing tells."""
+        """(H, W) float32 in [0, 1], how much of each pixel is known to show nothing; None if that is not known."""
         shown = self.mask if self.is_object else None
         if self.alpha is not None:
             alpha = _as_float(self.alpha)
@@ -78,7 +78,7 @@ class Frame:
         return None if shown is None else 1 - shown
 
     def object_weights(self) -> torch.Tensor | None:
-        """(H, W) float32 in [0, 1], how much of each pixel shows the object; None if nothing tells where it is."""
+        """(H, W) float32 in [0, 1], how much of each pixel shows the object; None if it is not known where that is."""
         empty = self.empty()
         if empty is None:
             return None
@@ -86,7 +86,7 @@ class Frame:
 
 
 def load_dataset(path: str | os.PathLike, config: FitConfig, **options: Any) -> Dataset:
-    """The data set of a fit: its frames, split and background are those that the fit is told.
+    """The data set of a fit: with the frames, split and background of its configuration.
 
     Args:
         path: The data set.

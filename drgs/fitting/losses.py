@@ -18,7 +18,18 @@ if TYPE_CHECKING:
     from drgs.fitting.frames import Frame
     from drgs.integrator import Output
 
-__all__ = ["LossTerm", "Opacity", "Outside", "Photometric", "Scale", "padded_ssim", "psnr_of", "ssim_map", "terms_of"]
+__all__ = [
+    "LossTerm",
+    "Opacity",
+    "Outside",
+    "Photometric",
+    "Scale",
+    "padded_ssim",
+    "psnr",
+    "psnr_of",
+    "ssim_map",
+    "terms_of",
+]
 
 _RADIUS = 5
 _SIGMA = 1.5
@@ -49,15 +60,21 @@ class LossTerm(Protocol):
         """
 
 
-def terms_of(config: FitConfig, extent: float) -> list[LossTerm]:
-    """The terms of a fit, in the order in which they are added up; `extent` of the scene is its unit of length."""
+def terms_of(config: FitConfig, extent: float, far: int = 0) -> list[LossTerm]:
+    """The terms that every fit has, in the order in which they are added up.
+
+    Args:
+        config: Configuration of the fit.
+        extent: Extent of the scene, its unit of length.
+        far: How many of the first Gaussians are far away, and left out of means over all.
+    """
     terms: list[LossTerm] = [Photometric(config.loss.ssim_weight)]
     if config.loss.outside_weight:
         terms.append(Outside(config.loss.outside_weight))
     if config.loss.opacity_weight:
-        terms.append(Opacity(config.loss.opacity_weight))
+        terms.append(Opacity(config.loss.opacity_weight, far))
     if config.loss.scale_weight:
-        terms.append(Scale(config.loss.scale_weight, extent))
+        terms.append(Scale(config.loss.scale_weight, extent, far))
     return terms
 
 
@@ -109,41 +126,58 @@ class Outside:
 class Opacity:
     """Opacity of all Gaussians: those that no photograph needs become transparent, and density control moves them.
 
-    `skybox`: how many of the first are far away, and left out of the mean.
+    `far`: how many of the first are far away (a skybox), and left out of the mean.
     """
 
     weight: float
-    skybox: int = 0
+    far: int = 0
     name: ClassVar[str] = "opacity"
     outputs: ClassVar[tuple[str, ...]] = ()
 
     def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor:
         """See `LossTerm`."""
-        return self.weight * gaussians.opacities[self.skybox :].mean()
+        return self.weight * gaussians.opacities[self.far :].mean()
 
 
 @dataclasses.dataclass(frozen=True)
 class Scale:
     """Scales of all Gaussians, in units of the scene's extent: those that no photograph needs shrink.
 
-    `skybox`: how many of the first are far away, and left out of the mean.
+    `far`: how many of the first are far away (a skybox), and left out of the mean.
     """
 
     weight: float
     extent: float
-    skybox: int = 0
+    far: int = 0
     name: ClassVar[str] = "scale"
     outputs: ClassVar[tuple[str, ...]] = ()
 
     def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor:
         """See `LossTerm`."""
         # The weight of MCMC's authors is for scenes with an extent of about 5.
-        return self.weight * gaussians.scales[self.skybox :].mean() * (5 / self.extent)
+        return self.weight * gaussians.scales[self.far :].mean() * (5 / self.extent)
 
 
 def psnr_of(mse: float) -> float:
     """Peak signal-to-noise ratio in dB of a mean squared error of values in [0, 1]."""
     return -10 * math.log10(max(mse, 1e-10))  # equal images have 100 dB, which averages can take
+
+
+def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio in dB, as `drgs.metrics.DEFINITIONS` says.
+
+    Args:
+        image, target: (H, W, 3) in [0, 1].
+        mask: (H, W) weights in [0, 1], or None.
+    """
+    error = (image.double() - target.double()).square().mean(2)
+    if mask is not None:
+        if not bool((mask > 0).any()):
+            raise ValueError("psnr: the mask must keep at least one pixel, keeps none; drop this view")
+        mse = float((error * mask).sum() / mask.double().sum())
+    else:
+        mse = float(error.mean())
+    return psnr_of(mse)
 
 
 def padded_ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:

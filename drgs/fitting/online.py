@@ -116,14 +116,14 @@ class OnlineFit:
         frames = self._waiting if self.trainer is None else self.trainer.frames
         tensors = {f"photograph.{i}": frame.pixels for i, frame in enumerate(frames)}
         rng: Any = self._rng.bit_generator.state  # whose numbers have 128 bits, which few readers of JSON keep
-        told = {name: f"{rng['state'][name]:x}" for name in ("state", "inc")}
-        told |= {name: rng[name] for name in ("has_uint32", "uinteger")}
+        state = {name: f"{rng['state'][name]:x}" for name in ("state", "inc")}
+        state |= {name: rng[name] for name in ("has_uint32", "uinteger")}
         fit = None
         if self.trainer is not None:
             more, fit = self.trainer.state()
             tensors |= {f"fit.{name}": x.clone() for name, x in more.items()}
             fit |= {"point_source": "photographs"}
-        return tensors, {"config": self.config.to_json(), "rng": told, "fit": fit}, [one.camera for one in frames]
+        return tensors, {"config": self.config.to_json(), "rng": state, "fit": fit}, [one.camera for one in frames]
 
     @classmethod
     def from_state(

@@ -19,13 +19,13 @@ import torch
 
 from drgs.codecs.ply import load_ply
 from drgs.data.camera_lists import load_cameras_json
+from drgs.fitting.components.base import Checkpoint
+from drgs.fitting.components.poses import CAMERAS
+from drgs.fitting.components.semantics import SemanticRecord
+from drgs.fitting.components.table import COMPONENTS
 from drgs.fitting.config import FitConfig
-from drgs.fitting.filter_3d import VARIANCES, filtered
 from drgs.fitting.networks import saved_networks
-from drgs.fitting.poses import CAMERAS
 from drgs.fitting.rows import GaussianRows
-from drgs.fitting.semantic_record import SemanticRecord
-from drgs.fitting.transients import TENSOR as TRANSIENT
 from drgs.information.nuisances import NUISANCES, Nuisance
 from drgs.io.checkpoint import load_state
 from drgs.io.json_files import check_json, parse_json, read_json
@@ -38,7 +38,9 @@ if TYPE_CHECKING:
     from drgs.features.decoder import Decoder
     from drgs.features.segmentation import Classes
     from drgs.fitting.active import ActiveViews
+    from drgs.fitting.components.base import Setup
     from drgs.fitting.frames import Frame
+    from drgs.fitting.trainer import Trainer
     from drgs.io.run import Run
 
 __all__ = [
@@ -102,7 +104,7 @@ class FitRecord:
     def with_refined_poses(self, dataset: Dataset) -> Dataset:
         """The data set with the cameras of the photographs where the fit has found them.
 
-        Whoever compares photographs with a run, or asks what known views tell, has to load them so.
+        Whoever compares photographs with a run, or computes the information of known views, has to load them so.
         """
         for view in dataset.views:
             if view.name in self.refined:
@@ -178,17 +180,18 @@ def load_run(run: Run | str | os.PathLike) -> LoadedRun:
     try:
         tensors, header = load_state(run.state)
         check_checkpoint(run.state, tensors, header)
+        checkpoint = Checkpoint(tensors, header, str(run.state))
         gaussians = GaussianRows.from_state(tensors).gaussians().detach()  # to be looked at, not to be fitted
-        if VARIANCES in tensors:
-            gaussians = filtered(gaussians, tensors[VARIANCES])
+        for component in COMPONENTS.values():
+            gaussians = component.load_gaussians(gaussians, checkpoint)
         gaussians.validate(str(run.state))
         networks = saved_networks(tensors, header)
         if known is not None:
             decoder = known.decoder(networks, gaussians, str(run.state))
-        if "field" in header:
-            from drgs.fitting.dynamics import moving_scene
-
-            moving = moving_scene(gaussians, tensors, networks, header, str(run.state))
+        scene: Any = gaussians
+        for component in COMPONENTS.values():
+            scene = component.load_scene(scene, checkpoint)
+        moving = None if scene is gaussians else scene
     except (FileNotFoundError, ValueError) as error:
         if not run.point_cloud.is_file():
             if run.state.exists():
@@ -278,22 +281,28 @@ def is_fit_config(path: Path) -> bool:
 
 
 def config_record(
-    dataset: Dataset,
-    config: FitConfig,
-    plan: ActiveViews | None,
-    taught: SemanticRecord | None,
-    frames: list[Frame],
-    held_out: list[Frame],
+    setup: Setup,
+    trainer: Trainer,
     source: str,
-    times: tuple[float, ...] = (),
+    plan: ActiveViews | None,
+    before: Mapping[str, Any],
+    begin: Path | None,
 ) -> dict:
-    """What config.json is to say of a fit, for `drgs.files.Run.start`; `fit_record` reads it."""
+    """What config.json is to say of a fit, for `drgs.io.run.Run.start`; `fit_record` reads it.
+
+    Args:
+        setup, trainer, plan: What the fit begins with, at its first step or resumed, and its views if they are chosen.
+        source: Where the first Gaussians come from, in words.
+        before: Contents of config.json of a fit that is resumed; else empty.
+        begin: Checkpoint whose Gaussians it begins with.
+    """
+    dataset, data, frames, held_out = setup.dataset, trainer.config.data, setup.frames, setup.held_out
     recorded: dict[str, Any] = {
         "schema": CONFIG_SCHEMA,
         "command": "fit",
         "data": str(Path(dataset.path).resolve()),
         "format": dataset.format,
-        "split_rule": dataset.split_rule(config.data.test_every, config.data.test_offset, config.data.test_cameras),
+        "split_rule": dataset.split_rule(data.test_every, data.test_offset, data.test_cameras),
         "train": [frame.name for frame in frames],
         "test": [frame.name for frame in held_out],
         "size": sorted({(f.camera.width, f.camera.height) for f in frames + held_out}),
@@ -301,16 +310,15 @@ def config_record(
         "points": source,
         **({"frames": list(dataset.frames)} if dataset.frames else {}),
         **({"absent": [view.name for view in dataset.absent]} if dataset.absent else {}),
-        **({"semantics": taught.to_json()} if taught else {}),
-        **({"times": list(times)} if times else {}),
-        "fit": config.to_json(),
+        "fit": trainer.config.to_json(),
     }
     if plan:
-        recorded |= {
-            "pool": [view.name for view in plan.views],
-            "pool_leak": plan.pool_leak,
-        }
-    return recorded
+        recorded |= {"pool": [view.name for view in plan.views], "pool_leak": plan.pool_leak}
+    for component in trainer.components:
+        recorded |= component.record(trainer, before)
+    recorded |= {"estimated": trainer.nuisances} if trainer.nuisances else {}
+    began = before.get("begin", None if begin is None else str(begin))
+    return recorded | ({} if began is None else {"begin": began})
 
 
 def fit_record(run: Run) -> FitRecord:
@@ -393,7 +401,7 @@ def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict)
 
     Args:
         path: File that messages name.
-        tensors, header: Result of `drgs.files.load_state`.
+        tensors, header: Result of `drgs.io.checkpoint.load_state`.
     Raises:
         ValueError: If the header lacks a field, or a value is of another type or out of range, or a tensor is missing
             or has another shape than the number of Gaussians asks for, or a network has no tensor.
@@ -405,7 +413,8 @@ def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict)
         kind |= {"active": _ACTIVE | ({"exposure": dict} if found else {})}
     kind |= {"networks": [str]} if "networks" in header else {}
     kind |= {"seconds": float} if "seconds" in header else {}  # of older versions
-    kind |= {"transients": bool} if "transients" in header else {}
+    for component in COMPONENTS.values():
+        kind |= {name: x for name, x in component.header_kinds.items() if name in header}
     kind |= {"skybox": int} if "skybox" in header else {}
     check_json(str(path), header, kind, advice)
     try:
@@ -430,7 +439,7 @@ def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict)
     for name, held in saved_networks(tensors, header).items():
         if not held:  # every network has parameters: an optimizer of none is refused by torch
             raise ValueError(f"{path}: network {name!r} must have parameters, got none; {advice}")
-    for name, (dtype, shape) in _expected(tensors, header).items():
+    for name, (dtype, shape) in _expected(Checkpoint(tensors, header, str(path))).items():
         x = tensors.get(name)
         if x is None or x.dtype != dtype or tuple(x.shape) != shape:
             got = "none" if x is None else f"{x.dtype} of shape {tuple(x.shape)}"
@@ -440,8 +449,9 @@ def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict)
         raise ValueError(f"{path}: queue must hold numbers of the {len(header['views'])} views; {advice}")
 
 
-def _expected(tensors: dict[str, torch.Tensor], header: dict) -> dict[str, tuple[torch.dtype, tuple[int, ...]]]:
+def _expected(checkpoint: Checkpoint) -> dict[str, tuple[torch.dtype, tuple[int, ...]]]:
     """Type and shape of the tensors of a checkpoint, of as many Gaussians as there are means."""
+    tensors, header = checkpoint.tensors, checkpoint.header
     length = lambda name, axis: x.shape[axis] if (x := tensors.get(name)) is not None and x.ndim > axis else 0  # noqa: E731
     count, rest = length("parameter.means", 0), length("parameter.sh_rest", 1)
     rest = next((k for k in (0, 3, 8, 15) if k >= rest), 0)
@@ -459,16 +469,13 @@ def _expected(tensors: dict[str, torch.Tensor], header: dict) -> dict[str, tuple
     state = torch.Generator().get_state()
     generators = ("rng",) if header.get("active") is None else ("rng", "policy_rng")
     expected |= {name: (state.dtype, tuple(state.shape)) for name in generators}
-    if VARIANCES in tensors or header["config"].get("filter_3d") == "on":
-        expected[VARIANCES] = torch.float32, (count,)
-    for name in tensors:
-        if name.startswith(TRANSIENT):
-            expected[name] = torch.uint8, (length(name, 0), length(name, 1))
+    for component in COMPONENTS.values():
+        expected |= component.tensor_kinds(checkpoint, count)
     return expected | {"queue": (torch.int64, (length("queue", 0),))}
 
 
 def _mask_kinds(frame: Frame) -> list[str]:
-    """What tells of a photograph where nothing is, or is not known."""
+    """What says of a photograph where nothing is, or where that is not known."""
     kinds = [] if frame.mask is None else ["object" if frame.is_object else "valid"]
     kinds += [] if frame.alpha is None else ["alpha"]
     return kinds or ["none"]

@@ -15,7 +15,8 @@ Reference:
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -61,6 +62,10 @@ class Resolution:
             return []
         width, height = halved_size(frames[0].camera.width, frames[0].camera.height, halvings)
         return [{"event": "resolution", "halvings": halvings, "width": width, "height": height}]
+
+    def describe(self, event: Mapping[str, Any]) -> str | None:
+        """The line on stderr for an event of its own; None for others."""
+        return f"photographs of {event['width']}x{event['height']}" if event["event"] == "resolution" else None
 
     def seen(self, index: int, frame: Frame, step: int) -> Frame:
         """A photograph as a step sees it: area averages of pixels, mask and alpha, with the camera of that size.

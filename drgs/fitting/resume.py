@@ -8,9 +8,9 @@ import shutil
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from drgs.fitting.poses import CAMERAS
+from drgs.fitting.components.poses import CAMERAS
+from drgs.fitting.components.semantics import EMBEDDINGS
 from drgs.fitting.records import check_checkpoint, is_fit_config
-from drgs.fitting.semantic_record import EMBEDDINGS
 from drgs.io.checkpoint import load_state
 from drgs.io.outputs import lock_folder, replacing
 

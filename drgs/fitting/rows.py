@@ -7,6 +7,8 @@ Gaussian is fitted beside them (networks.py).
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import torch
 
@@ -23,12 +25,13 @@ class GaussianRows:
     Attributes:
         tensors: means, quats, log_scales, logit_opacities, sh_dc (N, 1, 3) and sh_rest (N, K - 1, 3), perhaps features
             (N, D), and any others (N, ...) whose rows shall follow the Gaussians.
-        skybox: How many of the first rows are what is far away (skybox.py), which density control leaves alone.
+        far: How many of the first rows are far away, beyond the scene (a skybox): density control leaves them alone,
+            and means over all Gaussians leave them out.
         optimizer: One parameter group a tensor, named as in `tensors`.
     """
 
     def __init__(self, tensors: dict[str, torch.Tensor]) -> None:
-        self.skybox = 0
+        self.far = 0
         # Leaves of their own: what the caller has is neither changed nor differentiated.
         self.tensors = {name: x.detach().clone().requires_grad_() for name, x in tensors.items()}
         groups = [{"params": [x], "name": name} for name, x in self.tensors.items()]
@@ -37,7 +40,7 @@ class GaussianRows:
 
     @classmethod
     def from_points(
-        cls, points: torch.Tensor, colors: torch.Tensor, opacity: float = 0.1, scale: float = 1.0, features: int = 0
+        cls, points: torch.Tensor, colors: torch.Tensor, opacity: float = 0.1, scale: float = 1.0
     ) -> GaussianRows:
         """One isotropic Gaussian a point, as wide as the points around it are far apart.
 
@@ -46,7 +49,6 @@ class GaussianRows:
             colors: (N, 3) in [0, 1].
             opacity: Opacity of all of them.
             scale: Times the root of the mean squared distance to the three nearest points.
-            features: Their number D a Gaussian, 0 at the start.
         """
         n = len(points)
         quats = torch.zeros(n, 4)
@@ -59,7 +61,6 @@ class GaussianRows:
                 "logit_opacities": torch.full((n,), math.log(opacity / (1 - opacity))),
                 "sh_dc": ((colors.float() - 0.5) * (1 / Y_00))[:, None, :],
                 "sh_rest": torch.zeros(n, 0, 3),
-                **({"features": torch.zeros(n, features)} if features else {}),
             }
         )
 
@@ -92,7 +93,7 @@ class GaussianRows:
         self.tensors[name] = x = values.detach().clone().requires_grad_()  # a leaf of its own, as in `__init__`
         self.optimizer.add_param_group({"params": [x], "name": name})
 
-    def add_skybox(self, rows: dict[str, torch.Tensor]) -> None:
+    def add_far(self, rows: dict[str, torch.Tensor]) -> None:
         """Put the Gaussians of a shell before all others, with no moments; before the first step alone.
 
         Raises:
@@ -100,9 +101,11 @@ class GaussianRows:
         """
         if self.optimizer.state:
             raise ValueError("fit: a skybox must be there before the first step, got one later; begin a fit with it")
-        whole = GaussianRows({name: torch.cat([rows[name], x.detach()]) for name, x in self.tensors.items()})
+        count = len(rows["means"])
+        first = {name: rows.get(name, x.new_zeros(count, *x.shape[1:])) for name, x in self.tensors.items()}
+        whole = GaussianRows({name: torch.cat([first[name], x.detach()]) for name, x in self.tensors.items()})
         self.tensors, self.optimizer = whole.tensors, whole.optimizer
-        self.skybox = len(rows["means"])
+        self.far = count
 
     def scale_colors(self, factors: torch.Tensor) -> None:
         """Multiply the colors that directions see by (3,) factors of R, G and B; moments stay.
@@ -141,9 +144,13 @@ class GaussianRows:
             out |= {f"adam.{name}.{key}": v for key, v in self.optimizer.state.get(x, {}).items()}
         return out
 
+    def header(self) -> dict:
+        """What a checkpoint's header says of the rows."""
+        return {"skybox": self.far} if self.far else {}
+
     @classmethod
-    def from_state(cls, state: dict[str, torch.Tensor]) -> GaussianRows:
-        """The inverse of `state`; other keys are ignored."""
+    def from_state(cls, state: dict[str, torch.Tensor], header: Mapping[str, Any] | None = None) -> GaussianRows:
+        """The inverse of `state` and `header`; other keys are ignored."""
         prefix = "parameter."
         rows = cls({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
         for name, x in rows.tensors.items():
@@ -151,6 +158,7 @@ class GaussianRows:
             moments = {k.removeprefix(prefix): v.clone() for k, v in state.items() if k.startswith(prefix)}
             if moments:
                 rows.optimizer.state[x] = moments
+        rows.far = (header or {}).get("skybox", 0)
         return rows
 
     def _moments(self, name: str) -> list[torch.Tensor]:

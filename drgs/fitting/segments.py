@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from drgs.features.decoder import Decoder
     from drgs.features.segmentation import Classes
     from drgs.fitting.frames import Frame
-    from drgs.fitting.semantic_record import SemanticRecord
 
 __all__ = ["Segmentation", "check_references", "feature_colors", "segmentation_of", "teacher_labels"]
 
@@ -121,28 +120,28 @@ def segmentation_of(
     gaussians: Gaussians,
     decoder: Decoder | None,
     classes: Classes | None,
-    record: SemanticRecord | None,
+    labels: str,
+    teacher: str,
     frames: list[Frame],
-) -> Segmentation | str | None:
+) -> Segmentation | str:
     """What to measure of frames: against the data set's labels if any of them has some, else against the teacher's.
 
     Args:
         gaussians: Gaussians with features; those of a scene that moves are at rest.
-        decoder, classes, record: Decoder, classes and teacher of the run.
+        decoder, classes: Decoder and classes of the run.
+        labels, teacher: Names of the folders of labels and of a teacher's maps in its data set.
         frames: That will be measured.
     Returns:
-        None where a run has no features; in words why it cannot be measured.
+        In words why it cannot be measured, if it cannot.
     """
-    if record is None:
-        return None
     if decoder is None or gaussians.features is None:
         return "only the PLY of the run could be read, which has no decoder: restore state.safetensors"
     if classes is None or classes.embeddings is None:
         return "the run has no text embeddings of its classes: add text_embeddings.npy and classes.json to the data set"
     if any(frame.labels is not None for frame in frames):
-        return Segmentation(gaussians, decoder, classes, "labels", record.labels)
+        return Segmentation(gaussians, decoder, classes, "labels", labels)
     if any(frame.teacher is not None for frame in frames):
-        return Segmentation(gaussians, decoder, classes, "teacher", record.teacher)
+        return Segmentation(gaussians, decoder, classes, "teacher", teacher)
     return "no view has labels or a map of the teacher"
 
 

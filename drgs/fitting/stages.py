@@ -1,5 +1,5 @@
 """Which steps a schedule runs over, and which times the photographs of a fit are of; of every fit, also of what stands
-still, and therefore without what moves (dynamics.py).
+still, and therefore without what moves (components/motion.py).
 """
 
 from __future__ import annotations
@@ -13,8 +13,18 @@ import numpy as np
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.data import Dataset
+    from drgs.fitting.config import FitConfig
 
-__all__ = ["Stage", "first_time", "moving_labels", "shows_first_time", "spacing", "times_of"]
+__all__ = [
+    "Stage",
+    "dynamic_stage",
+    "first_time",
+    "fitted_times",
+    "moving_labels",
+    "shows_first_time",
+    "spacing",
+    "times_of",
+]
 
 _FEWEST = 3  # photographs of one time that show the depth of things, with one to spare
 
@@ -51,6 +61,23 @@ class Stage:
     def length(self) -> int:
         """How many steps."""
         return self.end - self.begin
+
+
+def dynamic_stage(config: FitConfig) -> Stage:
+    """The steps of a fit to what moves that come after those that fit what stands still."""
+    return Stage(round(config.motion.static_share * config.max_steps), config.max_steps)
+
+
+def fitted_times(config: FitConfig, train: Sequence[_Seen], test: Sequence[_Seen]) -> tuple[float, ...]:
+    """The distinct times of all views that a fit distinguishes, sorted; none if nothing can have moved in the training
+    views, or is to.
+
+    Raises:
+        ValueError: If some views have a time and others do not.
+    """
+    if config.motion.dynamics == "ignore" or not times_of(train):
+        return ()
+    return times_of([*train, *test])
 
 
 def times_of(views: Sequence[_Seen]) -> tuple[float, ...]:

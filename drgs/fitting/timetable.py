@@ -7,9 +7,9 @@
 
 [1] fits a static scene to the first time for 3,000 steps, then a dynamic one for 14,000, with a pick every 200 of
 these at the 39 later times. `times` and `pairs` do so at any number of steps: the first pick comes when the dynamic
-stage has lasted 200 of 17,000 steps, or `every` if that is more, for a deformation that begins at zero tells nothing of
-what its first layers hold. Every step shows one of the photographs picked so far, each as likely as any other, those of
-the first time included.
+stage has lasted 200 of 17,000 steps, or `every` if that is more, for a deformation that begins at zero has no
+information about its first layers. Every step shows one of the photographs picked so far, each as likely as any other,
+those of the first time included.
 
 Reference:
     [1] Next Best View Selections for Semantic and Dynamic 3D Gaussian Splatting, arXiv 2512.22771.

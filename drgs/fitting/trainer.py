@@ -1,46 +1,46 @@
 """One fit, a step at a time: the losses and rates of 3DGS and MCMC density control (density.py) with a fixed budget.
 
 All schedules are fractions of `max_steps`, so that a short fit goes through all of them. One view a step, in epochs
-of random order. What moves is fitted in two stages (dynamics.py). `drgs.train` adds files, progress and the command.
+of random order. What a fit has besides photographs and Gaussians are its components (`drgs.fitting.components`), whose
+methods are called at their times. `drgs.train` adds files, progress and the command.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from drgs.ellipsoids import Gaussians
+from drgs.fitting.components.base import Checkpoint
+from drgs.fitting.components.table import components_of
 from drgs.fitting.config import FitConfig
 from drgs.fitting.density import add_gaussians, explore, relocate
-from drgs.fitting.exposure import Exposure
-from drgs.fitting.filter_3d import VARIANCES
-from drgs.fitting.losses import psnr_of
-from drgs.fitting.networks import rate_at
-from drgs.fitting.parts import Parts, means_rate, parts_of, with_exposure, with_skybox, without_exposure
-from drgs.fitting.poses import is_due
+from drgs.fitting.losses import psnr_of, terms_of
+from drgs.fitting.networks import Network, rate_at
+from drgs.fitting.rates import means_rate, rates_of
 from drgs.fitting.renderers import AUTO, RendererSchedule
 from drgs.fitting.resolution import Resolution
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.stages import Stage
-from drgs.fitting.transients import Transients
+from drgs.information.nuisances import NUISANCES, Nuisance
 from drgs.integrator import render
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Scene
-    from drgs.fitting.dynamics import Motion
-    from drgs.fitting.exposure import ExposureEstimate
+    from drgs.fitting.components.base import Component, Setup
     from drgs.fitting.frames import Frame
+    from drgs.fitting.losses import LossTerm
     from drgs.integrator import Output
 
 __all__ = ["StepResult", "Trainer"]
 
 _MAX_BAD_STEPS = 10
-# Parts of names in a checkpoint, not of networks.
-_RESERVED = {"parameter", "adam", "rng", "queue", "policy_rng", "transient", VARIANCES}
+# Parts of names in a checkpoint, not of networks; components have more.
+_RESERVED = {"parameter", "adam", "rng", "queue", "policy_rng"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,21 +63,21 @@ class StepResult:
 
 
 class Trainer:
-    """The state of a fit, one `step` at a time.
+    """The state of a fit, one `step` at a time; a `drgs.fitting.components.base.Fit`.
 
     Attributes:
         config: The `FitConfig`.
         frames: Training photographs.
         rows: The Gaussians and their optimizer.
         extent: Extent of the scene, its unit of length.
-        parts: Terms of the loss, learning rates, networks, and what is rendered.
-        motion: The stages of a fit to what moves; None of what stands still.
+        components: What the fit has besides, in the order of the table.
+        terms: Terms of the loss that every fit has, added up before those of components.
         renderers: What each step is rendered with.
         resolution: How large each step sees the photographs.
-        transients: What single photographs alone show.
         step_index: Steps done.
         bad_steps: Steps skipped because a loss or gradient was not finite.
         reserved: Part of the budget that density control leaves for points of photographs to come.
+        generator: Generator of all random choices of the steps.
     """
 
     def __init__(
@@ -86,14 +86,16 @@ class Trainer:
         frames: list[Frame],
         rows: GaussianRows,
         extent: float,
-        parts: Parts | None = None,
-        motion: Motion | None = None,
+        components: list[Component] | None = None,
+        setup: Setup | None = None,
+        checkpoint: Checkpoint | None = None,
     ) -> None:
         """A fit at its first step.
 
         Args:
-            parts: Default those of `config`.
-            motion: Stage that a fit of what moves is in, and what comes with the next.
+            components: Their instances, for this fit alone; default those of the table, without evidence of a data set.
+            setup: What components begin with; None: they have begun, or have nothing to begin with.
+            checkpoint: What they are resumed from.
         Raises:
             ValueError: If there is no photograph or no Gaussian, a tensor has no rate, or two networks have one name.
         """
@@ -105,89 +107,101 @@ class Trainer:
         self.frames = frames
         self.rows = rows
         self.extent = extent
-        self.parts = with_skybox(parts_of(config, extent) if parts is None else parts, rows.skybox)
-        self.motion = motion
-        self._check_parts()
+        self.components = components_of() if components is None else components
         self.renderers = RendererSchedule.of(config.renderers, config.settings, config.max_steps)
         self.resolution = Resolution(config.data.num_downscales, config.max_steps)
-        self.transients = Transients(config.loss.transients)
         self.step_index = self.bad_steps = self._bad_in_a_row = 0
         self._bad: str | None = None  # what was not finite first
-        self._generator = torch.Generator().manual_seed(config.seed)
+        self.generator = torch.Generator().manual_seed(config.seed)
         self._queue = torch.zeros(0, dtype=torch.int64)
-        self._start_count = len(rows)
         self.reserved = 0
-        self._sample()
+        for component in self.components:
+            if setup is not None:
+                component.start(self, setup)
+            if checkpoint is not None:
+                component.resume(self, checkpoint)
+        self.terms: list[LossTerm] = terms_of(config, extent, rows.far)
+        self._start_count = len(rows)
+        self._check()
+        if checkpoint is None:
+            self._changed()
 
-    def _check_parts(self) -> None:
+    @property
+    def networks(self) -> list[Network]:
+        """What is fitted beside the Gaussians."""
+        return [network for component in self.components for network in component.networks]
+
+    @property
+    def nuisances(self) -> list[Nuisance]:
+        """Unknowns of the photographs that are estimated beside the scene."""
+        estimated = {component.nuisance for component in self.components}
+        return [name for name in NUISANCES if name in estimated]
+
+    @property
+    def part(self) -> float:
+        """The fraction of the fit that is done."""
+        return self.step_index / self.config.max_steps
+
+    def component(self, name: str) -> Any:
+        """The component of a name.
+
+        Raises:
+            KeyError: If the fit has none.
+        """
+        return {component.name: component for component in self.components}[name]
+
+    def network(self, name: str) -> torch.nn.Module | None:
+        """What is fitted beside the Gaussians under a name, as it is now; None if there is nothing."""
+        return next((network.module for network in self.networks if network.name == name), None)
+
+    def _check(self) -> None:
         """Raise ValueError if a tensor has no rate, or two networks have one name."""
-        rows = self.rows
-        if missing := sorted(set(rows.tensors) - set(self.parts.rates)):
-            raise ValueError(f"fit: every tensor must have a learning rate, {missing[0]} has none; add it to the parts")
-        names = [network.name for network in self.parts.networks]
-        if len(set(names)) < len(names) or any(_RESERVED & set(name.split(".")) for name in names):
+        if missing := sorted(set(self.rows.tensors) - set(self._rates())):
             raise ValueError(
-                f"fit: networks must have names of their own, none of whose parts is {', '.join(sorted(_RESERVED))}, "
+                f"fit: every tensor must have a learning rate, {missing[0]} has none; a component must add it"
+            )
+        names = [network.name for network in self.networks]
+        reserved = _RESERVED.union(*(component.reserved_names for component in self.components))
+        if len(set(names)) < len(names) or any(reserved & set(name.split(".")) for name in names):
+            raise ValueError(
+                f"fit: networks must have names of their own, none of whose parts is {', '.join(sorted(reserved))}, "
                 f"got {', '.join(names)}; rename one"
             )
+
+    def _rates(self) -> dict:
+        rates = rates_of(self.config, self.extent)
+        for component in self.components:
+            rates |= component.rates
+        return rates
+
+    # --------------------------------------------------------------------- Gaussians and photographs that come and go
 
     def add_points(self, points: torch.Tensor, colors: torch.Tensor, opacity: float, scale: float) -> None:
         """Add Gaussians at points, as `GaussianRows.from_points` makes them; those that are there stay as they are."""
         new = GaussianRows.from_points(points, colors, opacity, scale).take(torch.arange(len(points)))
         del new["sh_rest"]  # 0 up to the degree that the others have
-        if self.motion is not None:
-            new |= self.motion.new_gates(len(points), self.rows)
+        for component in self.components:
+            new |= component.new_rows(self, len(points))
         self.rows.append(new)
-        self._sample()
+        self._changed()
 
     def restart(self, points: torch.Tensor, colors: torch.Tensor) -> None:
         """Begin again with Gaussians at other points; schedules, networks and photographs stay as they are."""
-        features = self.rows.tensors.get("features")
-        width = 0 if features is None else features.shape[1]
         degree = self.rows.sh_degree
-        self.rows = GaussianRows.from_points(points, colors, *self.config.density.start_of(False), features=width)
-        self.parts = with_skybox(self.parts, 0)
+        self.rows = GaussianRows.from_points(points, colors, *self.config.density.start_of(False))
+        for component in self.components:
+            component.restart(self)
+        self.terms = terms_of(self.config, self.extent)
         while self.rows.sh_degree < degree:
             self.rows.raise_sh_degree()
         self._start_count = len(self.rows)
-        self._sample()
-
-    def add_unknowns(self, frame: Frame, estimate: ExposureEstimate | None = None) -> None:
-        """Begin with what is unknown of a photograph that is about to be added, besides the scene.
-
-        The scene's colors change by what the gauge of the gains does, so that the other photographs look as before.
-
-        Args:
-            frame: The photograph; it gets a pose where the others have.
-            estimate: What points say of the gains of all photographs, of this one last. From now on each has its own;
-                None: nothing is said of gains.
-        """
-        poses = self.parts.poses
-        if poses is not None:
-            for network in self.parts.networks:
-                if network.module is poses:
-                    network.extend(lambda: poses.join(frame.camera, self.gaussians(), self.rows.skybox))
-        if estimate is None:
-            return
-        if self.parts.exposure is None:
-            self.parts = with_exposure(self.parts, self.frames, self.config)
-        names = [frame.name for frame in (*self.frames, frame)]
-        for network in self.parts.networks:
-            gains = network.module
-            if isinstance(gains, Exposure):
-                grown = network.extend(functools.partial(gains.join, names, estimate))
-                self.rows.scale_colors((-grown).exp())
-
-    def drop_exposure(self) -> None:
-        """From now on all photographs have the same gain; that of theirs was 1 on average, so that colors stay."""
-        if self.parts.exposure is not None:
-            self.parts = without_exposure(self.parts)
+        self._changed()
 
     def add_frame(self, frame: Frame) -> None:
         """One more photograph; the epoch begins anew, so that it is seen soon."""
         self.frames = [*self.frames, frame]
         self._queue = self._queue[:0]
-        self._sample()
+        self._changed()
 
     def drop_frame(self, name: str) -> None:
         """Fit no longer to the photograph of that name; the epoch begins anew.
@@ -200,7 +214,17 @@ class Trainer:
             raise ValueError(f"fit: {name!r} must be one of two photographs or more, is not; keep it")
         self.frames = left
         self._queue = self._queue[:0]
-        self._sample()
+        self._changed()
+
+    def _changed(self) -> None:
+        for component in self.components:
+            component.changed(self)
+
+    def begin_stage(self) -> None:
+        """See `Fit`."""
+        self._check()
+        self._queue = self._queue[:0]
+        self._start_count = len(self.rows)
 
     def reschedule(self, max_steps: int) -> None:
         """Let the fit end at another step; schedules go by the share of the steps that is done, so that they go on.
@@ -208,9 +232,9 @@ class Trainer:
         Args:
             max_steps: Steps of the whole fit, more than have been done.
         Raises:
-            ValueError: If they have been done already, or where things move, whose rates count steps.
+            ValueError: If they have been done already, or where the fit has stages, whose rates count steps.
         """
-        if self.motion is not None:
+        if any(component.stage(self) is not None for component in self.components):
             raise ValueError("fit: steps must stay as they are where things move; fit again with others")
         if max_steps <= self.step_index:
             raise ValueError(f"fit: steps must be more than the {self.step_index} done, got {max_steps}; ask for more")
@@ -218,73 +242,83 @@ class Trainer:
         self.renderers = RendererSchedule.of(self.config.renderers, self.config.settings, max_steps)
         self.resolution = Resolution(self.config.data.num_downscales, max_steps)
 
+    def another(self, config: FitConfig, frames: list[Frame], rows: GaussianRows, component: Component) -> Trainer:
+        """See `Fit`."""
+        others = [component if x.name == component.name else x for x in components_of()]
+        return Trainer(config, frames, rows, self.extent, others)
+
+    # ------------------------------------------------------------------------------------------------------- a step
+
     def step(self) -> StepResult:
         """One view, one optimizer step, and what is due at it.
 
         Raises:
             ValueError: After 10 steps in a row without a finite loss and gradient.
         """
-        config, rows, done = self.config, self.rows, self.step_index
-        events = self._begin_motion() if self.motion is not None and self.motion.is_due(done) else []
-        if self.motion is not None and self.motion.is_to_look(done, self.frames):
-            events += self._look_for_births()
+        done = self.step_index
+        events = [event for component in self.components for event in component.before_density(self)]
         events += self.resolution.events(done, self.frames)
         events += self._prepare(done)
-        if self.transients.is_due(done, config.max_steps, len(self.frames)):
-            events.append(self.transients.look(self.photographs(), self.gaussians(), config.settings))
+        events += [event for component in self.components for event in component.before_step(self)]
         index = self._next_view()
         frame = self.frames[index]
-        gaussians = self._fitted_scene().at(frame.camera.time)
-        if self.parts.poses is not None:
-            frame = self._posed(frame)
+        gaussians = self._scene().at(frame.camera.time)
+        for component in self.components:
+            frame = component.frame(self, frame)
         frame = self.resolution.seen(index, frame, done)
-        out = self._shown(gaussians, frame)
-        if self.parts.exposure is not None:
-            out = self.parts.exposure(out, frame)
-        loss, terms = self._loss(out, frame, gaussians)
-        optimizers = [rows.optimizer, *(network.optimizer for network in self.parts.networks)]
+        out = self.shown(self._rendered(gaussians, frame), frame)
+        loss, values = self._loss(out, frame, gaussians)
+        networks = self.networks
+        optimizers = [self.rows.optimizer, *(network.optimizer for network in networks)]
         for optimizer in optimizers:
             optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        if self.motion is not None:
-            self.motion.hold(self.rows)
-        with torch.no_grad():  # told, not optimized
+        for component in self.components:
+            component.after_backward(self)
+        with torch.no_grad():  # logged, not optimized
             mse = self._mse(frame, out.rgb)
         if (bad := self._not_finite(loss)) is None:
-            self._bad_in_a_row = 0
-            self._bad = None
+            self._bad_in_a_row, self._bad = 0, None
             for optimizer in optimizers:
                 optimizer.step()
-            for network in self.parts.networks:
+            for network in networks:
                 network.hold()
-            stage = self._stage()
-            density = config.density
-            if density.noise and done - stage.begin < density.refine_stop * stage.length:
-                explore(rows, means_rate(config, self._part()), self.extent, density.noise, self._generator)
+            self._explore(done)
         else:
-            self.bad_steps += 1
-            self._bad_in_a_row += 1
-            self._bad = self._bad or bad
-            events.append({"event": "skipped", "view": frame.name, "reason": f"{bad} not finite"})
-            if self._bad_in_a_row == _MAX_BAD_STEPS:
-                raise ValueError(
-                    f"fit: loss and gradients must be finite, were not for {_MAX_BAD_STEPS} steps in a row until step "
-                    f"{done} (view {frame.name}), first the {self._bad}; check the cameras, or lower the learning rates"
-                )
+            events.append(self._skip(bad, frame))
         self.step_index += 1
         psnr = psnr_of(mse) if math.isfinite(mse) else None
-        return StepResult(float(loss.detach()), terms, psnr, frame.name, events)  # told, not optimized
+        return StepResult(float(loss.detach()), values, psnr, frame.name, events)  # logged, not optimized
+
+    def _explore(self, done: int) -> None:
+        """The noise of density control after step `done`."""
+        density, stage = self.config.density, self._stage()
+        if density.noise and done - stage.begin < density.refine_stop * stage.length:
+            explore(self.rows, means_rate(self.config, self.part), self.extent, density.noise, self.generator)
+
+    def _skip(self, bad: str, frame: Frame) -> dict:
+        """Count a step that changes nothing, since `bad` is not finite; the event for the log.
+
+        Raises:
+            ValueError: If it is the last of 10 in a row.
+        """
+        self.bad_steps += 1
+        self._bad_in_a_row += 1
+        self._bad = self._bad or bad
+        if self._bad_in_a_row == _MAX_BAD_STEPS:
+            raise ValueError(
+                f"fit: loss and gradients must be finite, were not for {_MAX_BAD_STEPS} steps in a row until step "
+                f"{self.step_index} (view {frame.name}), first the {self._bad}; check the cameras, or lower the "
+                "learning rates"
+            )
+        return {"event": "skipped", "view": frame.name, "reason": f"{bad} not finite"}
 
     def photographs(self) -> list[Frame]:
-        """The training photographs, whose cameras are put where they are now."""
-        if self.parts.poses is not None:
-            for frame in self.frames:
-                frame.camera = self.parts.poses.camera(frame.name)
+        """See `Fit`."""
+        for frame in self.frames:
+            for component in self.components:
+                frame.camera = component.camera(frame)
         return self.frames
-
-    def network(self, name: str) -> torch.nn.Module | None:
-        """What is fitted beside the Gaussians under a name, as it is now; None if there is nothing."""
-        return next((network.module for network in self.parts.networks if network.name == name), None)
 
     @property
     def is_sound(self) -> bool:
@@ -292,26 +326,33 @@ class Trainer:
         return not self._bad_in_a_row
 
     def gaussians(self) -> Gaussians:
-        """The Gaussians that the rows are shown as, without a graph: those of a scene that moves are at rest."""
-        gaussians = self.rows.gaussians()
-        if self.parts.filter_3d is not None:
-            gaussians = self.parts.filter_3d(gaussians)
-        return gaussians.detach()
+        """See `Fit`."""
+        return self._gaussians().detach()
 
     def scene(self) -> Scene:
-        """What a step renders, to be looked at: `gaussians`, or the scene that the parts make of the rows."""
-        scene = self.parts.scene(self.rows)
+        """See `Fit`."""
+        scene = self._scene()
         return scene.detach() if isinstance(scene, Gaussians) else scene  # looked at, not optimized
+
+    def shown(self, out: Output, frame: Frame) -> Output:
+        """See `Fit`."""
+        for component in self.components:
+            out = component.shown(out, frame)
+        return out
+
+    def describe(self, event: Mapping[str, Any]) -> list[str]:
+        """Lines on stderr for an event of a step."""
+        lines = [self.resolution.describe(event), *(component.describe(event) for component in self.components)]
+        return [line for line in lines if line is not None]
+
+    # -------------------------------------------------------------------------------------------------- checkpoints
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict]:
         """Tensors and header of a checkpoint."""
-        tensors = {**self.rows.state(), "rng": self._generator.get_state(), "queue": self._queue}
-        for network in self.parts.networks:
+        tensors = {**self.rows.state(), "rng": self.generator.get_state(), "queue": self._queue}
+        networks = self.networks
+        for network in networks:
             tensors |= network.state()
-        if self.parts.filter_3d is not None:
-            tensors[VARIANCES] = self.parts.filter_3d.variances
-        masks, found = self.transients.state(self.frames)
-        tensors |= masks
         header = {
             "step": self.step_index,
             "bad_steps": self.bad_steps,
@@ -319,11 +360,13 @@ class Trainer:
             "extent": self.extent,
             "views": [frame.name for frame in self.frames],
             "config": self.config.to_json(),
-            **({"networks": sorted(network.name for network in self.parts.networks)} if self.parts.networks else {}),
-            **({"skybox": self.rows.skybox} if self.rows.skybox else {}),
-            **(self.motion.header() if self.motion is not None else {}),
-            **found,
+            **({"networks": sorted(network.name for network in networks)} if networks else {}),
+            **self.rows.header(),
         }
+        for component in self.components:
+            more, said = component.state(self)
+            tensors |= more
+            header |= said
         return tensors, header
 
     @classmethod
@@ -334,17 +377,15 @@ class Trainer:
         tensors: dict[str, torch.Tensor],
         header: dict,
         where: str,
-        parts: Parts | None = None,
-        motion: Motion | None = None,
+        components: list[Component] | None = None,
     ) -> Trainer:
-        """Continue from a checkpoint.
+        """Resume from a checkpoint.
 
         Args:
             config, frames: The same as before, but for `saving`.
             tensors, header: Contents of the checkpoint.
             where: It, for messages.
-            parts: Parts of the first step; networks are overwritten by those of the checkpoint.
-            motion: Motion of the first step.
+            components: As of `Trainer`, before they have begun.
         Raises:
             ValueError: If the checkpoint belongs to another config, other views or other networks.
         """
@@ -362,35 +403,26 @@ class Trainer:
             raise ValueError(
                 f"{where}: --resume must have the same training views, the data set has changed; choose another folder"
             )
-        rows = GaussianRows.from_state(tensors)
-        extent = header["extent"]
-        parts = parts_of(config, extent) if parts is None else parts
-        rows.skybox = header.get("skybox", 0)
-        if motion is not None and motion.has_begun(rows):
-            parts = motion.restored(rows, parts, header, where)
-        trainer = cls(config, frames, rows, extent, parts, motion)
-        was = sorted(header.get("networks", []))
-        now = sorted(network.name for network in trainer.parts.networks)
-        if was != now:
+        rows = GaussianRows.from_state(tensors, header)
+        checkpoint = Checkpoint(tensors, header, where)
+        trainer = cls(config, frames, rows, header["extent"], components, checkpoint=checkpoint)
+        old = sorted(header.get("networks", []))
+        new = sorted(network.name for network in trainer.networks)
+        if old != new:
             raise ValueError(
-                f"{where}: --resume must continue the same fit, networks were {was} and are {now}; "
+                f"{where}: --resume must continue the same fit, networks were {old} and are {new}; "
                 "repeat the options or choose another run folder"
             )
-        for network in trainer.parts.networks:
+        for network in trainer.networks:
             network.restore(tensors, where)
-        if parts.filter_3d is not None:
-            parts.filter_3d.variances = tensors[VARIANCES]
-        trainer.transients.restore(frames, tensors, header, where)
         trainer.step_index = header["step"]
         trainer.bad_steps = header["bad_steps"]
         trainer._start_count = header["start_count"]
-        trainer._generator.set_state(tensors["rng"])
+        trainer.generator.set_state(tensors["rng"])
         trainer._queue = tensors["queue"]
         return trainer
 
-    def _part(self) -> float:
-        """The fraction of the fit that is done."""
-        return self.step_index / self.config.max_steps
+    # ------------------------------------------------------------------------------------------------ within a step
 
     def _prepare(self, done: int) -> list[dict]:
         """Schedules and density control before step `done`."""
@@ -409,9 +441,10 @@ class Trainer:
         stop = density.refine_stop * stage.length
         if (done - stage.begin) % every == 0 and max(start, 1) <= done - stage.begin < stop:
             events.append(self._refine(done, start))
-        rows.set_rates({name: rate_at(self.parts.rates[name], self._part()) for name in rows.tensors})
-        for network in self.parts.networks:
-            network.set_rate(self._part())
+        rates = self._rates()
+        rows.set_rates({name: rate_at(rates[name], self.part) for name in rows.tensors})
+        for network in self.networks:
+            network.set_rate(self.part)
         return events
 
     def _refine(self, done: int, start: float) -> dict:
@@ -419,116 +452,74 @@ class Trainer:
         density = self.config.density
         rows = self.rows
         stage = self._stage()
-        moved = relocate(rows, density.min_opacity, density.jitter, self._generator)
+        moved = relocate(rows, density.min_opacity, density.jitter, self.generator)
         # Growth by a constant factor that reaches the budget at grow_until, whatever the schedule's length.
         full = max(density.grow_until * stage.length - start, 1)
         part = min(1.0, (done - stage.begin - start + density.refine_every * stage.length) / full)
         budget = round(stage.budget * density.max_gaussians) - self.reserved
         wanted = round(self._start_count * (budget / self._start_count) ** part) if self._start_count < budget else 0
         missing = min(wanted, budget) - len(rows)
-        added = add_gaussians(rows, missing, density.min_opacity, density.jitter, self._generator)
-        self._sample()
+        added = add_gaussians(rows, missing, density.min_opacity, density.jitter, self.generator)
+        self._changed()
         return {"event": "density", "moved": moved, "added": added, "gaussians": len(rows)}
-
-    def _sample(self) -> None:
-        """How finely the photographs sample the Gaussians, after one or the other has changed."""
-        if self.parts.filter_3d is not None:
-            cameras = [frame.camera for frame in self.photographs()]
-            self.parts.filter_3d.sample(self.rows.tensors["means"], cameras, self.rows.skybox)
 
     def _stage(self) -> Stage:
         """The steps that density control runs over now."""
-        return Stage(0, self.config.max_steps) if self.motion is None else self.motion.stage()
-
-    def _begin_motion(self) -> list[dict]:
-        """From the static to the dynamic stage: gates, a field, its rates and terms, and photographs of all times."""
-        assert self.motion is not None
-        self.parts = self.motion.begin(self.rows, self.parts, self.extent)
-        self._check_parts()
-        self._queue = self._queue[:0]
-        self._start_count = len(self.rows)
-        return [{"event": "stage", "name": "dynamic", "gaussians": len(self.rows)}]
-
-    def _look_for_births(self) -> list[dict]:
-        """Add Gaussians where photographs of a time show what the scene does not."""
-        from drgs.fitting.births import find_births
-        from drgs.fitting.lives import MOST_BORN
-
-        assert self.motion is not None
-        most = round(MOST_BORN * self.config.density.max_gaussians) - self.reserved
-        if most <= 0:
-            return []
-        found = find_births(
-            self.photographs(),
-            self.scene(),
-            self.config.settings,
-            self.extent,
-            most,
-            self._generator,
-            self.parts.exposure,
-        )
-        self.motion.give_birth(self.rows, found)
-        return [
-            {
-                "event": "births",
-                "found": len(found.points),
-                "photographs": found.photographs,
-                "of": len(self.frames),
-                "gaussians": len(self.rows),
-            }
-        ]
-
-    def _fitted_scene(self) -> Scene:
-        """What a step renders and differentiates."""
-        if self.motion is not None and self.motion.has_begun(self.rows):
-            self.motion.prepare(self.rows, self.step_index)
-        return self.parts.scene(self.rows)
+        stages = [stage for component in self.components if (stage := component.stage(self)) is not None]
+        return stages[0] if stages else Stage(0, self.config.max_steps)
 
     def _next_view(self) -> int:
-        """Index of a photograph, each once an epoch; in a static stage, those of the first time alone."""
+        """Index of a photograph, each of those that are fitted to now once an epoch."""
         if not len(self._queue):
-            shown = range(len(self.frames)) if self.motion is None else self.motion.shown(self.frames)
-            self._queue = torch.tensor(shown)[torch.randperm(len(shown), generator=self._generator)]
+            fitted = self.frames
+            for component in self.components:
+                fitted = component.fitted_frames(fitted)
+            chosen = {id(frame) for frame in fitted}
+            shown = [i for i, frame in enumerate(self.frames) if id(frame) in chosen]
+            self._queue = torch.tensor(shown)[torch.randperm(len(shown), generator=self.generator)]
         view = int(self._queue[0])
         self._queue = self._queue[1:].clone()
         return view
 
-    def _posed(self, frame: Frame) -> Frame:
-        """A photograph with its camera as it is now; gradients reach the pose while poses are fitted."""
-        poses = self.parts.poses
-        assert poses is not None
-        if is_due(self._part()):
-            if not poses.has_begun:
-                poses.begin(self.gaussians(), self.rows.skybox)
-            return poses(frame)
-        return dataclasses.replace(frame, camera=poses.camera(frame.name))
+    def _gaussians(self) -> Gaussians:
+        """The Gaussians that are shown of the rows; differentiated."""
+        gaussians = self.rows.gaussians()
+        for component in self.components:
+            gaussians = component.gaussians(gaussians)
+        return gaussians
 
-    def _shown(self, gaussians: Gaussians, frame: Frame) -> Output:
+    def _scene(self) -> Scene:
+        """What a step renders; differentiated."""
+        scene: Scene = self._gaussians()
+        for component in self.components:
+            scene = component.scene(self, scene)
+        return scene
+
+    def _all_terms(self) -> list[LossTerm]:
+        return [*self.terms, *(term for component in self.components for term in component.terms)]
+
+    def _rendered(self, gaussians: Gaussians, frame: Frame) -> Output:
         """What the terms need to see of the Gaussians in a photograph's view."""
-        parts = self.parts
-        if gaussians.features is not None and parts.shows_features and not parts.shows_features(frame):
-            gaussians = gaussians.replace(features=None)
-        outputs = {name: None for term in parts.terms for name in term.outputs}  # each once, in their order
-        return render(
-            gaussians,
-            frame.camera,
-            self.renderers.settings_at(self.step_index),
-            outputs=tuple(outputs),
-            couple_features=parts.couple_features,
-        )
+        options: dict[str, Any] = {}
+        for component in self.components:
+            gaussians = component.rendered(gaussians, frame)
+            options |= component.rendering
+        outputs = {name: None for term in self._all_terms() for name in term.outputs}  # each once, in their order
+        settings = self.renderers.settings_at(self.step_index)
+        return render(gaussians, frame.camera, settings, outputs=tuple(outputs), **options)
 
     def _loss(self, out: Output, frame: Frame, gaussians: Gaussians) -> tuple[torch.Tensor, dict[str, float]]:
         """The sum of the terms that a view has, and each of them by name."""
         total = None
-        told = {}
-        for term in self.parts.terms:
+        values = {}
+        for term in self._all_terms():
             value = term(out, frame, gaussians)
             if value is not None:
                 total = value if total is None else total + value
-                told[term.name] = float(value.detach())  # to be looked at
+                values[term.name] = float(value.detach())  # to be looked at
         if total is None:
             raise ValueError(f"fit: a view must have a term of the loss, {frame.name} has none; add one")
-        return total, told
+        return total, values
 
     def _mse(self, frame: Frame, rgb: torch.Tensor) -> float:
         error = (rgb.clamp(0, 1) - frame.image()).square().mean(2)
@@ -542,7 +533,7 @@ class Trainer:
         A sum is not finite where one of its numbers is not.
         """
         named = [*self.rows.tensors.items()]
-        named += [(f"{n.name}.{key}", x) for n in self.parts.networks for key, x in n.module.named_parameters()]
+        named += [(f"{n.name}.{key}", x) for n in self.networks for key, x in n.module.named_parameters()]
         # Values that are looked at.
         if all(
             math.isfinite(float(x)) for x in (loss.detach(), *(x.grad.sum() for _, x in named if x.grad is not None))

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drgs.display.progress import duration
+from drgs.fitting.components.table import COMPONENTS
 from drgs.fitting.config import FitConfig, SelectionConfig
 from drgs.metrics import MOVING, OBJECT, renderers_table
 from drgs.report.pictures import Picture
@@ -96,6 +97,7 @@ def page_html(account: Account, shown: Shown, command: str, command_text: str) -
         "stills_text": f"Camera {shown.stills_of}, stopped where it is, at times of the sequence.",
         **_picks(account),
         "places": [place["text"] for place in account.places],
+        "components": [row for x in COMPONENTS.values() for row in x.report(account.config, metrics)],
         "timings": _timings(account),
         "memory": _memory(account),
         "command": command,
@@ -117,6 +119,7 @@ def _sections(context: Mapping[str, Any]) -> list[tuple[str, str]]:
         "labels": ("Labels", context["segmentation"]),
         "time": ("Over time", context["stills"]),
         "cameras": ("Cameras", context["charts"].get("cameras") or context["picks"] or context["places"]),
+        "components": ("Besides the Gaussians", context["components"]),
         "time-spent": ("Time and memory", True),
         "repeat": ("Again", True),
     }

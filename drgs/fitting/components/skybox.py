@@ -15,8 +15,8 @@ in 30,000 steps, where they are a hundred away. The terms of the loss that keep 
 them out, or one of their scales would outweigh those of all others; density control neither moves nor copies them.
 
 Whether there is anything far shows in the photographs before the fit: what is far has the same color in all of them
-along a direction, wherever they were taken from, and what is near has not. That much light passes between Gaussians
-does not tell: the first ones of `statue`, whose park is far, leave nothing open, and those of `banana`, a carpet that
+along a direction, wherever they were taken from, and what is near has not. How much light passes between Gaussians does
+not show it: the first ones of `statue`, whose park is far, leave nothing open, and those of `banana`, a carpet that
 points cover sparsely, leave most of it open, where a shell does harm.
 
 Reference:
@@ -27,22 +27,39 @@ Reference:
 from __future__ import annotations
 
 import dataclasses
+import logging
 import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
+from drgs.data import scene_extent
 from drgs.display.progress import Bar
 from drgs.ellipsoids import Y_00
+from drgs.fitting.components.base import Component, Conflict, Fit, Setup
 from drgs.integrator import render
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from drgs.ellipsoids import Gaussians
     from drgs.fitting.frames import Frame
     from drgs.settings import RenderSettings
 
-__all__ = ["RADIUS", "SHARE", "FarEvidence", "Skybox", "SkyboxChoice", "far_evidence", "visible_share", "why_not"]
+__all__ = [
+    "RADIUS",
+    "SHARE",
+    "FarEvidence",
+    "Skybox",
+    "SkyboxChoice",
+    "SkyboxComponent",
+    "far_evidence",
+    "visible_share",
+    "why_not",
+]
+
+_log = logging.getLogger("drgs.train")
 
 RADIUS = 100.0
 """Distance of the nearest of them from the middle of the cameras, in extents of the scene."""
@@ -60,9 +77,10 @@ _POINTS_AT_ONCE = 1 << 18  # of which it is asked whether photographs look at th
 _COLORS_AT_ONCE = 1 << 25  # bytes of the colors of all photographs at some points; a median takes several times that
 _COUNTED = 200  # of them that photographs must look in, for the count to be right within some percent
 _LEAST_COUNTED = 20  # where a lens is so narrow that even the most drawn do not do
+_MEASURED = 8  # photographs, at most, in which it is looked for at the end
 _OPEN = 0.5  # transmittance of the others from which on the shell is what a pixel shows
 _LOOKED = 800  # directions whose colors are compared
-_VIEWS = 3  # photographs that must look in a direction, so that a median tells of more than two
+_VIEWS = 3  # photographs that must look in a direction, so that a median is of more than two
 _BLUR = 0.012  # radius of the mean that is compared, in widths of a picture: the parallax that is left, and details
 _SAME = 0.03  # median distance of colors from their median that what is far has at most
 # Share of directions beyond chance: 0.48 of `statue`, which gains 3 dB by a shell; 0.21, 0.07 and 0.00 of `rooftop` (13
@@ -112,8 +130,8 @@ class Skybox:
     def __len__(self) -> int:
         return len(self.means)
 
-    def rows(self, features: int = 0) -> dict[str, torch.Tensor]:
-        """Rows for `GaussianRows`, with `features` channels of features that are 0."""
+    def rows(self) -> dict[str, torch.Tensor]:
+        """Rows for `GaussianRows`."""
         count = len(self)
         quats = torch.zeros(count, 4)
         quats[:, 0] = 1
@@ -124,7 +142,6 @@ class Skybox:
             "logit_opacities": torch.full((count,), math.log(_OPACITY / (1 - _OPACITY))),
             "sh_dc": ((torch.from_numpy(self.colors).float() - 0.5) * (1 / Y_00))[:, None, :],
             "sh_rest": torch.zeros(count, 0, 3),
-            **({"features": torch.zeros(count, features)} if features else {}),
         }
 
 
@@ -192,7 +209,7 @@ def far_evidence(frames: list[Frame], extent: float, seed: int = 0) -> FarEviden
     Args:
         frames: Training photographs, at least one; nothing outside of their masks is looked at.
         extent: Extent of the scene.
-        seed: Seed of the shuffling that tells what chance is.
+        seed: Seed of the shuffling that shows what chance is.
     """
     points = Skybox.around(frames, extent, _LOOKED, seed).means
     colors = _colors_seen(frames, points, _BLUR)
@@ -209,15 +226,15 @@ def far_evidence(frames: list[Frame], extent: float, seed: int = 0) -> FarEviden
     return FarEvidence(float(many.sum() / there.any(axis=0).sum()), agreeing, chance)
 
 
-def visible_share(gaussians: Gaussians, skybox: int, frames: list[Frame], settings: RenderSettings) -> float:
+def visible_share(gaussians: Gaussians, far: int, frames: list[Frame], settings: RenderSettings) -> float:
     """Share of the pixels of photographs that show the shell: behind all others more than half of the light is left.
 
     Args:
-        gaussians: Gaussians, `skybox` of a shell first.
+        gaussians: Gaussians, `far` of a shell first.
         frames: Photographs; nothing outside of their masks is counted.
         settings: What the others are rendered with.
     """
-    others = gaussians.detach().take(slice(skybox, None)).replace(features=None)
+    others = gaussians.detach().take(slice(far, None)).replace(features=None)
     shown = total = 0.0
     with torch.no_grad(), Bar("what shows of the skybox", len(frames)) as bar:  # looked at, not optimized
         for frame in frames:
@@ -247,11 +264,11 @@ def why_not(frames: list[Frame], background: tuple[float, float, float]) -> str 
 
 def _looked_at(frames: list[Frame], middle: np.ndarray, radius: float, whole: int) -> np.ndarray:
     """(P, 3) those of `whole` directions evenly over the sphere that photographs look in, of points at a distance."""
-    found = []
+    kept = []
     for first in range(0, whole, _POINTS_AT_ONCE):
         directions = _directions(whole, first, min(first + _POINTS_AT_ONCE, whole))
-        found.append(directions[_seen(frames, middle + radius * directions)])
-    return np.concatenate(found)
+        kept.append(directions[_seen(frames, middle + radius * directions)])
+    return np.concatenate(kept)
 
 
 def _directions(count: int, first: int, end: int) -> np.ndarray:
@@ -278,7 +295,7 @@ def _colors_seen(frames: list[Frame], points: np.ndarray, blur: float = 0.0) -> 
     """
     import cv2
 
-    found = np.full((len(frames), len(points), 3), np.nan, np.float32)
+    colors = np.full((len(frames), len(points), 3), np.nan, np.float32)
     for row, frame in enumerate(frames):
         image = frame.image().numpy()
         if blur:
@@ -289,8 +306,8 @@ def _colors_seen(frames: list[Frame], points: np.ndarray, blur: float = 0.0) -> 
         if frame.mask is not None:
             kept = frame.mask.numpy()[lines, columns] > 0.5
             index, columns, lines = index[kept], columns[kept], lines[kept]
-        found[row, index] = image[lines, columns]
-    return found
+        colors[row, index] = image[lines, columns]
+    return colors
 
 
 def _deviation(colors: np.ndarray) -> np.ndarray:
@@ -311,10 +328,10 @@ def _colors(frames: list[Frame], points: np.ndarray) -> np.ndarray:
     step = max(1, _COLORS_AT_ONCE // (12 * len(frames)))
     for first in range(0, len(points), step):
         some = slice(first, first + step)
-        found = _colors_seen(frames, points[some])
-        there = ~np.isnan(found[..., 0]).all(axis=0)
+        seen = _colors_seen(frames, points[some])
+        there = ~np.isnan(seen[..., 0]).all(axis=0)
         if there.any():
-            colors[some][there] = np.nanmedian(found[:, there], axis=0)
+            colors[some][there] = np.nanmedian(seen[:, there], axis=0)
         has_color[some] = there
     if not has_color.any():
         return colors
@@ -325,3 +342,88 @@ def _colors(frames: list[Frame], points: np.ndarray) -> np.ndarray:
     for row in np.flatnonzero(~has_color):
         colors[row] = known[np.argmax(known_directions @ directions[row])]
     return colors
+
+
+class SkyboxComponent(Component):
+    """A shell of Gaussians around the scene as a part of a fit: `skybox` on, or auto, where photographs agree on it.
+
+    Attributes:
+        choice: Whether there is one, and why; None of a fit that is resumed.
+    """
+
+    name = "skybox"
+    option = ("skybox", "off or auto")
+    where = "where Gaussians begin far away"
+    conflicts = (
+        Conflict("selection", "whether there is one is decided by all photographs", "leave --skybox out"),
+        Conflict("motion", "photographs are compared as if nothing moved", "leave --skybox out"),
+    )
+
+    def __init__(self) -> None:
+        self.choice: SkyboxChoice | None = None
+        self._count = 0
+
+    def setting(self, setup: Setup) -> str | None:
+        """See `Component`: `auto` gives way."""
+        return "on" if setup.config.data.skybox == "on" else None
+
+    def begin(self, setup: Setup, resumed: bool) -> None:
+        """See `Component`: whether there is to be one, for which the initial points leave room."""
+        if resumed:
+            return
+        self.choice = self._chosen(setup)
+        if self.choice.reason is None:
+            self._count = max(1, round(SHARE * setup.config.density.max_gaussians))
+            setup.reserved += self._count
+
+    def _chosen(self, setup: Setup) -> SkyboxChoice:
+        """By what is fitted, by what data say is behind everything, and by what photographs show.
+
+        Raises:
+            ValueError: If a skybox is asked for where data say what is behind everything.
+        """
+        config, frames = setup.config, setup.frames
+        if "begin" in setup.ways:
+            return SkyboxChoice("the fit goes on from Gaussians of another one")
+        if config.data.skybox == "off":
+            return SkyboxChoice("skybox is off")
+        if clash := setup.conflict(self):
+            return SkyboxChoice(clash[1].removeprefix("where "))
+        with Bar("skybox") as bar:
+            reason = why_not(frames, config.settings.background)
+            if reason is not None and config.data.skybox == "on":
+                raise ValueError(f"fit: skybox must be off or auto here, got on: {reason}; leave --skybox out")
+            if reason is not None:
+                bar.note(f"skybox: none, {reason}")
+                return SkyboxChoice(reason)
+            evidence = far_evidence(frames, scene_extent([frame.camera for frame in frames]), config.seed)
+            is_on = config.data.skybox == "on" or evidence.is_clear
+            bar.note(f"skybox: {evidence.words()}; {'there is one' if is_on else 'there is none'}")
+            return SkyboxChoice(None if is_on else "photographs do not clearly agree on what is far away", evidence)
+
+    def start(self, fit: Fit, setup: Setup) -> None:
+        """See `Component`."""
+        if self._count:
+            with Bar("colors of the skybox"):
+                skybox = Skybox.around(fit.frames, fit.extent, self._count, fit.config.seed)
+            _log.info("skybox: %d Gaussians, %.4g and more away", len(skybox), RADIUS * fit.extent)
+            fit.rows.add_far(skybox.rows())
+
+    def record(self, fit: Fit, before: Mapping[str, Any]) -> dict[str, Any]:
+        """See `Component`."""
+        if self.choice is not None:
+            return {"skybox": self.choice.to_json(fit.rows.far)}
+        # The config.json of a fit that is resumed may have been moved away, or say nothing of a skybox.
+        here = {"gaussians": fit.rows.far, "reason": None} if fit.rows.far else None
+        known = before.get("skybox", here)
+        return {} if known is None else {"skybox": known}
+
+    def metrics(self, fit: Fit, held_out: list[Frame]) -> dict[str, Any]:
+        """See `Component`: how many Gaussians it has, and how much of it photographs show."""
+        count = fit.rows.far
+        if not count:
+            return {}
+        frames = fit.photographs()
+        frames = frames[:: -(-len(frames) // _MEASURED)]
+        share = visible_share(fit.gaussians(), count, frames, fit.config.settings)
+        return {"skybox": {"gaussians": count, "visible": share}}

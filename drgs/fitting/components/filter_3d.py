@@ -1,7 +1,8 @@
 """A low-pass filter of the Gaussians themselves: none is smaller than what the photographs could have shown of it.
 
-Photographs sample the scene. Of detail that is finer than their pixels they tell nothing, and what is fitted there
-shows as needles, or as holes between Gaussians, in pictures that sample it more finely: in larger ones, and nearer by.
+Photographs sample the scene. They have no information about detail that is finer than their pixels, and what is fitted
+there shows as needles, or as holes between Gaussians, in pictures that sample it more finely: in larger ones, and
+nearer by.
 So each Gaussian of covariance S and opacity o is rendered as its convolution with an isotropic one, as wide as the
 pixels of the photograph that samples it most finely [1, eq. 7 to 9]:
 
@@ -25,13 +26,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from drgs.fitting.components.base import Checkpoint, Component, Conflict, Fit, Setup
 from drgs.lenses import LENS_MODELS
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["VARIANCES", "Filter3D", "filtered", "sampling_rates"]
+__all__ = ["VARIANCES", "Filter3D", "Filter3DComponent", "filtered", "sampling_rates"]
 
 VARIANCES = "filter_3d"
 """Name of the filter's variances in a checkpoint, one a Gaussian."""
@@ -53,18 +55,18 @@ class Filter3D(torch.nn.Module):
         super().__init__()
         self.register_buffer("variances", torch.zeros(0))
 
-    def sample(self, means: torch.Tensor, cameras: Sequence[Camera], skybox: int = 0) -> None:
+    def sample(self, means: torch.Tensor, cameras: Sequence[Camera], far: int = 0) -> None:
         """Take the sampling rates anew, after Gaussians have come or gone.
 
         Args:
             means: (N, 3) world; nothing is differentiated through them.
             cameras: Those of the photographs, of the size at which these are fitted.
-            skybox: How many of the first means are far away.
+            far: How many of the first means are far away.
         """
         # A rate is a maximum over cameras of what changes little from step to step: constant in between, and after the
         # last density control.
         rates = sampling_rates(means.detach().double().cpu().numpy(), cameras)
-        seen = rates[skybox:][rates[skybox:] > 0]
+        seen = rates[far:][rates[far:] > 0]
         # Nothing shows what no camera sees: it gets the filter of the most coarsely sampled of the others [1, code].
         lowest = seen.min() if len(seen) else np.inf
         variances = _STRENGTH / np.square(np.where(rates > 0, rates, lowest))
@@ -120,3 +122,62 @@ def sampling_rates(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
         focal = max(camera.K[0, 0], camera.K[1, 1])
         rates[inside] = np.maximum(rates[inside], focal / depth[inside])
     return rates
+
+
+class Filter3DComponent(Component):
+    """The filter as a part of a fit; `filter_3d on`.
+
+    Attributes:
+        filter: The filter; None in a fit without.
+    """
+
+    name = "filter_3d"
+    option = ("filter_3d", "off")
+    where = "where Gaussians have a 3D filter"
+    conflicts = (
+        Conflict(
+            "motion",
+            "sampling rates are those of what stands still",
+            "leave --filter-3d out, or fit to what stands still (--dynamics ignore)",
+        ),
+    )
+    reserved_names = (VARIANCES,)
+
+    def __init__(self) -> None:
+        self.filter: Filter3D | None = None
+
+    def setting(self, setup: Setup) -> str | None:
+        """See `Component`."""
+        return "on" if setup.config.filter_3d == "on" else None
+
+    def changed(self, fit: Fit) -> None:
+        """See `Component`: how finely photographs sample the Gaussians is computed anew."""
+        if fit.config.filter_3d == "on":
+            self.filter = self.filter or Filter3D()
+            cameras = [frame.camera for frame in fit.photographs()]
+            self.filter.sample(fit.rows.tensors["means"], cameras, fit.rows.far)
+
+    def gaussians(self, gaussians: Gaussians) -> Gaussians:
+        """See `Component`."""
+        return gaussians if self.filter is None else self.filter(gaussians)
+
+    def state(self, fit: Fit) -> tuple[dict[str, torch.Tensor], dict]:
+        """See `Component`."""
+        return ({} if self.filter is None else {VARIANCES: self.filter.variances}), {}
+
+    def resume(self, fit: Fit, checkpoint: Checkpoint) -> None:
+        """See `Component`."""
+        if fit.config.filter_3d == "on":
+            self.filter = Filter3D()
+            self.filter.variances = checkpoint.tensors[VARIANCES]
+
+    @classmethod
+    def tensor_kinds(cls, checkpoint: Checkpoint, count: int) -> dict[str, tuple[torch.dtype, tuple[int, ...]]]:
+        """See `Component`."""
+        is_on = VARIANCES in checkpoint.tensors or checkpoint.header["config"].get("filter_3d") == "on"
+        return {VARIANCES: (torch.float32, (count,))} if is_on else {}
+
+    @classmethod
+    def load_gaussians(cls, gaussians: Gaussians, checkpoint: Checkpoint) -> Gaussians:
+        """See `Component`."""
+        return filtered(gaussians, checkpoint.tensors[VARIANCES]) if VARIANCES in checkpoint.tensors else gaussians

@@ -12,19 +12,33 @@ without.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
+from drgs.display.progress import Bar
+from drgs.ellipsoids import Y_00
+from drgs.fitting.components.base import Checkpoint, Component, Fit, Setup
+from drgs.fitting.frames import frames_for
+from drgs.fitting.losses import psnr_of
 from drgs.fitting.networks import Network
+from drgs.fitting.rows import GaussianRows
+from drgs.integrator import render
+from drgs.sfm.guided import Matches
+from drgs.sfm.points import shared_points
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from drgs.data import View
+    from drgs.fitting.config import FitConfig
     from drgs.fitting.frames import Frame
     from drgs.integrator import Output
 
-__all__ = ["NETWORK", "Exposure", "ExposureEstimate", "estimate_exposure", "exposure_network"]
+__all__ = ["NETWORK", "Exposure", "ExposureComponent", "ExposureEstimate", "estimate_exposure", "exposure_network"]
 
 NETWORK = "exposure"
 """Name of the gains in a checkpoint."""
@@ -40,6 +54,9 @@ _LEAST_NOISE = 0.01  # of a log color: a byte's rounding at mid-gray
 _SUPPORT = 8  # points that two photographs must share to say something of each other
 _RATE = 1e-3  # of learned log gains
 _CLEAR = 0.1  # stops: three times what two sets of points of one capture differ by in what they say
+_TRIAL = {"max_steps": 200, "max_gaussians": 8_000, "num_downscales": 0}  # of a short fit that tries gains
+_TRIAL_PIXELS = 12_000  # of its photographs; two such fits take 10 to 20 s on one core
+_TRIAL_EVERY = 5  # photographs of which it holds one out
 _LOWERED = 0.05  # of the error of held-out halves; on captures of one exposure it is up to 0.02, by chance
 
 
@@ -106,9 +123,9 @@ class ExposureEstimate:
         change = f"{'lower' if self.lowered >= 0 else 'raise'} the error of held-out halves of photographs by "
         change += f"{100 * abs(self.lowered):.0f} %"
         others = int((~self.is_confirmed).sum())
-        tried = "" if self.gained is None else f"; photographs held out of short fits change by {self.gained:+.2f} dB"
+        trial = "" if self.gained is None else f"; photographs held out of short fits change by {self.gained:+.2f} dB"
         left = f" (those of {others} of {len(self.is_confirmed)} do not)" if others else ""
-        return f"they {change}{left}{tried}"
+        return f"they {change}{left}{trial}"
 
     def warning(self) -> str:
         """What a fit without gains is to say of photographs that differ, in one line; empty where they do not."""
@@ -217,9 +234,9 @@ class Exposure(torch.nn.Module):
     def join(self, names: list[str], estimate: ExposureEstimate) -> torch.Tensor:
         """Go on with photographs that have been joined by others, each with a gain of its own.
 
-        Gains that points tell are those of the new estimate, which has seen more of them. Learned ones stay, and new
-        ones stand to them as the estimate says: their log gain is the estimate's, plus what was learned beyond it, on
-        average over the photographs of the same set; 0 where there is none. Then all have zero mean again.
+        Gains that are not learned are those of the new estimate, which is of more photographs. Learned ones stay, and
+        new ones stand to them as the estimate says: their log gain is the estimate's, plus what was learned beyond it,
+        on average over the photographs of the same set; 0 where there is none. Then all have zero mean again.
 
         Args:
             names: V names, those that were there first.
@@ -229,16 +246,16 @@ class Exposure(torch.nn.Module):
             are to be divided by this, so that these look as before.
         """
         before = self.log_gains.detach()  # values, which go on in a parameter with more rows
-        told = torch.tensor(estimate.log_gains, dtype=torch.float32)
+        estimated = torch.tensor(estimate.log_gains, dtype=torch.float32)
         labels = torch.from_numpy(estimate.labels)
         old = len(before)
-        after = told.clone()
+        after = estimated.clone()
         if self._learned:
-            beyond = before - told[:old]
+            beyond = before - estimated[:old]
             after[:old] = before
-            for row in range(old, len(told)):
+            for row in range(old, len(estimated)):
                 mine = labels[:old] == labels[row]
-                after[row] = told[row] + beyond[mine].mean(dim=0) if mine.any() else 0.0
+                after[row] = estimated[row] + beyond[mine].mean(dim=0) if mine.any() else 0.0
             after -= after.mean(dim=0)
         self._rows = {name: row for row, name in enumerate(names)}
         self.log_gains = torch.nn.Parameter(after, requires_grad=self._learned)
@@ -376,3 +393,190 @@ def _components(there: np.ndarray) -> np.ndarray:
 def _three(values: np.ndarray) -> tuple[float, float, float]:
     red, green, blue = (float(x) for x in values)
     return red, green, blue
+
+
+class ExposureComponent(Component):
+    """Gains of the photographs of a fit: `exposure` points, learned, or auto, where they are of use.
+
+    Attributes:
+        module: The gains; None where all photographs have the same.
+        evidence: The last estimate of them, as config.json has it; None where there was none.
+    """
+
+    name = "exposure"
+    option = ("exposure", "off")
+    where = "where each photograph has an exposure of its own"
+    header_kinds = {"exposure": dict}
+
+    def __init__(self) -> None:
+        self.module: Exposure | None = None
+        self.evidence: dict[str, Any] | None = None
+
+    def setting(self, setup: Setup) -> str | None:
+        """See `Component`."""
+        use = setup.config.data.exposure
+        return None if use == "off" else use
+
+    def start(self, fit: Fit, setup: Setup) -> None:
+        """See `Component`: gains from the points that photographs share, if they are asked for or of use."""
+        config, use = fit.config, fit.config.data.exposure
+        compared = _compared(setup, config)
+        if use == "off":
+            if compared is not None:
+                with Bar("exposure") as bar:
+                    if said := estimate_exposure(fit.frames, compared[0], config.seed, compared[1]).warning():
+                        bar.note(said)
+            return
+        # A trial takes photographs that are there and stand still, and points of which it is known who shows them.
+        is_tried = use == "auto" and compared is not None and not setup.is_active
+        with Bar("exposure") as bar:
+            assert setup.points is not None  # initial ones are there
+            points, shown = compared or (setup.points, None)
+            estimate = estimate_exposure(fit.frames, points, config.seed, shown)
+            is_on = use != "auto" or (estimate.is_sound if is_tried else estimate.is_clear)
+            if is_tried and is_on:
+                estimate = estimate.confirmed()
+                gained = _trial(fit, setup.views, estimate)
+                estimate, is_on = dataclasses.replace(estimate, gained=gained), gained > 0
+            effect = "each has its own" if is_on else "off, all have the same"
+            now = " for now" if setup.is_active and use == "auto" else ""
+            bar.note(f"exposure: {estimate.words()}; {effect}{now}")
+        self.evidence = estimate.to_json([frame.name for frame in fit.frames])
+        if is_on:
+            self.use(fit.config, fit.frames, estimate)
+
+    def use(self, config: FitConfig, frames: list[Frame], estimate: ExposureEstimate | None = None) -> None:
+        """From now on photographs have gains: those of the estimate, or 1 where a checkpoint brings them."""
+        gains = None if estimate is None else estimate.log_gains
+        network = exposure_network(frames, config.data.exposure == "learned", gains, config.settings.background)
+        self.networks = [network]
+        self.module = network.module  # type: ignore[assignment]  # an `Exposure`
+        self.nuisance = "exposure"
+
+    def resume(self, fit: Fit, checkpoint: Checkpoint) -> None:
+        """See `Component`."""
+        if NETWORK in checkpoint.header.get("networks", ()):
+            self.use(fit.config, fit.frames)
+        active = checkpoint.header.get("active") or {}
+        self.evidence = checkpoint.header.get("exposure", active.get("exposure"))  # version 0.2.0 wrote it there
+
+    def shown(self, out: Output, frame: Frame) -> Output:
+        """See `Component`."""
+        return out if self.module is None else self.module(out, frame)
+
+    def join(self, fit: Fit, frame: Frame, setup: Setup) -> list[dict]:
+        """See `Component`: points are looked at again, which the new photograph shows, too."""
+        use = fit.config.data.exposure
+        if use == "off" or setup.picked_points is None:
+            return []
+        frames = [*fit.photographs(), frame]
+        with Bar("exposure") as bar:
+            points, shown = setup.picked_points(setup.dataset.points)
+            estimate = estimate_exposure(frames, points, fit.config.seed, shown)
+            # A few points of the first photographs may have said something else than all of them do.
+            is_on = use != "auto" or estimate.is_clear
+            if is_on != (self.module is not None):
+                now = "each has its own" if is_on else "off, all have the same"
+                bar.note(f"exposure: {estimate.words()}; {now} from step {fit.step_index} on")
+        self.evidence = estimate.to_json([frame.name for frame in frames])
+        if is_on:
+            self.extend(fit, frame, estimate)
+        else:  # gains were 1 on average, so that colors stay
+            self.module, self.networks, self.nuisance = None, (), None
+        return [{"event": "exposure", **{key: x for key, x in self.evidence.items() if key != "gains"}, "used": is_on}]
+
+    def extend(self, fit: Fit, frame: Frame, estimate: ExposureEstimate) -> None:
+        """One photograph more; the scene's colors change by what the gauge of the gains does, so that the others look
+        as before.
+
+        Args:
+            fit: The fit, without the photograph.
+            frame: The photograph.
+            estimate: What points say of the gains of all photographs, of this one last.
+        """
+        if self.module is None:
+            self.use(fit.config, fit.frames)
+        assert self.module is not None
+        names = [one.name for one in (*fit.frames, frame)]
+        grown = self.networks[0].extend(functools.partial(self.module.join, names, estimate))
+        fit.rows.scale_colors((-grown).exp())
+
+    def state(self, fit: Fit) -> tuple[dict[str, torch.Tensor], dict]:
+        """See `Component`."""
+        return {}, {} if self.evidence is None else {"exposure": self.evidence}
+
+    def record(self, fit: Fit, before: Mapping[str, Any]) -> dict[str, Any]:
+        """See `Component`."""
+        if self.evidence is not None:
+            return {"exposure": self.evidence}
+        # Checkpoints of version 0.2.0 say nothing of fits to all views.
+        is_known = fit.config.data.exposure != "off" and "exposure" in before
+        return {"exposure": before["exposure"]} if is_known else {}
+
+
+def _compared(setup: Setup, config: FitConfig) -> tuple[np.ndarray, np.ndarray | None] | None:
+    """Points (P, 3) by which the exposure of photographs is compared, and which of the V show which, (V, P) bool.
+
+    Returns:
+        None where nothing says what hides points, and where nobody asks for exposure and to look would take matching;
+        None for who shows them where every photograph may.
+    """
+    use = config.data.exposure
+    if setup.picked_points is not None:
+        return setup.picked_points(setup.dataset.points) if use != "off" else None
+    if setup.times:  # photographs of other times do not show the same
+        return None
+    matches = Matches() if setup.matches is None and use != "off" else setup.matches
+    with Bar("points that photographs share") as bar:
+        return shared_points(setup.dataset, setup.views, config.seed, matches, bar.stage)
+
+
+def _trial(fit: Fit, views: list[View], estimate: ExposureEstimate) -> float:
+    """By how many dB gains change photographs that two short fits, with them and without, did not see: the
+    mean of what they change at gain 1, as held-out views are shown, and at the gain that suits each photograph best.
+    Points say nothing of a white wall, which has none.
+
+    Args:
+        fit: The fit, with the Gaussians that it begins with.
+        views: V views.
+        estimate: What points say of the gains of the V photographs.
+    """
+    config, rows = fit.config, fit.rows
+    frames = frames_for(views, config.data, min(_TRIAL_PIXELS, config.data.max_pixels))
+    held_out = frames[_TRIAL_EVERY // 2 :: _TRIAL_EVERY]
+    rest = [row for row in range(len(frames)) if row % _TRIAL_EVERY != _TRIAL_EVERY // 2]
+    if not held_out:
+        return 0.0
+    short = config.replace(**_TRIAL, max_pixels=_TRIAL_PIXELS)
+    begin = rows.gaussians().detach()  # where both begin
+    kept = torch.randperm(len(begin) - rows.far, generator=torch.Generator().manual_seed(config.seed))
+    kept = kept[: short.density.max_gaussians] + rows.far
+    colors = (0.5 + Y_00 * begin.sh[kept, 0]).clamp(0, 1)
+    errors = []
+    with Bar("whether exposure is of use", 2 * short.max_steps) as bar:
+        for use in (False, True):
+            few = GaussianRows.from_points(begin.means[kept], colors, *short.density.start_of(False))
+            seen = [frames[row] for row in rest]
+            component = ExposureComponent()
+            if use:
+                gains = estimate.log_gains[rest] - estimate.log_gains[rest].mean(axis=0)
+                component.use(short, seen, dataclasses.replace(estimate, log_gains=gains))
+            trial = fit.another(short, seen, few, component)
+            for _ in range(short.max_steps):
+                trial.step()
+                bar.advance()
+            errors.append([_psnr(trial, frame, suited) for frame in held_out for suited in (False, True)])
+    return float(np.mean(errors[1]) - np.mean(errors[0]))
+
+
+def _psnr(fit: Fit, frame: Frame, suited: bool) -> float:
+    """Of a photograph that the fit has not seen, in dB; `suited`: with gains of R, G and B that suit it best."""
+    with torch.no_grad():  # a measure
+        rgb = render(fit.scene(), frame.camera, fit.config.settings, outputs=()).rgb.cpu().clamp(0, 1)
+    target = frame.image()
+    weight = torch.ones_like(target) if frame.mask is None else frame.mask[..., None].expand_as(target)
+    if suited:
+        gain = (weight * rgb * target).sum(dim=(0, 1)) / (weight * rgb * rgb).sum(dim=(0, 1)).clamp(min=1e-12)
+        rgb = (gain * rgb).clamp(max=1)
+    error = (rgb - target).square()
+    return psnr_of(float((weight * error).sum() / weight.sum().clamp(min=1e-12)))

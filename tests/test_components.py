@@ -1,35 +1,165 @@
-"""A fit is made of parts: terms of the loss, rows that follow the Gaussians, and networks that do not.
+"""What a fit has besides photographs and Gaussians is a component: one file, and one row of a table.
 
-Each new part is written here, in a few lines, as a file of its own would be.
+The first is the one that docs/extending.md shows, from its page. Others are written here, in a few lines, as a file of
+their own would be.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import importlib
+import json
+import re
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from doc_pages import blocks
 from test_times import Drift
 from test_train import FAST, config, dataset, random_rows, scene  # noqa: F401 (a fixture)
 
+from drgs import cli
 from drgs.cameras import orbit
+from drgs.codecs.ply import load_ply
 from drgs.data import Dataset, View
 from drgs.display.pictures import write_png
-from drgs.files import load_ply, load_state, save_state
+from drgs.fitting.components.base import Component, Setup
+from drgs.fitting.components.table import COMPONENTS
 from drgs.fitting.config import SelectionConfig
 from drgs.fitting.density import add_gaussians, relocate
 from drgs.fitting.frames import Frame, load_frames
-from drgs.fitting.losses import Photometric
 from drgs.fitting.networks import Network, saved_networks
-from drgs.fitting.parts import Parts, parts_of
 from drgs.fitting.records import check_checkpoint, load_run
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.trainer import StepResult, Trainer
 from drgs.integrator import render
+from drgs.io.checkpoint import load_state, save_state
 from drgs.metrics import evaluate
 from drgs.select import select
 from drgs.train import fit
+
+PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
+
+
+@pytest.fixture
+def vignette(tmp_path, monkeypatch):
+    """The class of the page, in a file of its own, and its row in the table."""
+    file = next(x.text for x in blocks(PAGE) if x.text.startswith("# my_package/vignette.py"))
+    (tmp_path / "vignette_of_the_page.py").write_text(file)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    kind = importlib.import_module("vignette_of_the_page").Vignette
+    COMPONENTS["vignette"] = kind
+    yield kind
+    del COMPONENTS["vignette"]
+    del sys.modules["vignette_of_the_page"]
+
+
+@pytest.fixture
+def darkened(tmp_path):
+    """A folder of photographs, of which 0, 3, 6, ... are a third darker in their corners."""
+    import cv2
+    from same_bits import write_photographs
+
+    folder = tmp_path / "photographs"
+    write_photographs(folder)
+    for path in sorted((folder / "images").glob("*.png"))[::3]:
+        image = cv2.imread(str(path)).astype(np.float64)
+        y, x = (np.linspace(-1, 1, side) ** 2 / 2 for side in image.shape[:2])
+        cv2.imwrite(str(path), image * (1 - (y[:, None] + x) / 3)[..., None])
+    return folder
+
+
+def command(folder: Path, run: Path, *more: str) -> int:
+    quick = "--max-steps 40 --max-gaussians 80 --test-every 0 --sh-degree 0 --semantics ignore --deterministic --quiet"
+    return cli.main(["fit", str(folder), "-o", str(run), *quick.split(), "--for", "fast", *more])
+
+
+@pytest.mark.same_bits
+def test_a_vignette_is_one_file_and_one_row(vignette, darkened, tmp_path, monkeypatch, capsys):
+    """It is fitted, saved, and resumed to the same bits after the fit was killed; config.json, metrics.json and the
+    report page have its lines; beside gains of photographs it is refused in one line."""
+    assert command(darkened, tmp_path / "whole") == 0
+    step = Trainer.step
+
+    def killed(self):
+        if self.step_index == 23:
+            raise KeyboardInterrupt
+        return step(self)
+
+    monkeypatch.setattr(Trainer, "step", killed)
+    assert command(darkened, tmp_path / "killed", "--save-every", "10") == 130
+    monkeypatch.setattr(Trainer, "step", step)
+    assert load_state(tmp_path / "killed" / "state.safetensors")[1]["step"] == 20
+    assert command(darkened, tmp_path / "killed", "--save-every", "10", "--resume") == 0
+    one, other = (load_state(tmp_path / name / "state.safetensors") for name in ("whole", "killed"))
+    assert one[0].keys() == other[0].keys()
+    assert all(torch.equal(x, other[0][name]) for name, x in one[0].items())
+    assert one[1]["networks"] == ["vignette"]
+    strengths = one[0]["vignette.parameter.strengths"]
+    assert bool((strengths != 0).all())
+    for name in ("whole", "killed"):
+        run = tmp_path / name
+        assert json.loads((run / "config.json").read_text())["vignette"] == {"photographs": len(strengths)}
+        mean = json.loads((run / "metrics.json").read_text())["vignette"]["mean"]
+        assert mean == pytest.approx(float(strengths.mean()))
+        page = (run / "report.html").read_text()
+        assert "corners of photographs are darker by" in page
+        assert f"{mean:.1%}" in page
+    assert load_run(tmp_path / "whole").networks.keys() == {"vignette"}
+    capsys.readouterr()
+    assert command(darkened, tmp_path / "refused", "--exposure", "points") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.search(r"vignette must be off where each photograph has an exposure of its own, got on: .*; use", line)
+    assert not (tmp_path / "refused" / "config.json").exists()
+
+
+def test_a_vignette_is_fitted_to_photographs_that_join(vignette, darkened, tmp_path):
+    """In an active fit every photograph that is picked gets a strength of its own."""
+    active = ("--views", "active", "--initial", "3", "--add", "2", "--every", "10", "--no-report")
+    assert command(darkened, tmp_path / "run", *active) == 0
+    tensors, header = load_state(tmp_path / "run" / "state.safetensors")
+    assert len(header["views"]) == len(tensors["vignette.parameter.strengths"]) == 5
+
+
+def test_without_the_row_a_run_with_it_is_refused(vignette, darkened, tmp_path):
+    """The checkpoint has a network that nobody knows: one line, no traceback; what it shows can be looked at."""
+    assert command(darkened, tmp_path / "run", "--no-report") == 0
+    others = [kind for name, kind in COMPONENTS.items() if name != "vignette"]
+    from drgs.fitting.frames import load_dataset
+    from drgs.fitting.records import fit_record
+    from drgs.io.run import Run
+
+    record = fit_record(Run(tmp_path / "run"))
+    data = load_dataset(darkened, record.config)
+    with pytest.raises(ValueError, match=r"networks were \['vignette'\] and are \[\]; repeat"):
+        fit(data, tmp_path / "run", record.config, components=others, resume=True, progress=False)
+
+
+class Corrected(Component):
+    """A network that corrects what is rendered."""
+
+    name = "corrected"
+
+    def __init__(self) -> None:
+        self.networks = [Network("affine", Affine(), lambda part: 1e-2 * (1 - part))]
+
+    def shown(self, out, frame):
+        return dataclasses.replace(out, rgb=self.networks[0].module(out.rgb))
+
+
+class Painted(Component):
+    """Features that a term compares with the photograph."""
+
+    name = "painted"
+    rates = {"features": 1e-2}
+
+    def __init__(self) -> None:
+        self.terms = [Near()]
+
+    def start(self, fit, setup):
+        fit.rows.add_tensor("features", torch.zeros(len(fit.rows), 3))
 
 
 class Affine(torch.nn.Module):
@@ -45,18 +175,6 @@ class Affine(torch.nn.Module):
         return self.gain * rgb + self.offset
 
 
-@dataclasses.dataclass
-class Corrected:
-    """The photometric term of colors that a network has corrected."""
-
-    correction: torch.nn.Module
-    name = "corrected"
-    outputs = ()
-
-    def __call__(self, output, frame, gaussians):
-        return Photometric(0.2)(dataclasses.replace(output, rgb=self.correction(output.rgb)), frame, gaussians)
-
-
 class Near:
     """Features are the photograph, weighted by depth; the first view has none."""
 
@@ -69,18 +187,16 @@ class Near:
         return ((output.features - frame.target()) * output.depth[..., None]).square().mean()
 
 
-def trainer_of(dataset, state=None) -> Trainer:  # noqa: F811
-    """A fit with both terms, features and a network: new, or from a checkpoint."""
+def trainer_of(dataset, state=None, kinds=(Corrected, Painted)) -> Trainer:  # noqa: F811
+    """A fit with both components: new, or from a checkpoint."""
     cfg = config(max_steps=20, refine_start=0.1, refine_every=0.1, max_gaussians=50)
-    frames, affine = load_frames(dataset.split()[0], cfg.data.max_pixels, cfg.data.mask), Affine()
-    plain, network = parts_of(cfg, 3.0), Network("affine", affine, lambda part: 1e-2 * (1 - part))
-    terms = [Corrected(affine), Near(), *plain.terms[1:]]
-    parts = Parts(terms, {**plain.rates, "features": 1e-2}, [network])
+    frames, components = load_frames(dataset.split()[0], cfg.data.max_pixels, cfg.data.mask), [kind() for kind in kinds]
     if state is not None:
-        return Trainer.from_state(cfg, frames, *state, "here", parts)
+        return Trainer.from_state(cfg, frames, *state, "here", components)
     points, colors = torch.from_numpy(dataset.points), torch.from_numpy(dataset.colors)
-    rows = GaussianRows.from_points(points, colors)
-    return Trainer(cfg, frames, GaussianRows({**rows.tensors, "features": torch.zeros(len(rows), 3)}), 3.0, parts)
+    rows, train = GaussianRows.from_points(points, colors), dataset.split()[0]
+    setup = Setup(dataset, cfg, train, [], train, (), components, frames=frames)
+    return Trainer(cfg, frames, rows, 3.0, components, setup)
 
 
 def steps(trainer: Trainer, count: int) -> list[StepResult]:
@@ -88,7 +204,7 @@ def steps(trainer: Trainer, count: int) -> list[StepResult]:
 
 
 @pytest.mark.same_bits
-def test_new_parts_are_fitted_and_resumed_to_the_bit(dataset, tmp_path):  # noqa: F811
+def test_components_of_a_callers_own_are_resumed_to_the_bit(dataset, tmp_path):  # noqa: F811
     """A term, features and a network take part in every step, and a checkpoint in the middle changes no bit."""
     whole, first = trainer_of(dataset), trainer_of(dataset)
     rows = steps(whole, 20)
@@ -98,8 +214,8 @@ def test_new_parts_are_fitted_and_resumed_to_the_bit(dataset, tmp_path):  # noqa
     assert features.shape == (len(whole.rows), 3)
     assert bool(features.any())
     told = {row.view: set(row.terms) for row in rows}
-    assert told["1"] == {"corrected", "opacity", "scale"}
-    assert told["2"] == {"corrected", "near", "opacity", "scale"}
+    assert told["1"] == {"photometric", "opacity", "scale"}
+    assert told["2"] == {"photometric", "near", "opacity", "scale"}
     assert rows[5].loss == pytest.approx(sum(rows[5].terms.values()), rel=1e-5)
     steps(first, 9)
     tensors, header = first.state()
@@ -107,7 +223,7 @@ def test_new_parts_are_fitted_and_resumed_to_the_bit(dataset, tmp_path):  # noqa
     save_state(path, tensors, {**header, "seconds": 1.0, "point_source": "x"})
     saved = load_state(path)
     check_checkpoint(path, *saved)
-    network = first.parts.networks[0].module.state_dict()
+    network = first.networks[0].module.state_dict()
     assert network["calls"] == 9
     assert not torch.equal(network["gain"], Affine().gain)
     assert all(torch.equal(x, network[name]) for name, x in saved_networks(*saved)["affine"].items())
@@ -124,18 +240,21 @@ def test_a_scene_that_moves_is_fitted_at_the_times_of_its_views(rng):
     truth = random_rows(12, dead=0)
     velocities = torch.from_numpy(rng.normal(size=(12, 3)).astype(np.float32)) * 0.3
 
-    def moving(rows: GaussianRows) -> Drift:
-        return Drift(rows.gaussians(), rows.tensors["velocities"])
+    class Moving(Component):
+        name = "moving"
+        rates = {**dict.fromkeys(truth.tensors, 0.0), "velocities": lambda part: 0.05 * (1 - part)}
 
-    scene, cfg = Drift(truth.gaussians().detach(), velocities), config(max_steps=60)
+        def scene(self, fit, scene):
+            return Drift(scene, fit.rows.tensors["velocities"])
+
+    scene = Drift(truth.gaussians().detach(), velocities)
+    cfg = config(max_steps=60, ssim_weight=0.0, outside_weight=0.0, opacity_weight=0.0, scale_weight=0.0)
     cameras = orbit((0, 0, 0), 3.0, 6, width=32, height=32)
     views = [dataclasses.replace(camera, time=time) for time in (0.0, 0.5, 1.0) for camera in cameras]
     with torch.no_grad():
         frames = [Frame(f"{i}", view, render(scene, view, FAST).rgb) for i, view in enumerate(views)]
-    rates = {**dict.fromkeys(truth.tensors, 0.0), "velocities": lambda part: 0.05 * (1 - part)}
-    parts = Parts([Photometric(0.0)], rates, scene=moving)
     rows = GaussianRows({**truth.tensors, "velocities": torch.zeros(12, 3)})
-    trainer = Trainer(cfg.replace(sh_degree=0, refine_stop=0.0), frames, rows, 3.0, parts)
+    trainer = Trainer(cfg.replace(sh_degree=0, refine_stop=0.0), frames, rows, 3.0, [Moving()])
     steps(trainer, 60)
     error = (rows.tensors["velocities"].detach() - velocities).norm(dim=1)
     assert float(error.median()) < float(velocities.norm(dim=1).median()) / 3
@@ -153,28 +272,31 @@ def test_a_fit_without_networks_says_nothing_of_them(dataset):  # noqa: F811
     assert header.keys() == {"step", "bad_steps", "start_count", "extent", "views", "config"}
 
 
-def test_parts_that_do_not_fit_are_refused(dataset):  # noqa: F811
+def test_components_that_do_not_fit_are_refused(dataset):  # noqa: F811
     """Another network or one of another shape, a tensor without a rate, names that clash: one line each."""
     trainer = trainer_of(dataset)
     trainer.step()
-    tensors, header = trainer.state()
-    whole, plain = trainer.parts, parts_of(trainer.config, 3.0)
+    state = trainer.state()
 
-    def load(**changes):
-        parts = dataclasses.replace(whole, **changes)
-        return Trainer.from_state(trainer.config, trainer.frames, tensors, header, "here", parts)
+    def load(*networks):
+        class Other(Component):
+            name = "other"
+
+            def __init__(self):
+                self.networks = list(networks)
+
+        return trainer_of(dataset, state, (Other, Painted))
 
     with pytest.raises(ValueError, match=r"^here: --resume .*networks were \['affine'\] and are \[\]; repeat"):
-        load(networks=[])
-    wide = Network("affine", torch.nn.Linear(2, 2), 1e-2)
+        load()
     with pytest.raises(ValueError, match=r"^here: affine\.parameter\.weight must have shape \(2, 2\), got none; "):
-        load(networks=[wide])
+        load(Network("affine", torch.nn.Linear(2, 2), 1e-2))
     with pytest.raises(ValueError, match="every tensor must have a learning rate, features has none"):
-        load(rates=plain.rates)
+        trainer_of(dataset, state, (Corrected,))
     for names in (("rng",), ("a", "a"), ("parameter.x",), ("adam.sh_dc",), ("a", "a.parameter")):
         with pytest.raises(ValueError, match="networks must have names of their own"):
-            load(networks=[Network(name, Affine(), 1e-2) for name in names])
-    trainer.parts = dataclasses.replace(whole, terms=[Near()])
+            load(*(Network(name, Affine(), 1e-2) for name in names))
+    trainer.terms = []
     trainer._queue = torch.tensor([[frame.name for frame in trainer.frames].index("1")])
     with pytest.raises(ValueError, match="a view must have a term of the loss, 1 has none"):
         trainer.step()
@@ -209,10 +331,10 @@ def test_a_step_that_is_not_finite_leaves_networks_alone(dataset):  # noqa: F811
     """A NaN that only a network's gradient has skips the step of all."""
     trainer = trainer_of(dataset)
     steps(trainer, 2)
-    trainer.parts.networks[0].module.gain.register_hook(lambda gradient: gradient * torch.nan)
-    before = {name: x.clone() for name, x in trainer.parts.networks[0].state().items() if not name.endswith("calls")}
+    trainer.networks[0].module.gain.register_hook(lambda gradient: gradient * torch.nan)
+    before = {name: x.clone() for name, x in trainer.networks[0].state().items() if not name.endswith("calls")}
     assert trainer.step().events[-1]["event"] == "skipped"
-    after = trainer.parts.networks[0].state()
+    after = trainer.networks[0].state()
     assert [name for name, x in before.items() if not torch.equal(x, after[name])] == []
 
 
@@ -283,12 +405,17 @@ def test_a_moving_fit_is_looked_at_as_it_moves(tmp_path, monkeypatch):
     data, wind = blown(tmp_path), Wind()
     with torch.no_grad():
         wind.velocity += torch.tensor([0.6, 0, 0])  # fitted already, so that a few steps are enough
-    cfg = config(max_steps=6, max_gaussians=60, init_points="all", dc_rate=0.2)
-    parts = dataclasses.replace(
-        parts_of(cfg, 3.0),
-        networks=[Network("wind", wind, 1e-3)],
-        scene=lambda rows: Drift(rows.gaussians(), wind.velocity),
-    )
+    cfg = config(max_steps=6, max_gaussians=60, init_points="all", dc_rate=0.2, dynamics="ignore")
+
+    class Blown(Component):
+        name = "blown"
+
+        def __init__(self):
+            self.networks = [Network("wind", wind, 1e-3)]
+
+        def scene(self, fit, scene):
+            return Drift(scene, wind.velocity)
+
     active, chosen_of = SelectionConfig().replace(initial=3, add=1, every=3, pick_points="uncovered"), []
 
     def choose(scene, *arguments, **options):
@@ -296,7 +423,7 @@ def test_a_moving_fit_is_looked_at_as_it_moves(tmp_path, monkeypatch):
         return select(scene, *arguments, **options)
 
     monkeypatch.setattr("drgs.select.select", choose)
-    result = fit(data, tmp_path / "run", cfg.replace(selection=active), parts=parts, progress=False)
+    result = fit(data, tmp_path / "run", cfg.replace(selection=active), components=[Blown], progress=False)
     frames = load_frames(data.split()[1], cfg.data.max_pixels, cfg.data.mask)
     moving = Drift(result.gaussians, wind.velocity.detach())
     shown, at_rest = (evaluate(x, frames, cfg.settings)["mean"]["psnr"] for x in (moving, result.gaussians))

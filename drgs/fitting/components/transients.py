@@ -1,6 +1,6 @@
 """What was there for one photograph only, a shadow or a passer-by: found in residuals, and left out of the loss.
 
-A residual alone does not tell it from what is merely not fitted yet: on captures where nothing moves the largest
+A residual alone does not distinguish it from what is merely not fitted yet: on captures where nothing moves the largest
 residuals are as far above the others. But where several photographs see one place, what is not fitted yet leaves them
 the same residual, and what one of them shows alone leaves it to that one. So every photograph's residual is compared
 with the median of those of its neighbors, at the places where they see the same surface: the ray is followed to the
@@ -24,17 +24,21 @@ from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d
 
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
+from drgs.fitting.components.base import Checkpoint, Component, Conflict, Fit, Setup
 from drgs.integrator import render
 from drgs.sizes import reduced_size
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from typing import Any
+
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
     from drgs.fitting.config import TransientUse
     from drgs.fitting.frames import Frame
     from drgs.settings import RenderSettings
 
-__all__ = ["TENSOR", "Transients", "line_of", "transient_masks"]
+__all__ = ["TENSOR", "TransientsComponent", "line_of", "masked_share", "transient_masks"]
 
 TENSOR = "transient."
 """What names of masks in a checkpoint begin with; the number of the photograph follows."""
@@ -57,29 +61,54 @@ _MASKED = 0.01  # the same, from which on a photograph has a mask once that is d
 _ABOVE = 4.0  # times the median over photographs, which wrong poses and mirrors raise in all of them
 
 
-class Transients:
-    """Which pixels of the photographs of a fit are left out of its photometric term.
+class TransientsComponent(Component):
+    """Pixels of photographs that the photometric term of a fit leaves out: `transients` mask, or auto, where residuals
+    clearly show some.
 
     Attributes:
-        found: Whether there is something to be left out; None until that has been looked at.
+        present: Whether there is something to be left out; None until that has been decided.
     """
 
-    def __init__(self, use: TransientUse) -> None:
-        """As `LossConfig.transients` says."""
-        decided: dict[str, bool | None] = {"auto": None, "mask": True, "keep": False}
-        self.found = decided[use]
-        self._is_asked = use != "keep"
+    name = "transients"
+    option = ("transients", "keep")
+    where = "where what single photographs show is left out"
+    # They are distinguished by what neighbors show of the same surface at rest.
+    conflicts = (
+        Conflict(
+            "motion",
+            "what moves is in no two photographs the same",
+            "leave --transients out, or fit to what stands still (--dynamics ignore)",
+        ),
+    )
+    reserved_names = (TENSOR.rstrip("."),)
+    header_kinds = {"transients": bool}
 
-    def is_due(self, done: int, max_steps: int, photographs: int) -> bool:
-        """Whether to look before step `done`."""
-        if self.found is False or photographs < _FEWEST or done < _VISITS * photographs:
+    def __init__(self) -> None:
+        self.present: bool | None = None
+
+    def setting(self, setup: Setup) -> str | None:
+        """See `Component`."""
+        use = setup.config.loss.transients
+        return None if use == "keep" else use
+
+    def before_step(self, fit: Fit) -> list[dict]:
+        """See `Component`: looks when it is due."""
+        use = fit.config.loss.transients
+        if not self.is_due(use, fit.step_index, fit.config.max_steps, len(fit.frames)):
+            return []
+        return [self.look(use, fit.photographs(), fit.gaussians(), fit.config.settings)]
+
+    def is_due(self, use: TransientUse, done: int, max_steps: int, photographs: int) -> bool:
+        """Whether to look before step `done`; `use` as `LossConfig.transients` says."""
+        if use == "keep" or self.present is False or photographs < _FEWEST or done < _VISITS * photographs:
             return False
         return done in {round(part * max_steps) for part in _LOOKS}
 
-    def look(self, frames: list[Frame], gaussians: Gaussians, settings: RenderSettings) -> dict:
+    def look(self, use: TransientUse, frames: list[Frame], gaussians: Gaussians, settings: RenderSettings) -> dict:
         """Decide, where that is open, whether there is something to be left out, and renew the masks of all frames.
 
         Args:
+            use: As `LossConfig.transients` says.
             frames: Photographs; their `transient` is set if there is something.
             gaussians: What has been fitted to them so far.
             settings: What it is rendered with.
@@ -88,52 +117,70 @@ class Transients:
         """
         masks, shares = transient_masks(frames, gaussians, settings)
         worst, median = max(shares), float(np.median(shares))
-        if self.found is None:
-            self.found = worst > max(_SHARE, _ABOVE * median)
-        if self.found:
+        if self.present is None:
+            self.present = use == "mask" or worst > max(_SHARE, _ABOVE * median)
+        if self.present:
             for frame, mask in zip(frames, masks, strict=True):
                 frame.transient = mask if mask.any() else None
         return {
             "event": "transients",
-            "found": self.found,
+            "found": self.present,
             "worst": worst,
             "median": median,
             "photographs": sum(share > _SHARE for share in shares),
             "of": len(frames),
-            **self.summary(frames),
+            **masked_share(frames),
         }
 
-    def summary(self, frames: list[Frame]) -> dict:
-        """How many photographs have a mask, and its mean share of all their pixels."""
-        masks = [frame.transient for frame in frames if frame.transient is not None]
-        total = sum(float(mask.float().mean()) for mask in masks)
-        return {"masked": len(masks), "share": total / len(frames)}
+    def state(self, fit: Fit) -> tuple[dict[str, torch.Tensor], dict]:
+        """See `Component`."""
+        masks = {
+            f"{TENSOR}{i}": x.transient.to(torch.uint8) for i, x in enumerate(fit.frames) if x.transient is not None
+        }
+        return masks, {} if self.present is None else {"transients": self.present}
 
-    def state(self, frames: list[Frame]) -> tuple[dict[str, torch.Tensor], dict]:
-        """Tensors and header for a checkpoint."""
-        masks = {f"{TENSOR}{i}": x.transient.to(torch.uint8) for i, x in enumerate(frames) if x.transient is not None}
-        return masks, {"transients": self.found} if self._is_asked and self.found is not None else {}
-
-    def restore(self, frames: list[Frame], tensors: dict[str, torch.Tensor], header: dict, where: str) -> None:
-        """Continue from `state`; `where` names the checkpoint.
+    def resume(self, fit: Fit, checkpoint: Checkpoint) -> None:
+        """See `Component`.
 
         Raises:
             ValueError: If a mask has not the size of its photograph.
         """
-        self.found = header.get("transients", self.found)
-        for i, frame in enumerate(frames):
-            mask = tensors.get(f"{TENSOR}{i}")
+        self.present = checkpoint.header.get("transients")
+        for i, frame in enumerate(fit.frames):
+            mask = checkpoint.tensors.get(f"{TENSOR}{i}")
             size = tuple(frame.pixels.shape[:2])
             if mask is not None and tuple(mask.shape) != size:
                 raise ValueError(
-                    f"{where}: {TENSOR}{i} must have the size {size} of its photograph, got {tuple(mask.shape)}; "
-                    "choose another run folder"
+                    f"{checkpoint.where}: {TENSOR}{i} must have the size {size} of its photograph, got "
+                    f"{tuple(mask.shape)}; choose another run folder"
                 )
             frame.transient = None if mask is None else mask.bool()
 
+    def describe(self, event: Mapping[str, Any]) -> str | None:
+        """See `Component`."""
+        return line_of(event) if event["event"] == "transients" and event["found"] else None
 
-def line_of(event: dict) -> str:
-    """What `Transients.look` has found, in one line."""
+    def metrics(self, fit: Fit, held_out: list[Frame]) -> dict[str, Any]:
+        """See `Component`."""
+        is_on = self.present or fit.config.loss.transients == "mask"
+        return {"transients": masked_share(fit.frames)} if is_on else {}
+
+    @classmethod
+    def tensor_kinds(cls, checkpoint: Checkpoint, count: int) -> dict[str, tuple[torch.dtype, tuple[int, ...]]]:
+        """See `Component`: a mask is a picture of any size."""
+        masks = {name: x for name, x in checkpoint.tensors.items() if name.startswith(TENSOR)}
+        return {name: (torch.uint8, (*x.shape, 0, 0)[:2]) for name, x in masks.items()}
+
+
+def masked_share(frames: list[Frame]) -> dict:
+    """How many photographs have a mask, `masked`, and its mean `share` of all their pixels."""
+    masks = [frame.transient for frame in frames if frame.transient is not None]
+    total = sum(float(mask.float().mean()) for mask in masks)
+    return {"masked": len(masks), "share": total / len(frames)}
+
+
+def line_of(event: Mapping[str, Any]) -> str:
+    """What was found, in one line, of an event of `TransientsComponent.look`."""
     return (
         f"{event['photographs']} of {event['of']} photographs show over {100 * _SHARE:g} % of what their neighbors do "
         f"not, up to {100 * event['worst']:.1f} % (median {100 * event['median']:.1f} %): left out of the loss, "
@@ -230,10 +277,10 @@ def _excess(one: _Compared, neighbors: list[_Compared]) -> torch.Tensor:
         distance = torch.from_numpy(np.linalg.norm(points - other.camera.center, axis=-1)).float()
         front = torch.from_numpy(depth > 0).reshape(height, width)
         maps = torch.cat([other.residual, other.distance[None], other.valid[None].float()])[None]
-        found = grid_sample(maps, where.nan_to_num(2.0)[None], align_corners=False)[0]
-        same = front & (where.abs() < 1).all(-1) & (found[4] > 0.5)
-        same &= (found[3] - distance).abs() < _SAME * distance
-        seen.append(torch.where(same, found[:3], torch.nan))
+        sampled = grid_sample(maps, where.nan_to_num(2.0)[None], align_corners=False)[0]
+        same = front & (where.abs() < 1).all(-1) & (sampled[4] > 0.5)
+        same &= (sampled[3] - distance).abs() < _SAME * distance
+        seen.append(torch.where(same, sampled[:3], torch.nan))
     stack = torch.stack(seen)
     median = stack.nanmedian(0).values
     spread = (stack - median).abs().nanmedian(0).values.mean(0)

@@ -29,12 +29,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from drgs.data.camera_lists import save_cameras_json
 from drgs.display.progress import Bar
+from drgs.ellipsoids import colors_only
+from drgs.fitting.components.base import Checkpoint, Component, Conflict, Fit, RunViews, Setup
+from drgs.fitting.losses import psnr
 from drgs.fitting.networks import Network
 from drgs.integrator import render, render_jvp
 from drgs.sizes import at_most
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+    from typing import Any
+
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians, Scene
     from drgs.fitting.frames import Frame
@@ -45,11 +53,13 @@ __all__ = [
     "POSE_NETWORK",
     "PoseEvidence",
     "Poses",
+    "PosesComponent",
     "displacement",
     "is_due",
     "motion",
     "pose_network",
     "refined_against",
+    "refined_scores",
 ]
 
 POSE_NETWORK = "poses"
@@ -105,7 +115,7 @@ class PoseEvidence:
     def words(self) -> str:
         """What was found, in words."""
         if self.pixels is None:
-            return "the data set brings no observations that would tell how wrong they are"
+            return "the data set brings no observations that would say how wrong they are"
         return f"points are {self.pixels:.2f} px (median) from where photographs show them, at the size of the fit"
 
     def to_json(self, refined: bool) -> dict:
@@ -160,24 +170,24 @@ class Poses(torch.nn.Module):
         """Whether information has been computed, and poses may be other than stated."""
         return bool(self.whitening.any())
 
-    def begin(self, gaussians: Gaussians, skybox: int = 0) -> None:
+    def begin(self, gaussians: Gaussians, far: int = 0) -> None:
         """Compute W of every photograph, and what its pose moves its picture by, from what the Gaussians are now.
 
         Args:
             gaussians: The Gaussians.
-            skybox: How many of the first are far away: where a camera stands makes no difference to how they look.
+            far: How many of the first are far away: where a camera stands makes no difference to how they look.
         """
         with Bar("information about poses", len(self._cameras)) as bar:
             for row in range(len(self._cameras)):
-                self._look(row, gaussians, skybox)
+                self._look(row, gaussians, far)
                 bar.advance()
 
-    def _look(self, row: int, gaussians: Gaussians, skybox: int) -> None:
+    def _look(self, row: int, gaussians: Gaussians, far: int) -> None:
         """W of a photograph, and what its pose moves its picture by; arguments as of `begin`."""
         camera = self._cameras[row]
         # A metric of steps, not part of the loss.
-        means = gaussians.means[skybox:].detach().cpu().double()
-        opacities = gaussians.logit_opacities[skybox:].detach().cpu().double().sigmoid()
+        means = gaussians.means[far:].detach().cpu().double()
+        opacities = gaussians.logit_opacities[far:].detach().cpu().double().sigmoid()
         tangents = {"camera": self._twist_of[row].T.contiguous()}
         small = at_most(camera, _PIXELS)
         changes = render_jvp(gaussians, small, tangents, self._settings, outputs=()).rgb.double().reshape(6, -1)
@@ -189,7 +199,7 @@ class Poses(torch.nn.Module):
         moved = moved @ self._twist_of[row]
         self.shifts[row] = torch.einsum("n,nki,nkj->ij", weights, moved, moved) / weights.sum()
 
-    def join(self, camera: Camera, gaussians: Gaussians, skybox: int = 0) -> None:
+    def join(self, camera: Camera, gaussians: Gaussians, far: int = 0) -> None:
         """One photograph more, whose pose is as stated until it is fitted.
 
         The gauge is held over it, too, from now on. That moves no camera: the tangents of all cameras, restricted to
@@ -198,7 +208,7 @@ class Poses(torch.nn.Module):
         Args:
             camera: Its pinhole camera, named as it.
             gaussians: The Gaussians, which are looked at only once refinement has begun.
-            skybox: How many of the first are far away, as of `begin`.
+            far: How many of the first are far away, as of `begin`.
         """
         begun = self.has_begun
         row = len(self.names)
@@ -210,7 +220,7 @@ class Poses(torch.nn.Module):
         self.whitening, self.shifts = torch.cat([self.whitening, nothing]), torch.cat([self.shifts, nothing])
         self._place()
         if begun:
-            self._look(row, gaussians, skybox)
+            self._look(row, gaussians, far)
 
     def forward(self, frame: Frame) -> Frame:
         """The photograph with its camera as it is now; gradients reach its pose."""
@@ -268,10 +278,10 @@ class Poses(torch.nn.Module):
 
     def words(self) -> str:
         """What became of the poses, in one line."""
-        told = self.displacement()
+        moved = self.displacement()
         return (
-            f"poses: {told['cameras']} cameras were turned by {told['degrees']:.3g} degrees and moved by "
-            f"{told['moved']:.3g} (root mean square, world units); {CAMERAS} has them"
+            f"poses: {moved['cameras']} cameras were turned by {moved['degrees']:.3g} degrees and moved by "
+            f"{moved['moved']:.3g} (root mean square, world units); {CAMERAS} has them"
         )
 
     def displacement(self) -> dict:
@@ -441,3 +451,133 @@ def motion(twist: torch.Tensor) -> torch.Tensor:
     along = eye + factors[1] * w + factors[2] * (w @ w)
     top = torch.cat([rotation, (along @ twist[3:])[:, None]], 1)
     return torch.cat([top, torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=twist.dtype)])
+
+
+def refined_scores(scene: Scene, frames: list[Frame], settings: RenderSettings) -> dict:
+    """PSNR of views whose cameras are refined against their own photographs first, with the scene as it is.
+
+    What a view lacks apart from the error of its pose: no number to compare with those of other programs.
+
+    Returns:
+        `psnr_refined`, the mean in dB, and `views`, a list of name and `psnr_refined`; empty without views.
+    """
+    views = []
+    with Bar("refining held-out cameras", len(frames)) as bar:
+        for frame in frames:
+            camera = refined_against(scene, frame, settings)
+            with torch.no_grad():  # a measure
+                image = render(colors_only(scene, camera.time), camera, settings).rgb.cpu().clamp(0, 1)
+            views.append({"name": frame.name, "psnr_refined": psnr(image, frame.image(), frame.mask)})
+            bar.advance()
+    if not views:
+        return {}
+    return {"psnr_refined": float(np.mean([view["psnr_refined"] for view in views])), "views": views}
+
+
+class PosesComponent(Component):
+    """Poses of training photographs as a part of a fit: `poses` refined, or auto, where the data set says they are off.
+
+    Attributes:
+        module: The poses; None where they stay as the data set states them.
+        evidence: What the data set says of them; None where nobody looked, and of a fit that is resumed.
+    """
+
+    name = "poses"
+    option = ("poses", "fixed")
+    where = "where poses are optimized"
+    # A field explains a camera's error as well, and the photographs of one camera at many times have one pose.
+    conflicts = (
+        Conflict(
+            "motion",
+            "what moves would explain their errors, too",
+            "leave --poses out, or refine them on photographs of what stands still (--dynamics ignore)",
+        ),
+    )
+
+    def __init__(self) -> None:
+        self.module: Poses | None = None
+        self.evidence: PoseEvidence | None = None
+
+    def setting(self, setup: Setup) -> str | None:
+        """See `Component`."""
+        use = setup.config.data.poses
+        return None if use == "fixed" else use
+
+    def start(self, fit: Fit, setup: Setup) -> None:
+        """See `Component`."""
+        use = fit.config.data.poses
+        if use == "fixed":
+            return
+        with Bar("poses") as bar:
+            # Observations of views that are not chosen yet are not looked at.
+            all_seen = not setup.is_active or fit.config.data.init_points == "all"
+            self.evidence = PoseEvidence.of(setup.dataset.reprojection if all_seen else None, fit.frames)
+            is_on = use == "refined" or self.evidence.is_clear
+            bar.note(f"poses: {self.evidence.words()}; {'refined with the scene' if is_on else 'fixed'}")
+        if is_on:
+            self.use(fit, self.evidence.reach)
+
+    def use(self, fit: Fit, reach: float = 0.0) -> None:
+        """From now on poses are fitted; `reach` as of `Poses`."""
+        self.module = Poses([frame.camera for frame in fit.frames], fit.extent, fit.config.settings, reach)
+        self.networks = [pose_network(self.module)]
+        self.nuisance = "pose"
+
+    def resume(self, fit: Fit, checkpoint: Checkpoint) -> None:
+        """See `Component`."""
+        if POSE_NETWORK in checkpoint.header.get("networks", ()):
+            self.use(fit)
+
+    def before_step(self, fit: Fit) -> list[dict]:
+        """See `Component`."""
+        if self.module is not None and is_due(fit.part) and not self.module.has_begun:
+            self.module.begin(fit.gaussians(), fit.rows.far)
+        return []
+
+    def frame(self, fit: Fit, frame: Frame) -> Frame:
+        """See `Component`: gradients reach the pose while poses are fitted."""
+        if self.module is None:
+            return frame
+        return self.module(frame) if is_due(fit.part) else dataclasses.replace(frame, camera=self.camera(frame))
+
+    def camera(self, frame: Frame) -> Camera:
+        """See `Component`."""
+        return frame.camera if self.module is None else self.module.camera(frame.name)
+
+    def join(self, fit: Fit, frame: Frame, setup: Setup) -> list[dict]:
+        """See `Component`."""
+        if (poses := self.module) is not None:
+            self.networks[0].extend(lambda: poses.join(frame.camera, fit.gaussians(), fit.rows.far))
+        return []
+
+    def write_files(self, folder: Path) -> None:
+        """See `Component`."""
+        if self.module is not None:
+            save_cameras_json(folder / CAMERAS, self.module.cameras())
+
+    def record(self, fit: Fit, before: Mapping[str, Any]) -> dict[str, Any]:
+        """See `Component`."""
+        refined = self.module is not None
+        if self.evidence is not None:
+            return {"poses": self.evidence.to_json(refined)}
+        if fit.config.data.poses == "fixed":
+            return {}
+        # The config.json of a fit that is resumed may have been moved away.
+        return {"poses": before.get("poses", {"reprojection": None, "refined": refined})}
+
+    def metrics(self, fit: Fit, held_out: list[Frame]) -> dict[str, Any]:
+        """See `Component`."""
+        if self.module is None:
+            return {}
+        with Bar("poses") as bar:
+            bar.note(self.module.words())
+        scores = refined_scores(fit.scene(), held_out, fit.config.settings)
+        return {"poses": {**self.module.displacement(), **scores}}
+
+    @classmethod
+    def run_metrics(cls, run: RunViews) -> dict[str, Any]:
+        """See `Component`."""
+        if not run.refined:
+            return {}
+        scores = refined_scores(run.scene, run.held_out, run.settings)
+        return {"poses": {**displacement(run.stated, run.cameras), **scores}}

@@ -14,14 +14,18 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from drgs.cameras import Camera
+from drgs.display.progress import Bar
+from drgs.fitting.components.base import Component, Conflict, Fit, Setup
 from drgs.fitting.renderers import RendererSchedule, planar_of
 from drgs.sizes import at_most
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from drgs.data import View
     from drgs.fitting.config import FitConfig
 
-__all__ = ["LensChoice", "lens_choice", "lost_share"]
+__all__ = ["LensChoice", "LensComponent", "lens_choice", "lost_share"]
 
 _LOST = 0.2  # of the rays of photographs; ordinary lenses lose a twentieth, a fisheye of 180 degrees most
 _PIXELS = 10_000  # of a photograph, whose share is counted
@@ -54,12 +58,13 @@ class LensChoice:
         return dataclasses.asdict(self)
 
 
-def lens_choice(config: FitConfig, views: Sequence[View]) -> LensChoice:
+def lens_choice(config: FitConfig, views: Sequence[View], otherwise: str | None = None) -> LensChoice:
     """What `--undistort auto` means of photographs.
 
     Args:
         config: Configuration of the fit.
         views: The training views.
+        otherwise: What to do to fit through lenses, where something else of the fit does not go with them.
     """
     counted: dict[tuple, int] = {}
     cameras: dict[tuple, Camera] = {}
@@ -73,14 +78,52 @@ def lens_choice(config: FitConfig, views: Sequence[View]) -> LensChoice:
         return LensChoice("on", lost)
     if planar_of(config.renderers, config.settings):
         return LensChoice("on", lost, "use --for drgs, or another renderer along rays")
-    if config.data.poses != "fixed":
-        return LensChoice("on", lost, "use --poses fixed")
-    if config.selection is not None:
-        return LensChoice("on", lost, "use --views all")
+    if otherwise is not None:
+        return LensChoice("on", lost, otherwise)
     drawn = RendererSchedule.of(config.renderers, config.settings, config.max_steps).all_settings
     if any(settings.near > 0 for settings in drawn) and any(_looks_behind(camera) for camera in cameras.values()):
         return LensChoice("on", lost, "use --for drgs: near planes leave out what lenses see behind the camera's plane")
     return LensChoice("off", lost)
+
+
+class LensComponent(Component):
+    """Whether photographs are fitted as they were taken, through their lenses: `undistort` off, or auto, where
+    undistorting would lose much.
+
+    Attributes:
+        choice: What `auto` means; None where it was not asked.
+    """
+
+    name = "lens"
+    option = ("undistort", "on")
+    where = "where photographs are fitted through their lenses"
+    conflicts = (
+        Conflict("poses", "a lens's pose is not differentiated", "use --poses fixed"),
+        Conflict("selection", "candidates are scored as pinhole cameras", "use --views all"),
+    )
+
+    def __init__(self) -> None:
+        self.choice: LensChoice | None = None
+
+    def prepare(self, setup: Setup) -> None:
+        """See `Component`: what `auto` means is from now on in the configuration."""
+        if setup.config.data.undistort != "auto":
+            return
+        with Bar("lenses") as bar:
+            clash = setup.conflict(self)
+            self.choice = lens_choice(setup.config, setup.train, None if clash is None else clash[0].advice)
+            if self.choice.words():
+                bar.note(self.choice.words())
+        data = dataclasses.replace(setup.config.data, undistort=self.choice.undistort)
+        setup.config = setup.config.replace(data=data)
+
+    def setting(self, setup: Setup) -> str | None:
+        """See `Component`: `auto` gives way."""
+        return "off" if setup.config.data.undistort == "off" else None
+
+    def record(self, fit: Fit, before: Mapping[str, Any]) -> dict[str, Any]:
+        """See `Component`."""
+        return {"lenses": self.choice.to_json()} if self.choice is not None and self.choice.lost else {}
 
 
 def _looks_behind(camera: Camera) -> bool:

@@ -1,0 +1,392 @@
+"""What a component of a fit is: something that is fitted, or decided, beside photographs and Gaussians.
+
+A component is a class with one row in `drgs.fitting.components.table.COMPONENTS`. `drgs.train.fit` and the `Trainer`
+call its methods below at their times and know no component by name. Every method has a default that does nothing, so
+that a component writes those alone that it needs. What its life is, in the order of calls:
+
+    prepare      before photographs are decoded: what the cameras and the configuration say
+    setting      whether it is to be part of this fit; then conflicts are refused
+    begin        photographs are there, of a new fit and of one that is resumed
+    start        a new fit has its first Gaussians: networks, rows, evidence
+    resume       instead of `start`, from a checkpoint
+    before_density, before_step, frame, gaussians, scene, rendered, shown, terms, after_backward               each step
+    changed, new_rows, restart, join                                    Gaussians or photographs come, or are replaced
+    state, write_files                                                                                  each checkpoint
+    record, log_fields, describe, evaluation, metrics                                what it says in files and on stderr
+
+Class methods read what a run folder says, when no fit is there: `load_gaussians`, `load_scene`, `run_metrics`, `report`
+and the checks of a checkpoint.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+
+import torch
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from drgs.cameras import Camera
+    from drgs.data import Dataset, View
+    from drgs.ellipsoids import Gaussians, Scene
+    from drgs.fitting.config import FitConfig
+    from drgs.fitting.frames import Frame
+    from drgs.fitting.losses import LossTerm
+    from drgs.fitting.networks import Network, Rate
+    from drgs.fitting.rows import GaussianRows
+    from drgs.fitting.stages import Stage
+    from drgs.information.choices import Block
+    from drgs.information.nuisances import Nuisance
+    from drgs.information.scoring import Scoring
+    from drgs.integrator import Output
+    from drgs.settings import RenderSettings
+    from drgs.sfm.guided import Matches
+
+__all__ = ["WAYS", "Checkpoint", "Component", "Conflict", "Fit", "RunViews", "Setup", "check_conflicts"]
+
+WAYS = {
+    "selection": "where views are chosen on the way",
+    "begin": "where the fit begins with the Gaussians of another",
+    "pace": "where the number of steps follows the time that there is",
+}
+"""Ways to fit that a component may not be built for, by the names that `Conflict.other` has for them, in words."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Conflict:
+    """Something that a component cannot stand beside.
+
+    Attributes:
+        other: Name of another component, or of one of `WAYS`.
+        why: The reason, a clause.
+        advice: What to do.
+    """
+
+    other: str
+    why: str
+    advice: str
+
+
+@dataclasses.dataclass
+class Setup:
+    """What is known of a fit before its first step.
+
+    Attributes:
+        dataset: The data set.
+        config: What to do; components replace what `auto` means in it.
+        train, test: The two splits.
+        views: Training views that may be read at the start: all, or the first ones of an active fit.
+        times: Distinct times of the views that the fit distinguishes, sorted; none where nothing can move, or is to.
+        components: Those of the fit, in their order.
+        ways: Which of `WAYS` it goes.
+        frames, held_out: Photographs of the views that are fitted to at the start, and of `test`, once decoded.
+        reserved: Gaussians of the budget that components will add at the start.
+        points: (P, 3) initial points, world, once they are there.
+        matches: What was matched between photographs for initial points; None where nothing was.
+        picked_points: Of an active fit, `ActiveViews.compared_points`.
+    """
+
+    dataset: Dataset
+    config: FitConfig
+    train: list[View]
+    test: list[View]
+    views: list[View]
+    times: tuple[float, ...]
+    components: Sequence[Component]
+    ways: frozenset[str] = frozenset()
+    frames: list[Frame] = dataclasses.field(default_factory=list)
+    held_out: list[Frame] = dataclasses.field(default_factory=list)
+    reserved: int = 0
+    points: np.ndarray | None = None
+    matches: Matches | None = None
+    picked_points: Callable[[np.ndarray | None], tuple[np.ndarray, np.ndarray | None]] | None = None
+
+    @property
+    def is_active(self) -> bool:
+        """Whether views are chosen on the way."""
+        return "selection" in self.ways
+
+    def conflict(self, component: Component) -> tuple[Conflict, str] | None:
+        """The first thing of this fit that a component cannot stand beside, and where that is, in words."""
+        there = {name: WAYS[name] for name in WAYS if name in self.ways}
+        there |= {x.name: x.where for x in self.components if x is not component and x.setting(self) is not None}
+        return next(((x, there[x.other]) for x in component.conflicts if x.other in there), None)
+
+
+def check_conflicts(setup: Setup) -> None:
+    """Refuse components that cannot stand beside others of this fit.
+
+    Raises:
+        NotImplementedError: On the first, in one line.
+    """
+    for component in setup.components:
+        value = component.setting(setup)
+        if value is None or (clash := setup.conflict(component)) is None:
+            continue
+        conflict, where = clash
+        option, neutral = component.option
+        raise NotImplementedError(
+            f"fit: {option} must be {neutral} {where}, got {value}: {conflict.why}; {conflict.advice}"
+        )
+
+
+class Fit(Protocol):
+    """What a component sees of a fit, and may change: `drgs.fitting.trainer.Trainer` has it."""
+
+    config: FitConfig
+    frames: list[Frame]
+    rows: GaussianRows
+    extent: float
+    step_index: int
+    reserved: int
+    generator: torch.Generator
+    components: list[Component]
+
+    @property
+    def part(self) -> float:
+        """The fraction of the steps that is done."""
+
+    def photographs(self) -> list[Frame]:
+        """The training photographs, whose cameras are put where they are now."""
+
+    def gaussians(self) -> Gaussians:
+        """The Gaussians as they are shown and saved, without a graph; at rest where they move."""
+
+    def scene(self) -> Scene:
+        """What a step renders, to be looked at."""
+
+    def shown(self, out: Output, frame: Frame) -> Output:
+        """A rendering as a photograph shows it."""
+
+    def begin_stage(self) -> None:
+        """Other things are fitted from now on: the epoch, and the growth of density control, begin anew."""
+
+    def another(self, config: FitConfig, frames: list[Frame], rows: GaussianRows, component: Component) -> Fit:
+        """A short fit for a trial: to other Gaussians, and with this component in place of the one of its name."""
+
+    def step(self) -> Any:
+        """One step."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Checkpoint:
+    """Contents of state.safetensors.
+
+    Attributes:
+        tensors, header: As `drgs.io.checkpoint.load_state` returns them.
+        where: The file, for messages.
+    """
+
+    tensors: Mapping[str, torch.Tensor]
+    header: Mapping[str, Any]
+    where: str
+
+
+@dataclasses.dataclass(frozen=True)
+class RunViews:
+    """A run that is measured again (`drgs eval`).
+
+    Attributes:
+        scene: What is shown.
+        settings: Settings of the fit's renderings.
+        refined: Whether the run has cameras of its own.
+        stated: Cameras of the training photographs that were fitted to, as the data set states them.
+        cameras: The same as the run has them.
+        held_out: Photographs that were not fitted to, at the size of the fit; none where others are measured.
+    """
+
+    scene: Scene
+    settings: RenderSettings
+    refined: bool
+    stated: list[Camera]
+    cameras: list[Camera]
+    held_out: list[Frame]
+
+
+class Component:
+    """A component of a fit. Every fit has instances of its own.
+
+    Attributes:
+        name: Its name in the table.
+        option: Option that it is asked for by, and the value, or values, that are without it; for messages.
+        where: Where it is, in words, as other components say what they cannot stand beside.
+        conflicts: What it cannot stand beside. Each pair is declared once, by the one of the two that gives way.
+        block: Block of information that can only be asked of a fit with it, and what a fit is without; None: none.
+        reserved_names: Names in a checkpoint, or what names begin with up to a dot, that no network may have.
+        header_kinds: Keys of its part of a checkpoint's header -> kind, as of `drgs.io.json_files.check_json`.
+        terms: Terms of the loss, added up after those that every fit has.
+        rates: Learning rates by the name of a tensor of `GaussianRows`, also of one that every fit has.
+        networks: What it fits beside the Gaussians.
+        nuisance: The unknown of each photograph that it estimates, eliminated from information; None: none.
+        pictures: Suffixes of the pictures that measuring a view draws besides that of its colors.
+        rendering: Arguments of `drgs.render` of a step.
+    """
+
+    name: ClassVar[str]
+    option: ClassVar[tuple[str, str]] = ("", "")
+    where: ClassVar[str] = ""
+    conflicts: ClassVar[tuple[Conflict, ...]] = ()
+    block: ClassVar[tuple[Block, str] | None] = None
+    reserved_names: ClassVar[tuple[str, ...]] = ()
+    header_kinds: ClassVar[Mapping[str, Any]] = {}
+    terms: Sequence[LossTerm] = ()
+    rates: Mapping[str, Rate] = {}
+    networks: Sequence[Network] = ()
+    nuisance: Nuisance | None = None
+    pictures: Sequence[str] = ()
+    rendering: Mapping[str, Any] = {}
+
+    # -------------------------------------------------------------------------------------- before the first step
+
+    def prepare(self, setup: Setup) -> None:
+        """See what views, not yet decoded, and the configuration say; may replace `setup.config`."""
+
+    def setting(self, setup: Setup) -> str | None:
+        """The value of its option where it is to be part of this fit, and is refused in a conflict; else None."""
+
+    def begin(self, setup: Setup, resumed: bool) -> None:
+        """Check, and decide by, decoded photographs; may reserve Gaussians of the budget.
+
+        Args:
+            setup: With its photographs.
+            resumed: Whether the fit is resumed from a checkpoint.
+        """
+
+    def initial_views(self, views: list[View]) -> list[View]:
+        """Those of the views that initial points may come from."""
+        return views
+
+    def start(self, fit: Fit, setup: Setup) -> None:
+        """Begin with a new fit, whose first Gaussians are there."""
+
+    def resume(self, fit: Fit, checkpoint: Checkpoint) -> None:
+        """Begin with what a checkpoint holds; the tensors of `networks` that are made here are restored afterwards."""
+
+    # ---------------------------------------------------------------------------------------------------- each step
+
+    def before_density(self, fit: Fit) -> list[dict]:
+        """What is due before schedules and density control; returns events for the log."""
+        return []
+
+    def before_step(self, fit: Fit) -> list[dict]:
+        """What is due after these, before a photograph is drawn and seen; returns events for the log."""
+        return []
+
+    def stage(self, fit: Fit) -> Stage | None:
+        """Over which density control runs now; None: over the whole fit."""
+
+    def fitted_frames(self, frames: list[Frame]) -> list[Frame]:
+        """Those of the photographs that steps are fitted to now."""
+        return frames
+
+    def frame(self, fit: Fit, frame: Frame) -> Frame:
+        """A photograph as a step sees it; its camera may be differentiated."""
+        return frame
+
+    def camera(self, frame: Frame) -> Camera:
+        """The camera of a training photograph as it is now, without a graph."""
+        return frame.camera
+
+    def gaussians(self, gaussians: Gaussians) -> Gaussians:
+        """The Gaussians that are shown and saved, of those that are fitted; differentiated."""
+        return gaussians
+
+    def scene(self, fit: Fit, scene: Scene) -> Scene:
+        """What is rendered of the Gaussians; differentiated."""
+        return scene
+
+    def rendered(self, gaussians: Gaussians, frame: Frame) -> Gaussians:
+        """What of the Gaussians at the time of a photograph is rendered for it."""
+        return gaussians
+
+    def shown(self, out: Output, frame: Frame) -> Output:
+        """A rendering as a photograph shows it, before terms of the loss see it; differentiated."""
+        return out
+
+    def after_backward(self, fit: Fit) -> None:
+        """Change gradients before optimizers step."""
+
+    # ------------------------------------------------------------------------- Gaussians and photographs that come
+
+    def changed(self, fit: Fit) -> None:
+        """Gaussians or photographs have come or gone."""
+
+    def new_rows(self, fit: Fit, count: int) -> dict[str, torch.Tensor]:
+        """Rows of its tensors for Gaussians that are added at points; left out, they are 0."""
+        return {}
+
+    def restart(self, fit: Fit) -> None:
+        """All Gaussians have been replaced by new ones at points; networks and schedules go on."""
+
+    def join(self, fit: Fit, frame: Frame, setup: Setup) -> list[dict]:
+        """A photograph is about to be added to `fit.frames`; returns events for the log, with which config.json is
+        written anew.
+        """
+        return []
+
+    # ------------------------------------------------------------------------------- files, log, metrics and report
+
+    def state(self, fit: Fit) -> tuple[dict[str, torch.Tensor], dict]:
+        """Tensors and header that a checkpoint has besides those of `networks` and rows."""
+        return {}, {}
+
+    def write_files(self, folder: Path) -> None:
+        """Write its own files into the run folder, atomically: when a run begins, and after every checkpoint."""
+
+    def record(self, fit: Fit, before: Mapping[str, Any]) -> dict[str, Any]:
+        """Its part of config.json; `before` is the one of a fit that is resumed, else empty."""
+        return {}
+
+    def scoring(self, scoring: Scoring) -> Scoring:
+        """How candidates of an active fit are scored."""
+        return scoring
+
+    def log_fields(self, fit: Fit, terms: Sequence[Mapping[str, float]]) -> dict[str, Any]:
+        """Its part of the `train` events; `terms` of the loss by name, of the steps since the last event."""
+        return {}
+
+    def describe(self, event: Mapping[str, Any]) -> str | None:
+        """The line on stderr for an event of the log that is its own; None: none."""
+
+    def evaluation(self, fit: Fit, held_out: list[Frame]) -> dict[str, Any]:
+        """Arguments of `drgs.metrics.evaluate`."""
+        return {}
+
+    def metrics(self, fit: Fit, held_out: list[Frame]) -> dict[str, Any]:
+        """Its part of metrics.json at the end of the fit."""
+        return {}
+
+    # ------------------------------------------------------------------------------------- what a run folder says
+
+    @classmethod
+    def tensor_kinds(cls, checkpoint: Checkpoint, count: int) -> dict[str, tuple[torch.dtype, tuple[int, ...]]]:
+        """Type and shape of its tensors in a checkpoint of `count` Gaussians."""
+        return {}
+
+    @classmethod
+    def check(cls, checkpoint: Checkpoint) -> str | None:
+        """What is wrong with its part of a checkpoint, in words."""
+
+    @classmethod
+    def load_gaussians(cls, gaussians: Gaussians, checkpoint: Checkpoint) -> Gaussians:
+        """As `gaussians`, of a checkpoint."""
+        return gaussians
+
+    @classmethod
+    def load_scene(cls, scene: Scene, checkpoint: Checkpoint) -> Scene:
+        """As `scene`, of a checkpoint; to be looked at, not fitted."""
+        return scene
+
+    @classmethod
+    def run_metrics(cls, run: RunViews) -> dict[str, Any]:
+        """Its part of metrics.json where a run is measured again."""
+        return {}
+
+    @classmethod
+    def report(cls, config: Mapping[str, Any], metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """Its lines on the report page, each a name and a text, of the contents of config.json and metrics.json."""
+        return []

@@ -1,0 +1,767 @@
+"""Gaussians of a fit that have a limited lifetime: added where photographs of a time show what the scene does not.
+
+Something that goes further between two photographs than it is large, or that appears, is nowhere near the Gaussians
+that were fitted to another time: no pixel sees both where a Gaussian is and where it should be, and photographs of all
+other times fade it. So new Gaussians are added where it is, at that time, with the velocity that is seen there, and
+photographs of other times do not reach them.
+
+**Lifetimes.** A Gaussian whose short lifetime few photographs see is fitted to these alone, and shows anything from
+other cameras. Long lifetimes make neighbors in time agree: the loss has `life_weight` times the mean over Gaussians of
+the time between two photographs over the width of the lifetime. One that is shorter than that time is left alone: no
+other time has confirmed where the Gaussian would be then, and what shows there at the wrong place is faded by the
+photographs that see it. From ten times the span of all photographs on a lifetime is unlimited
+(`drgs.dynamics.lives.LASTING`).
+
+**Where they are added.** A photograph differs from its rendering where something is at its time that is not there at
+others. A pixel of it is on a ray; how far along, and how fast it moves, is what other photographs of the same time and
+of times near it say: at the right depth and velocity they show the same color, where they, too, differ. Depth and
+velocity are found as PatchMatch finds them: candidates are drawn at random, taken from pixels of the same photograph
+and of those near in time, and changed a little, and each pixel keeps the one that photographs agree with best.
+
+Reference:
+    Barnes et al., "PatchMatch: A Randomized Correspondence Algorithm for Structural Image Editing", ACM TOG 2009;
+    Bleyer et al., "PatchMatch Stereo", BMVC 2011. That residuals of a model say where to look, and that a velocity is
+    searched with the depth, is not from there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+import numpy as np
+import torch
+from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d
+
+from drgs.display.progress import Bar
+from drgs.ellipsoids import colors_only
+from drgs.fitting.components.base import Checkpoint, Component, Fit, Setup
+from drgs.fitting.components.motion import WARM_UP, MotionComponent, limited_lifetimes
+from drgs.fitting.rates import means_rate
+from drgs.fitting.stages import dynamic_stage, shows_first_time, spacing
+from drgs.integrator import render
+from drgs.sizes import reduced_size
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.dynamics.lives import Lives
+    from drgs.ellipsoids import Gaussians, Scene
+    from drgs.fitting.config import FitConfig
+    from drgs.fitting.frames import Frame
+    from drgs.fitting.networks import Rate
+    from drgs.fitting.rows import GaussianRows
+    from drgs.integrator import Output
+    from drgs.settings import RenderSettings
+
+__all__ = [
+    "REFERENCE_TIMES",
+    "LifespansComponent",
+    "LifetimeTerm",
+    "NewGaussians",
+    "Search",
+    "add_new_gaussians",
+    "checked_lifetimes",
+    "find_new_gaussians",
+    "lifetimes_of",
+]
+
+REFERENCE_TIMES = "births"
+"""Name of the rows' tensor, and in checkpoints, of the time at which a Gaussian is where its mean is; not fitted."""
+
+MOST_ADDED = 0.5
+"""Share of the Gaussians that there may be: how many are added at most, so that what stands still keeps as many."""
+
+# Units of times are the median time between a photograph and the next one.
+_OPACITY = 0.3  # of a new Gaussian, as of those at points of depth maps: its place is known, too
+_FAINT = (
+    0.1  # opacity below which a Gaussian gives way to a new one: that of all at the start, which nothing has raised
+)
+_WIDTH = 2.0  # times: width of a new lifetime that other times confirm, which then reaches its neighbors
+_BRIEF = 0.4  # times: of one that they do not confirm, which hardly reaches them
+_GAP = 0.75  # of a longer time without photographs beside it, which the lifetime has to bridge
+_CONFIRMED = 0.4  # part of the photographs of other times that must agree with where it is then
+_CENTER_RATE = 0.02  # times: learning rate of a lifetime's center, a width of `_WIDTH` in 100 steps
+_WIDTH_RATE = 0.01  # learning rate of the logarithm of its width, a factor of e in 100 steps
+_SHUT = -2.0  # logit of the gate of a new Gaussian: 0.12, so that the field does not move it, and may later
+_SOON, _LATE = 2.0, 8.0  # times after which velocities, and accelerations, move a Gaussian as the rate of means does
+_SOLID = 0.5  # opacity below which a ray ends in nothing, and value of a mask below which a pixel does not count
+_NOTHING = 1e9  # distance, world units, to where a ray ends in nothing: farther than anything, and finite
+
+
+@dataclasses.dataclass(frozen=True)
+class Search:
+    """How new Gaussians are searched for. The defaults are those that docs/dynamic.md was measured with.
+
+    Attributes:
+        pixels: Pixels of the pictures that are compared, at most: few enough that the search takes seconds.
+        difference: Mean difference of colors, in [0, 1], from which on a pixel shows something else: above noise.
+        background_photographs: Photographs from one place from which on their median is what is seen there at most
+            times; fewer have no majority.
+        samples: Pixels of a photograph whose depth is searched, at most.
+        same_time, other_times: Photographs of the same time, and of the nearest other times, that they are compared
+            with.
+        iterations: Rounds of the search.
+        random, changed, neighbors: Candidates of a pixel in each round: drawn at random, its own with a change, and of
+            other pixels.
+        least_depth: Least random depth, as part of the way to what is rendered: nothing stands before the lens.
+        decades, resting: Powers of ten that random speeds span below the fastest, and part of them that are 0.
+        change: Relative change of depths and velocities in the second round; it halves with each.
+        propagated: Score in [0, 1] from which on other photographs take over a pixel's depth and velocity.
+        accepted: Score in [0, 1] from which on a new Gaussian is added: most photographs agree.
+        color: Standard deviation of the color of one thing in two photographs, in [0, 1].
+        fewest: Photographs that must show a place.
+        enough: Photographs of the same time that say where something is without those of others.
+        minor: Weight of what decides only between equals: agreement of other times, and a low speed.
+        occluded: Part of the distance to a place below which what is rendered stands before it; 1 up to rounding.
+        window: Within so many times velocities and accelerations are made to agree.
+        spread: How far apart places of one thing are, in extents of the scene.
+        reach: What velocity and acceleration may be off by at the end of the window, in extents of the scene.
+        turned: Part of its way that a thing may be off its straight path.
+        far: Quantile of the distances to all Gaussians beyond which nothing is looked for.
+        fastest: Largest speed, in extents of the scene in the time between two photographs.
+    """
+
+    pixels: int = 10_000
+    difference: float = 0.08
+    background_photographs: int = 4
+    samples: int = 128
+    same_time: int = 6
+    other_times: int = 8
+    iterations: int = 8
+    random: int = 24
+    changed: int = 8
+    neighbors: int = 5
+    least_depth: float = 0.02
+    decades: float = 2.5
+    resting: float = 0.3
+    change: float = 0.25
+    propagated: float = 0.3
+    accepted: float = 0.6
+    color: float = 0.15
+    fewest: int = 2
+    enough: int = 3
+    minor: float = 0.02
+    occluded: float = 0.98
+    window: float = 8.0
+    spread: float = 0.025
+    reach: float = 0.05
+    turned: float = 0.25
+    far: float = 0.95
+    fastest: float = 0.15
+
+
+class LifespansComponent(Component):
+    """Gaussians with a limited lifetime as a part of a fit to what moves: `lives` auto.
+
+    Attributes:
+        times: Times of all photographs, sorted; none in a fit without.
+    """
+
+    name = "lifespans"
+    option = ("lives", "off")
+    where = "where Gaussians have a limited lifetime"
+
+    def __init__(self, times: Sequence[float] = ()) -> None:
+        self.times = tuple(times)
+
+    def prepare(self, setup: Setup) -> None:
+        """See `Component`."""
+        self.times = setup.times if setup.config.motion.lives == "auto" else ()
+
+    def before_density(self, fit: Fit) -> list[dict]:
+        """See `Component`: once, looks for what photographs show and the scene does not.
+
+        Where the static stage was fitted to all times it shows nothing that moves, and this is at once. Where it shows
+        the first time, the field may carry what it shows to the others, and is given the time for it.
+        """
+        if not self.times:
+            return []
+        stage = dynamic_stage(fit.config)
+        wait = WARM_UP if shows_first_time(fit.frames) else 0.0
+        if fit.step_index != stage.begin + round(wait * stage.length):
+            return []
+        self.terms = [LifetimeTerm(fit.rows, spacing(self.times), fit.config.motion.life_weight)]
+        most = round(MOST_ADDED * fit.config.density.max_gaussians) - fit.reserved
+        if most <= 0:
+            return []
+        new = find_new_gaussians(
+            fit.photographs(), fit.scene(), fit.config.settings, fit.extent, most, fit.generator, fit.shown
+        )
+        self._use(fit)
+        add_new_gaussians(fit.rows, new, self.times, _SHUT, fit.config.density.max_gaussians)
+        return [
+            {
+                "event": "births",
+                "found": len(new.points),
+                "photographs": new.photographs,
+                "of": len(fit.frames),
+                "gaussians": len(fit.rows),
+            }
+        ]
+
+    def resume(self, fit: Fit, checkpoint: Checkpoint) -> None:
+        """See `Component`."""
+        if self.times and REFERENCE_TIMES in fit.rows.tensors:
+            self.terms = [LifetimeTerm(fit.rows, spacing(self.times), fit.config.motion.life_weight)]
+            self._use(fit)
+
+    def _use(self, fit: Fit) -> None:
+        """Rates of tensors of lifetimes, in the unit of length of the field."""
+        length = next((x.field_length for x in fit.components if isinstance(x, MotionComponent)), fit.extent)
+        self.rates = lifetime_rates(fit.config, self.times, length)
+
+    def scene(self, fit: Fit, scene: Scene) -> Scene:
+        """See `Component`."""
+        return _with_lifetimes(scene, lifetimes_of(fit.rows.tensors))
+
+    def after_backward(self, fit: Fit) -> None:
+        """See `Component`: what has a limited lifetime keeps one color in all directions.
+
+        The few photographs that see it would each have a color of their own, wherever it is.
+        """
+        rest = fit.rows.tensors["sh_rest"].grad
+        if self.times and rest is not None:
+            limited = limited_lifetimes(fit.rows, self.times)
+            if limited is not None:
+                rest[limited] = 0
+
+    def new_rows(self, fit: Fit, count: int) -> dict[str, torch.Tensor]:
+        """See `Component`: what is added is always there."""
+        return _unlimited(count, self.times) if REFERENCE_TIMES in fit.rows.tensors else {}
+
+    def describe(self, event: Mapping[str, Any]) -> str | None:
+        """See `Component`."""
+        if event["event"] != "births":
+            return None
+        if not event["found"]:
+            return "photographs agree with the scene at their times: no Gaussian with a limited lifetime is added"
+        return (
+            f"{event['photographs']} of {event['of']} photographs show what is not there at most times: "
+            f"{event['found']} Gaussians with a limited lifetime are added (--lives off: none)"
+        )
+
+    @classmethod
+    def load_scene(cls, scene: Scene, checkpoint: Checkpoint) -> Scene:
+        """See `Component`."""
+        if "field" not in checkpoint.header:
+            return scene
+        count = len(checkpoint.tensors["parameter.means"])
+        return _with_lifetimes(scene, checked_lifetimes(checkpoint.tensors, count, checkpoint.where))
+
+
+def _with_lifetimes(scene: Scene, lives: Lives | None) -> Scene:
+    """A scene that moves, whose Gaussians have lifetimes."""
+    if lives is None:
+        return scene
+    from drgs.deform import DynamicGaussians
+
+    assert isinstance(scene, DynamicGaussians)  # what has lifetimes has a field
+    return DynamicGaussians(scene.gaussians, scene.field, scene.motion, lives)
+
+
+def lifetimes_of(tensors: Mapping[str, torch.Tensor]) -> Lives | None:
+    """When Gaussians live, of the tensors of their rows; None where all are always there."""
+    if REFERENCE_TIMES not in tensors:
+        return None
+    from drgs.dynamics.lives import Lives
+
+    return Lives.of(tensors, tensors[REFERENCE_TIMES].detach())  # constants
+
+
+def checked_lifetimes(tensors: Mapping[str, torch.Tensor], count: int, where: str) -> Lives | None:
+    """`lifetimes_of` of a checkpoint.
+
+    Args:
+        tensors: Its contents.
+        count: How many Gaussians it has.
+        where: It, for messages.
+    Raises:
+        ValueError: If a tensor is missing, not finite, or not of as many Gaussians.
+    """
+    from drgs.dynamics.lives import LIVES
+
+    held = {name.removeprefix("parameter."): x for name, x in tensors.items() if name.startswith("parameter.")}
+    names = (*LIVES, REFERENCE_TIMES)
+    if not any(name in held for name in names):
+        return None
+    for name in names:
+        shape = (count, 3) if name in LIVES[2:] else (count,)
+        if name not in held or tuple(held[name].shape) != shape or not bool(torch.isfinite(held[name]).all()):
+            raise ValueError(
+                f"{where}: {name} must be finite and of shape {shape}, is not; restore the file, or fit again in "
+                "another folder"
+            )
+    return lifetimes_of(held)
+
+
+def lifetime_rates(config: FitConfig, times: Sequence[float], length: float) -> dict[str, Rate]:
+    """Learning rates of lifetimes; of reference times, which stay as they are, 0.
+
+    Args:
+        config: Configuration of the fit.
+        times: Times of all photographs, sorted.
+        length: Unit of length of the field, world units.
+    """
+    from drgs.dynamics.lives import LIVES
+
+    apart = spacing(times)
+    return {
+        LIVES[0]: _CENTER_RATE * apart,
+        LIVES[1]: _WIDTH_RATE,
+        # They move a Gaussian as far as the rate of the means does, one soon after its reference time, the other late.
+        LIVES[2]: lambda part: means_rate(config, part) * length / (_SOON * apart),
+        LIVES[3]: lambda part: means_rate(config, part) * length / (_LATE * apart) ** 2,
+        REFERENCE_TIMES: 0.0,
+    }
+
+
+def add_new_gaussians(rows: GaussianRows, places: NewGaussians, times: Sequence[float], gate: float, most: int) -> None:
+    """Add Gaussians with a limited lifetime; where there are `most` already, they take the place of the faintest.
+
+    Args:
+        rows: Changed in place; get tensors of lifetimes, by which those that are there already are always there.
+        places: Places, times and velocities of theirs.
+        times: Times of all photographs, sorted.
+        gate: Logit of the gates of those that are added.
+        most: How many Gaussians there may be.
+    """
+    from drgs.dynamics.lives import LIVES
+
+    count = len(places.points)
+    if not count:
+        return
+    if REFERENCE_TIMES not in rows.tensors:
+        for name, x in _unlimited(len(rows), times).items():
+            rows.add_tensor(name, x)
+    new = rows.from_points(places.points, places.colors, _OPACITY).take(torch.arange(count))
+    new["log_scales"] = places.sizes.log()[:, None].repeat(1, 3)
+    new["motion"] = torch.full((count,), gate)
+    moments = places.times.float()
+    began = (moments, _first_widths(places, times).log().float(), places.velocities, places.accelerations)
+    new |= dict(zip(LIVES, began, strict=True))
+    new[REFERENCE_TIMES] = moments
+    for name, x in rows.tensors.items():  # features and view-dependent colors begin at 0
+        if name not in new or new[name].shape[1:] != x.shape[1:]:
+            new[name] = x.new_zeros(count, *x.shape[1:])
+    # What hardly shows gives way. (A choice, which has no gradient.)
+    faint = (rows.tensors["logit_opacities"].detach().sigmoid() < _FAINT).nonzero()[:, 0]
+    room = max(0, min(count, most - len(rows)))
+    taken = faint[: count - room]
+    rows.overwrite(taken, {name: x[room : room + len(taken)] for name, x in new.items()})
+    rows.append({name: x[:room] for name, x in new.items()})
+
+
+def _unlimited(count: int, times: Sequence[float]) -> dict[str, torch.Tensor]:
+    from drgs.dynamics.lives import LASTING, LIVES
+
+    width = torch.tensor(2 * LASTING * (times[-1] - times[0]))
+    still = torch.zeros(count, 3)
+    values = (torch.full((count,), (times[0] + times[-1]) / 2), width.log().repeat(count), still, still)
+    return {**dict(zip(LIVES, values, strict=True)), REFERENCE_TIMES: torch.zeros(count)}
+
+
+def _first_widths(places: NewGaussians, times: Sequence[float]) -> torch.Tensor:
+    """(M,) first widths of lifetimes: standard deviations in time.
+
+    What other times have not confirmed is there at its own; else a time without photographs is to be bridged.
+    """
+    known = torch.tensor(times, dtype=torch.float64)
+    at = (known[None] - places.times.double()[:, None]).abs().argmin(1)
+    apart = torch.cat([torch.zeros(1, dtype=torch.float64), known.diff(), torch.zeros(1, dtype=torch.float64)])
+    gap = torch.maximum(apart[at], apart[at + 1])
+    step = torch.full_like(gap, spacing(times))
+    long = torch.maximum(_WIDTH * step, _GAP * gap)
+    return torch.where(places.confirmed > _CONFIRMED, long, _BRIEF * step)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LifetimeTerm:
+    """What keeps lifetimes long: the mean over Gaussians of the time between photographs over the width of a lifetime,
+    where that is below 1.
+    """
+
+    rows: GaussianRows
+    spacing: float
+    weight: float
+    name: ClassVar[str] = "lives"
+    outputs: ClassVar[tuple[str, ...]] = ()
+
+    def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor | None:
+        """See `LossTerm`; None where all Gaussians are always there."""
+        if REFERENCE_TIMES not in self.rows.tensors:
+            return None
+        from drgs.dynamics.lives import LIVES
+
+        parts = self.spacing * (-self.rows.tensors[LIVES[1]]).exp()
+        # Which are long enough to be lengthened is a choice, which has no derivative.
+        return self.weight * torch.where(parts.detach() < 1, parts, 0).mean()
+
+
+class NewGaussians(NamedTuple):
+    """M places where something is at a time.
+
+    Attributes:
+        points: (M, 3) world.
+        colors: (M, 3) in [0, 1].
+        times: (M,) times at which something is there.
+        velocities: (M, 3) world units in a unit of time.
+        accelerations: (M, 3) what these change by in a unit of time.
+        sizes: (M,) half of how far apart they are, world units.
+        confirmed: (M,) how well photographs of other times agree with where they are then, in [0, 1].
+        photographs: How many photographs show one of them, of all that were found.
+    """
+
+    points: torch.Tensor
+    colors: torch.Tensor
+    times: torch.Tensor
+    velocities: torch.Tensor
+    accelerations: torch.Tensor
+    sizes: torch.Tensor
+    confirmed: torch.Tensor
+    photographs: int
+
+    def take(self, index: torch.Tensor) -> NewGaussians:
+        """Some of them."""
+        return self._replace(**{name: getattr(self, name)[index] for name in self._fields[:-1]})
+
+    @classmethod
+    def joined(cls, several: Sequence[NewGaussians]) -> NewGaussians:
+        """All of them, at least one."""
+        tensors = {name: torch.cat([getattr(part, name) for part in several]) for name in cls._fields[:-1]}
+        return several[0]._replace(**tensors, photographs=sum(part.photographs for part in several))
+
+
+@dataclasses.dataclass
+class _Comparison:
+    """A photograph beside its rendering.
+
+    Attributes:
+        camera: Pinhole of its size.
+        time: Time at which it was taken.
+        maps: (4, H, W): RGB of the photograph, and where it shows something else, in [0, 1].
+        distance: (H, W) to what is rendered; infinite where rays end in nothing.
+        samples: (S, 2) pixels whose depth is searched, (x, y).
+        rays: (S, 3) unit directions.
+        colors: (S, 3).
+        share: Part of its pixels that show something else.
+        center: (3,) of the camera.
+        depth, velocity: (S,) and (S, 3), the best that are known of the samples: distances along rays, and world
+            units in a unit of time.
+        score, confirmed: (S,) how well all photographs agree with these, and those of other times.
+        is_searched: Whether they have been looked for.
+    """
+
+    camera: Camera
+    time: float
+    maps: torch.Tensor
+    distance: torch.Tensor
+    samples: torch.Tensor
+    rays: torch.Tensor
+    colors: torch.Tensor
+    share: float
+    center: torch.Tensor
+    depth: torch.Tensor
+    velocity: torch.Tensor
+    score: torch.Tensor
+    confirmed: torch.Tensor
+    is_searched: bool = False
+
+
+def find_new_gaussians(
+    frames: list[Frame],
+    scene: Scene,
+    settings: RenderSettings,
+    extent: float,
+    most: int,
+    generator: torch.Generator,
+    shown: Callable[[Output, Frame], Output] | None = None,
+    search: Search = Search(),  # noqa: B008
+) -> NewGaussians:
+    """Look for what photographs show and the scene does not.
+
+    Args:
+        frames: Photographs, whose cameras have times.
+        scene: What has been fitted so far.
+        settings: What it is rendered with.
+        extent: Extent of the scene, world units.
+        most: How many places are returned at most, drawn at random from those that are found.
+        generator: Generator of all random choices.
+        shown: What a photograph shows of a rendering; None: the rendering.
+        search: How they are searched for.
+    """
+    means = scene.at(frames[0].camera.time).means.detach()  # how far things are is a constant
+    places = torch.from_numpy(np.stack([frame.camera.center for frame in frames])).to(means)
+    far = float(torch.cdist(places, means).quantile(search.far, dim=1).max())
+    comparisons = []
+    background = _backgrounds(frames, search)
+    with Bar("looking for what moves", (1 + search.iterations) * len(frames)) as bar:
+        for frame, still in zip(frames, background, strict=True):
+            comparisons.append(_compared(frame, still, scene, settings, generator, shown, search))
+            bar.advance()
+        times = np.array([comparison.time for comparison in comparisons])
+        step = spacing([comparison.time for comparison in comparisons])
+        neighbors = [_neighbors(i, comparisons, times, search) for i in range(len(comparisons))]
+        fastest = search.fastest * extent / step
+        for iteration in range(search.iterations):
+            for i, comparison in enumerate(comparisons):
+                if len(comparison.samples):
+                    near = [comparisons[j] for j in neighbors[i]]
+                    _search_round(iteration, comparison, near, far, fastest, generator, search)
+                bar.advance()
+    whole = NewGaussians.joined([_accepted(comparison, search) for comparison in comparisons])
+    whole = _with_trajectories(whole, extent, step, search)
+    count = len(whole.points)
+    if count <= most:
+        return whole
+    drawn = torch.randperm(count, generator=generator)[:most]
+    fewer = whole.take(drawn)
+    return fewer._replace(sizes=fewer.sizes * math.sqrt(count / most))
+
+
+def _accepted(comparison: _Comparison, search: Search) -> NewGaussians:
+    """The places that the pixels of a photograph agree with others about."""
+    good = comparison.score > search.accepted
+    depth, rays, colors = comparison.depth[good], comparison.rays[good], comparison.colors[good]
+    camera = comparison.camera
+    pixels = comparison.share * camera.width * camera.height / max(len(comparison.samples), 1)  # of one sample
+    return NewGaussians(
+        points=comparison.center + depth[:, None] * rays,
+        colors=colors,
+        times=torch.full((len(depth),), comparison.time, dtype=torch.float64),
+        velocities=comparison.velocity[good],
+        accelerations=torch.zeros_like(comparison.velocity[good]),
+        sizes=depth * (math.sqrt(pixels) / 2 / float(camera.K[0, 0])),
+        confirmed=comparison.confirmed[good],
+        photographs=int(good.any()),
+    )
+
+
+def _with_trajectories(places: NewGaussians, extent: float, step: float, search: Search) -> NewGaussians:
+    """With the velocities and accelerations that places of times near theirs agree on.
+
+    Each place predicts where it is at those times. What else is there then, of its color, is a measurement of how far
+    the prediction is off: offset, velocity and acceleration are fitted to all of them, least squares with priors, and
+    the offset is dropped, for what was measured is another place of the same thing.
+    """
+    velocities, accelerations = places.velocities.clone(), places.accelerations.clone()
+    times = places.times
+    late = search.window * step
+    # Of an offset, and of what velocity and acceleration come to at the end of the window, over the noise of a place.
+    ratio = search.reach / search.spread
+    prior = torch.tensor([1.0, ratio, ratio]).square().reciprocal().diag()
+    for time in times.unique():
+        here = (times == time).nonzero()[:, 0]
+        there = ((times - time).abs() < late).nonzero()[:, 0]
+        part = ((times[there] - time) / late).float()
+        expected = places.points[here][:, None] + places.velocities[here][:, None] * (part * late)[None, :, None]
+        off = places.points[there][None] - expected
+        speed = places.velocities[here].norm(dim=1, keepdim=True)
+        same = off.norm(dim=2) < search.spread * extent * 2 + search.turned * speed * (part * late).abs()
+        same &= torch.cdist(places.colors[here], places.colors[there]) < 2 * search.color
+        basis = torch.stack([torch.ones_like(part), part, part.square()], 1)
+        # A time counts once: its photographs show one side of a thing, all places of which are off alike.
+        each = torch.unique(times[there], return_inverse=True)[1]
+        counted = same.float() @ torch.nn.functional.one_hot(each).float()
+        weights = same / counted[:, each].clamp(min=1)
+        weighted = weights[..., None] * basis  # (here, there, 3)
+        normal = weighted.transpose(1, 2) @ basis + prior
+        solved = torch.linalg.solve(normal, weighted.transpose(1, 2) @ off)
+        velocities[here] += solved[:, 1] / late
+        accelerations[here] = 2 * solved[:, 2] / late**2
+    return places._replace(velocities=velocities, accelerations=accelerations)
+
+
+def _reduced(frame: Frame, search: Search) -> torch.Tensor:
+    """(3, H, W) of a photograph, at the size at which photographs are compared."""
+    width, height = reduced_size(frame.camera, search.pixels)
+    return interpolate(frame.image().permute(2, 0, 1)[None], (height, width), mode="area")[0]
+
+
+def _backgrounds(frames: list[Frame], search: Search) -> list[torch.Tensor | None]:
+    """(3, H, W) of each photograph, what its camera sees at most times; None where it took fewer than 4 from there."""
+    groups: dict[bytes, list[int]] = {}
+    for i, frame in enumerate(frames):
+        camera = frame.camera
+        key = np.concatenate([camera.w2c.ravel(), camera.K.ravel(), (camera.width, camera.height)])
+        groups.setdefault(key.round(6).tobytes(), []).append(i)
+    background: list[torch.Tensor | None] = [None] * len(frames)
+    for listed in groups.values():
+        if len(listed) >= search.background_photographs:
+            median = torch.stack([_reduced(frames[i], search) for i in listed]).median(0).values
+            for i in listed:
+                background[i] = median
+    return background
+
+
+def _compared(
+    frame: Frame,
+    background: torch.Tensor | None,
+    scene: Scene,
+    settings: RenderSettings,
+    generator: torch.Generator,
+    shown: Callable[[Output, Frame], Output] | None,
+    search: Search,
+) -> _Comparison:
+    """A photograph beside its rendering, and the pixels whose depth is to be searched."""
+    width, height = reduced_size(frame.camera, search.pixels)
+    camera = frame.camera.resized(width, height)
+    with torch.no_grad():  # looked at
+        out = render(colors_only(scene, camera.time), camera, settings, outputs=("depth",))
+        if shown is not None:
+            out = shown(out, frame)
+    rgb = out.rgb.cpu().clamp(0, 1).permute(2, 0, 1)
+    image = _reduced(frame, search)
+    assert out.depth is not None  # asked for
+    assert camera.time is not None  # a fit to what moves
+    distance = torch.where(out.alpha.cpu() > _SOLID, out.depth.cpu(), torch.inf)
+    rays = torch.from_numpy(camera.pixel_directions()).reshape(height, width, 3).float()
+    if settings.planar and settings.depth_key == "z":
+        distance = distance / (rays @ torch.from_numpy(camera.c2w[:3, 2]).float())
+    residual = avg_pool2d((image - rgb).abs().mean(0)[None], 3, 1, 1)[0]
+    other = residual > search.difference
+    if background is not None:
+        other &= avg_pool2d((image - background).abs().mean(0)[None], 3, 1, 1)[0] > search.difference
+    if frame.mask is not None:
+        other &= interpolate(frame.mask[None, None], (height, width), mode="area")[0, 0] > _SOLID
+    # What is thinner than three pixels is an edge that is not sharp yet.
+    core = -max_pool2d(-other.float()[None], 3, 1, 1)
+    other = (max_pool2d(core, 3, 1, 1)[0] > 0) & other
+    where = other.nonzero()
+    if len(where):
+        where = where[torch.randperm(len(where), generator=generator)[: search.samples]]
+    rows, columns = where[:, 0], where[:, 1]
+    return _Comparison(
+        camera=camera,
+        time=camera.time,
+        maps=torch.cat([image, other.float()[None]]),
+        distance=distance,
+        samples=torch.stack([columns, rows], 1),
+        rays=rays[rows, columns],
+        colors=image[:, rows, columns].T.contiguous(),
+        share=float(other.float().mean()),
+        center=torch.from_numpy(camera.center).float(),
+        depth=torch.zeros(len(where)),
+        velocity=torch.zeros(len(where), 3),
+        score=torch.zeros(len(where)),
+        confirmed=torch.zeros(len(where)),
+    )
+
+
+def _neighbors(i: int, comparisons: list[_Comparison], times: np.ndarray, search: Search) -> list[int]:
+    """Photographs that the pixels of one are compared with: of its time, and nearest in time."""
+    apart = np.abs(times - times[i])
+    centers = np.stack([comparison.camera.center for comparison in comparisons])
+    beside = np.linalg.norm(centers - centers[i], axis=1)
+    order = np.lexsort((beside, apart))
+    same = [j for j in order if apart[j] == 0 and j != i][: search.same_time]
+    other = [j for j in order if apart[j] > 0][: search.other_times]
+    return [*same, *other]
+
+
+def _search_round(
+    iteration: int,
+    comparison: _Comparison,
+    neighbors: list[_Comparison],
+    far: float,
+    fastest: float,
+    generator: torch.Generator,
+    search: Search,
+) -> None:
+    """Try other depths and velocities for the pixels of a photograph, and keep what agrees better."""
+    samples = len(comparison.samples)
+    x, y = comparison.samples[:, 0], comparison.samples[:, 1]
+    end = comparison.distance[y, x].clamp(max=far)
+    rand = lambda *shape: torch.rand(*shape, generator=generator)  # noqa: E731
+    randn = lambda *shape: torch.randn(*shape, generator=generator)  # noqa: E731
+    depths = [end[:, None] * (search.least_depth + (1 - search.least_depth) * rand(samples, search.random))]
+    speed = fastest * 10 ** (-search.decades * rand(samples, search.random, 1))
+    speed = speed * (rand(samples, search.random, 1) > search.resting)
+    direction = torch.nn.functional.normalize(randn(samples, search.random, 3), dim=-1)
+    velocities = [speed * direction]
+    if comparison.is_searched:
+        depth, velocity = comparison.depth[:, None], comparison.velocity[:, None]
+        depths.append(depth)
+        velocities.append(velocity)
+        scale = search.change * 0.5 ** (iteration - 1)
+        depths.append(depth * (scale * randn(samples, search.changed)).exp())
+        # Most changes of a velocity are small ones.
+        change = scale * fastest * randn(samples, search.changed, 3)
+        velocities.append(velocity + change * rand(samples, search.changed, 1) ** 3)
+        others = torch.randint(samples, (samples, search.neighbors), generator=generator)
+        depths.append(comparison.depth[others])
+        velocities.append(comparison.velocity[others])
+        taken = _propagated(comparison, neighbors, search)
+        if taken is not None:
+            depths.append(taken[0])
+            velocities.append(taken[1])
+    depth = torch.cat(depths, 1).clamp(min=1e-3 * far)
+    depth = torch.minimum(depth, end[:, None])
+    velocity = torch.cat(velocities, 1)
+    score, confirmed = _agreement(comparison, depth, velocity, neighbors, fastest, search)
+    best = score.argmax(1)
+    rows = torch.arange(samples)
+    comparison.depth, comparison.velocity = depth[rows, best], velocity[rows, best]
+    comparison.score, comparison.confirmed = score[rows, best], confirmed[rows, best]
+    comparison.is_searched = True
+
+
+def _propagated(
+    comparison: _Comparison, neighbors: list[_Comparison], search: Search
+) -> tuple[torch.Tensor, torch.Tensor] | None:
+    """(S, T) depths and (S, T, 3) velocities that pixels of other photographs have, of those seen nearest to each."""
+    points, velocities = [], []
+    for other in neighbors:
+        good = other.score > search.propagated
+        place = other.center + other.depth[:, None] * other.rays + other.velocity * (comparison.time - other.time)
+        points.append(place[good])
+        velocities.append(other.velocity[good])
+    place, speed = torch.cat(points), torch.cat(velocities)
+    projected, depth = comparison.camera.project(place.double().numpy())
+    front = torch.from_numpy(depth > 0)
+    if not front.any():
+        return None
+    place, speed, pixels = place[front], speed[front], torch.from_numpy(projected)[front]
+    apart = torch.cdist(comparison.samples.double() + 0.5, pixels)
+    nearest = apart.topk(min(search.neighbors, len(place)), dim=1, largest=False).indices
+    return (place[nearest] - comparison.center).norm(dim=-1), speed[nearest]
+
+
+def _agreement(
+    comparison: _Comparison,
+    depth: torch.Tensor,
+    velocity: torch.Tensor,
+    neighbors: list[_Comparison],
+    fastest: float,
+    search: Search,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """How well other photographs agree with depths (S, T) and velocities (S, T, 3) of the pixels of one.
+
+    Returns:
+        (S, T) part of the photographs that agree, of the same time where enough of these show the place, else of all;
+        (S, T) the part of those of other times.
+    """
+    start = comparison.center + depth[..., None] * comparison.rays[:, None]
+    agreed, shown = torch.zeros(2, *depth.shape), torch.zeros(2, *depth.shape)  # at the same time, at others
+    for other in neighbors:
+        is_later = int(other.time != comparison.time)
+        place = start + velocity * (other.time - comparison.time)
+        camera = other.camera
+        pixels, ahead = camera.project(place.reshape(-1, 3).double().numpy())
+        size = np.array([camera.width, camera.height])
+        where = torch.from_numpy(2 * pixels / size - 1).float().reshape(*depth.shape, 2)
+        inside = torch.from_numpy(ahead > 0).reshape(depth.shape) & (where.abs() < 1).all(-1)
+        maps = torch.cat([other.maps, other.distance.clamp(max=_NOTHING)[None]])[None]
+        sampled = grid_sample(maps, where.nan_to_num(2.0).clamp(-2, 2)[None], align_corners=False)[0]
+        away = (place - other.center).norm(dim=-1)
+        inside &= sampled[4] > search.occluded * away  # else something stands before it
+        difference = (sampled[:3].permute(1, 2, 0) - comparison.colors[:, None]).square().sum(-1)
+        same = sampled[3] * torch.exp(-0.5 * difference / search.color**2)
+        agreed[is_later] += torch.where(inside, same, 0.0)
+        shown[is_later] += inside
+    # One more that does not agree: a place that many see is better than one that few do, where as large a part agrees.
+    now, confirmed = agreed / (shown + 1)
+    everything = torch.where(shown.sum(0) >= search.fewest, agreed.sum(0) / (shown.sum(0) + 1), 0.0)
+    score = torch.where(shown[0] >= search.enough, now + search.minor * confirmed, everything)
+    return score - search.minor * velocity.norm(dim=-1) / fastest, confirmed

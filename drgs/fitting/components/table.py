@@ -1,0 +1,38 @@
+"""The table of components: a name and a class each. Another package adds a row by the entry point `drgs.components`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from drgs.fitting.components.base import Component
+from drgs.guards.registry import Registry
+
+__all__ = ["COMPONENTS", "components_of"]
+
+_HERE = "drgs.fitting.components"
+
+COMPONENTS: Registry[type[Component]] = Registry(
+    "component",
+    "drgs.components",
+    {
+        # In the order in which their methods are called. The lens says what photographs are; terms of the loss are
+        # added up in this order; a pose is looked at with the colors that an exposure then scales; lifespans belong to
+        # what motion has begun.
+        "lens": f"{_HERE}.lens:LensComponent",
+        "filter_3d": f"{_HERE}.filter_3d:Filter3DComponent",
+        "skybox": f"{_HERE}.skybox:SkyboxComponent",
+        "semantics": f"{_HERE}.semantics:SemanticsComponent",
+        "poses": f"{_HERE}.poses:PosesComponent",
+        "exposure": f"{_HERE}.exposure:ExposureComponent",
+        "transients": f"{_HERE}.transients:TransientsComponent",
+        "motion": f"{_HERE}.motion:MotionComponent",
+        "lifespans": f"{_HERE}.lifespans:LifespansComponent",
+    },
+    row=type,
+)
+"""Name -> class of everything that a fit may have besides photographs and Gaussians."""
+
+
+def components_of(kinds: Sequence[Callable[[], Component]] | None = None) -> list[Component]:
+    """New instances for a fit; `kinds`: what makes them, default all rows of the table."""
+    return [kind() for kind in (COMPONENTS.values() if kinds is None else kinds)]
