@@ -172,6 +172,5 @@ def _shown_points(frames: list[Frame], points: np.ndarray) -> np.ndarray:
     is_shown = np.zeros(len(points), bool)
     for frame in frames:
         pixels, depth = frame.camera.project(points)
-        size = frame.camera.width, frame.camera.height
-        is_shown |= (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)
+        is_shown |= frame.camera.contains(pixels, depth)
     return np.flatnonzero(is_shown)
