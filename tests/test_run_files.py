@@ -163,8 +163,8 @@ _WRITERS = {
     "commands/teach.py": {"teach.json", "classes.json"},
     "commands/tradeoff.py": {"tradeoff.json"},
     "data/camera_lists.py": {"cameras.json"},
-    "data/gathering.py": {"frames.json"},
-    "data/held_out.py": {"held_out.json"},
+    "sfm/image_folder.py": {"frames.json"},
+    "data/dataset.py": {"held_out.json"},
     "io/run.py": {"config.json", "env.json", "log.jsonl"},
     "fitting/active.py": {"selection.json"},
     "metrics.py": {"metrics.json"},
@@ -175,7 +175,7 @@ _OTHERS = {
     "codecs/sog.py",  # the index in a .sog
     "commands/info.py",  # stdout
     "commands/report.py",  # options on a line of a report
-    "data/flight_files.py",  # flight.json: docs/view.md
+    "data/camera_path.py",  # flight.json: docs/view.md
     "data/reader_process.py",  # between processes
     "io/checkpoint.py",  # the header of a checkpoint
     "io/journal.py",  # lines of log.jsonl, rows.jsonl, .drgs.jsonl
