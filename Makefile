@@ -65,7 +65,7 @@ smoke: setup
 	$(BIN)/drgs demo --quick -o out/smoke
 	$(BIN)/drgs eval out/smoke/run
 	$(BIN)/drgs report out/smoke/run -o out/smoke/report.html
-	if $(BIN)/python -c 'from drgs.sharing.npm import viewer_files; viewer_files()'; then \
+	if $(BIN)/python -c 'from drgs.pages.sharing.npm import viewer_files; viewer_files()'; then \
 	  $(BIN)/drgs share out/smoke/run -o out/smoke/scene.html; \
 	else echo "no page: the viewer's code could not be fetched from npm"; fi
 	$(BIN)/drgs cite out/smoke/run

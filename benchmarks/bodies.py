@@ -39,9 +39,9 @@ from drgs.display.pictures import write_png  # noqa: E402
 from drgs.ellipsoids import Y_00  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.fitting.frames import Frame, load_frames  # noqa: E402
+from drgs.fitting.metrics import psnr  # noqa: E402
 from drgs.fitting.records import load_run  # noqa: E402
 from drgs.integrator import render  # noqa: E402
-from drgs.metrics import psnr  # noqa: E402
 from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
 from drgs.train import fit  # noqa: E402
 

@@ -29,12 +29,12 @@ import torch  # noqa: E402
 from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
+from drgs.cameras.sizes import at_most  # noqa: E402
 from drgs.codecs import load_gaussians, save_gaussians  # noqa: E402
 from drgs.commands.options import Share  # noqa: E402
 from drgs.commands.share import shared_of  # noqa: E402
 from drgs.integrator import render  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.sizes import at_most  # noqa: E402
 from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "codecs.jsonl"

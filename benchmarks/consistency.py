@@ -33,9 +33,9 @@ from drgs.cameras import Camera  # noqa: E402
 from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.fitting.frames import Frame, frames_for  # noqa: E402
+from drgs.fitting.metrics import psnr  # noqa: E402
 from drgs.fitting.renderers import renderers_to_measure  # noqa: E402
 from drgs.integrator import Output, render  # noqa: E402
-from drgs.metrics import psnr  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "consistency.jsonl"

@@ -43,6 +43,7 @@ import torch_rays  # noqa: E402
 
 import drgs  # noqa: E402
 from drgs.cameras import Camera  # noqa: E402
+from drgs.cameras.sizes import at_most  # noqa: E402
 from drgs.commands.orbits import Wish, scene_orbit  # noqa: E402
 from drgs.data import load as load_data  # noqa: E402
 from drgs.ellipsoids import Gaussians  # noqa: E402
@@ -51,7 +52,6 @@ from drgs.lab.crossval import VERDICTS, crops, crossval  # noqa: E402
 from drgs.lab.parameters import PARAMETERS, POSE_END, raw_of, with_pose  # noqa: E402
 from drgs.lab.rasterizers import cotangents, function, load_rasterizer  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.sizes import at_most  # noqa: E402
 from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
 from drgs.testing import random_scene  # noqa: E402
 

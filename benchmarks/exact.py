@@ -31,8 +31,8 @@ from where import DATA, ran  # noqa: E402
 
 import drgs  # noqa: E402
 from drgs import data, fisher  # noqa: E402
+from drgs.cameras.sizes import at_most, cropped  # noqa: E402
 from drgs.runtime.machine import peak_memory  # noqa: E402
-from drgs.sizes import at_most, cropped  # noqa: E402
 from drgs.studies.tables import markdown_table, paragraph  # noqa: E402
 from drgs.train import FitConfig, fit  # noqa: E402
 

@@ -16,9 +16,9 @@ from drgs.ellipsoids import Gaussians
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import Frame, frames_for
 from drgs.fitting.losses import LossTerm
+from drgs.fitting.metrics import through_renderers
 from drgs.fitting.renderers import RendererSchedule
 from drgs.fitting.start import start_plain
-from drgs.metrics import through_renderers
 from drgs.settings import RenderSettings
 
 __all__ = ["Fit", "fitted", "psnr_by_renderer", "split_of"]

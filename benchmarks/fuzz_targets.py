@@ -16,7 +16,7 @@ import fuzz_codecs as codecs
 import fuzz_seeds as seeds
 from fuzz_formats import mutate
 
-from drgs.guards.arguments import ArgumentError
+from drgs.checks.arguments import ArgumentError
 
 __all__ = ["TARGETS", "Bench", "Target", "fault_of"]
 
@@ -212,7 +212,7 @@ def _video(folder: Path) -> None:
 def _run(folder: Path) -> None:
     from drgs.files import Run
     from drgs.fitting.records import fitted_views, is_run, load_run
-    from drgs.report.account import account_of
+    from drgs.pages.report.account import account_of
 
     run = Run(folder)
     is_run(folder)

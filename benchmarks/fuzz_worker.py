@@ -39,8 +39,8 @@ LIMIT = 6 << 30
 SLOW = 5.0
 """Seconds of processor time that an input may take."""
 WATCHED = [
-    *("drgs.codecs", "drgs.data", "drgs.guards", "drgs.files", "drgs.features.teacher", "drgs.features.decoder"),
-    *("drgs.fitting.records", "drgs.report.account", "drgs.lab.rasterizers"),
+    *("drgs.codecs", "drgs.data", "drgs.checks", "drgs.io", "drgs.features.teacher", "drgs.features.decoder"),
+    *("drgs.fitting.records", "drgs.pages.report.account", "drgs.lab.rasterizers"),
 ]
 """Modules whose lines atheris watches."""
 _NEWS = 2.0  # seconds between counts

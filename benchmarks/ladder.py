@@ -26,6 +26,7 @@ from studies import ROOT
 
 import drgs
 from drgs.cameras import intrinsics_from_fov
+from drgs.cameras.sizes import at_most
 from drgs.commands.orbits import Wish, scene_orbit
 from drgs.commands.viewpoints import evenly
 from drgs.data import load
@@ -34,7 +35,6 @@ from drgs.fitting.records import fit_record
 from drgs.lab.ladder import Pictures, ladder
 from drgs.lab.parameters import PARAMETERS
 from drgs.settings import RenderSettings
-from drgs.sizes import at_most
 from drgs.studies.tables import fill_between, markdown_table, paragraph
 
 FOVS = (20, 45, 70, 95, 120)

@@ -29,10 +29,10 @@ from where import ran  # noqa: E402
 import drgs  # noqa: E402
 from drgs import fisher  # noqa: E402
 from drgs.cameras import Camera, orbit  # noqa: E402
+from drgs.cameras.sizes import at_most  # noqa: E402
 from drgs.display import tables  # noqa: E402
 from drgs.fisher import Nuisances  # noqa: E402
 from drgs.select import select  # noqa: E402
-from drgs.sizes import at_most  # noqa: E402
 
 KINDS = {
     "none": Nuisances(),

@@ -28,12 +28,12 @@ from studies import rank_correlation, write_csv  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
 from drgs.cameras import Camera  # noqa: E402
+from drgs.cameras.sizes import at_most  # noqa: E402
 from drgs.data import load  # noqa: E402
 from drgs.ellipsoids import Scene  # noqa: E402
 from drgs.fitting.records import load_run  # noqa: E402
 from drgs.select import Scoring, select  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.sizes import at_most  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "picks.jsonl"
 CSV = ROOT / "docs" / "data" / "moving-picks.csv"

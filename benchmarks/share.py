@@ -31,15 +31,15 @@ import torch  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
 from drgs.cameras import Camera  # noqa: E402
+from drgs.cameras.sizes import reduced_size  # noqa: E402
 from drgs.codecs import load_gaussians  # noqa: E402
 from drgs.codecs.sog import encode_sog  # noqa: E402
 from drgs.commands.options import Share  # noqa: E402
 from drgs.commands.share import shared_of  # noqa: E402
 from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.integrator import render  # noqa: E402
+from drgs.pages.sharing.write import write_page  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.sharing.write import write_page  # noqa: E402
-from drgs.sizes import reduced_size  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "share.jsonl"

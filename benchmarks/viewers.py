@@ -63,10 +63,10 @@ from drgs.cameras import Camera  # noqa: E402
 from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.files import Run, load_ply  # noqa: E402
 from drgs.fitting.frames import Frame, frames_for, load_dataset  # noqa: E402
+from drgs.fitting.metrics import psnr  # noqa: E402
 from drgs.fitting.records import load_run  # noqa: E402
 from drgs.fitting.renderers import ANY  # noqa: E402
 from drgs.integrator import render  # noqa: E402
-from drgs.metrics import psnr  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.studies.tables import fill_between  # noqa: E402
 from drgs.viewing.client import ClientGaussians, pose_of  # noqa: E402

@@ -62,37 +62,36 @@ _MODULES = {
     "cli": "cli",
     "cluster": "cluster",
     "codecs": "codecs",
-    "crossval": "crossval",
+    "crossval": "lab.crossval",
     "data": "data",
     "deform": "deform",
     "display": "display",
     "dynamics": "dynamics",
     "ellipsoids": "ellipsoids",
-    "evaluation": "evaluation",
+    "evaluation": "fitting.evaluation",
     "features": "features",
     "files": "files",
     "fisher": "fisher",
     "fitting": "fitting",
     "gain": "gain",
-    "guards": "guards",
     "information": "information",
     "integrator": "integrator",
     "lab": "lab",
-    "ladder": "ladder",
+    "ladder": "lab.ladder",
     "meshing": "meshing",
-    "metrics": "metrics",
+    "metrics": "fitting.metrics",
     "oracle": "oracle",
     "planner": "planner",
     "plugin": "plugin",
     "rasterize": "rasterize",
     "reference": "reference",
-    "report": "report",
+    "report": "pages.report",
     "select": "select",
     "selection": "selection",
     "settings": "settings",
     "sfm": "sfm",
-    "sharing": "sharing",
-    "shutters": "shutters",
+    "sharing": "pages.sharing",
+    "shutters": "cameras.shutters",
     "splats": "splats",
     "studies": "studies",
     "testing": "testing",
@@ -143,32 +142,24 @@ if TYPE_CHECKING:
     from drgs import cli as cli
     from drgs import cluster as cluster
     from drgs import codecs as codecs
-    from drgs import crossval as crossval
     from drgs import data, deform, fisher, gain, reference, select
     from drgs import display as display
     from drgs import dynamics as dynamics
     from drgs import ellipsoids as ellipsoids
-    from drgs import evaluation as evaluation
     from drgs import features as features
     from drgs import files as files
     from drgs import fitting as fitting
-    from drgs import guards as guards
     from drgs import information as information
     from drgs import integrator as integrator
     from drgs import lab as lab
-    from drgs import ladder as ladder
     from drgs import meshing as meshing
-    from drgs import metrics as metrics
     from drgs import oracle as oracle
     from drgs import planner as planner
     from drgs import plugin as plugin
     from drgs import rasterize as rasterize
-    from drgs import report as report
     from drgs import selection as selection
     from drgs import settings as settings
     from drgs import sfm as sfm
-    from drgs import sharing as sharing
-    from drgs import shutters as shutters
     from drgs import splats as splats
     from drgs import studies as studies
     from drgs import testing as testing
@@ -176,6 +167,7 @@ if TYPE_CHECKING:
     from drgs import train as train
     from drgs import viewing as viewing
     from drgs.cameras import Camera
+    from drgs.cameras import shutters as shutters
     from drgs.codecs import load_gaussians, save_gaussians
     from drgs.data import Dataset, View
     from drgs.data import load as load_data
@@ -183,10 +175,16 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.files import load_ply, save_ply
     from drgs.fisher import diagonal
+    from drgs.fitting import evaluation as evaluation
+    from drgs.fitting import metrics as metrics
     from drgs.fitting.records import load_run
     from drgs.gain import Prior
     from drgs.integrator import render, render_jvp
+    from drgs.lab import crossval as crossval
+    from drgs.lab import ladder as ladder
     from drgs.oracle import volume as volume
+    from drgs.pages import report as report
+    from drgs.pages import sharing as sharing
     from drgs.planner import Planner
     from drgs.rasterize import rasterization
     from drgs.select import Scoring, Selection

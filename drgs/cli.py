@@ -17,10 +17,10 @@ import sys
 from typing import Any, TextIO
 
 import drgs
+from drgs.checks.records import nearest
 from drgs.commands.command_line import command_list, help_page, parsed_options
 from drgs.commands.options import COMMANDS, Common
 from drgs.display.progress import Bar
-from drgs.guards.records import nearest
 from drgs.io import interrupts
 
 __all__ = ["main"]
@@ -59,7 +59,7 @@ def main(argv: list[str] | None = None) -> int:
         _complain(name, str(error) or type(error).__name__)
         return 2
     except (MemoryError, RuntimeError) as error:
-        from drgs.guards.memory import is_out_of_memory
+        from drgs.runtime.memory import is_out_of_memory
 
         if args.debug or not is_out_of_memory(error):
             raise

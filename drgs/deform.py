@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 import torch
 
+from drgs.checks.arguments import ArgumentError, must_be
+from drgs.checks.derivatives import ends_of
 from drgs.dynamics.hexplane import HexPlane, corners_of, features, product
 from drgs.dynamics.jacobian import scene_jacobian
 from drgs.dynamics.lives import LIVES, Lives, drift, living, logit_at
 from drgs.ellipsoids import Gaussians
-from drgs.guards.arguments import ArgumentError, must_be
-from drgs.guards.derivatives import ends_of
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 import torch
 
-from drgs.guards.arguments import ArgumentError, kind_of, must_be
-from drgs.guards.derivatives import check_has_numbers, ends_of
+from drgs.checks.arguments import ArgumentError, kind_of, must_be
+from drgs.checks.derivatives import check_has_numbers, ends_of
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

@@ -27,8 +27,8 @@ from typing import Unpack
 import torch
 
 from drgs.cameras import Camera
+from drgs.checks.arguments import ArgumentError, must_be
 from drgs.ellipsoids import Scene
-from drgs.guards.arguments import ArgumentError, must_be
 from drgs.information.backdrop import BACKDROP, Backdrop, Sphere, backdrop_sphere
 from drgs.information.choices import METHODS, Method, NetworkEstimate
 from drgs.information.columns import PoseInformation, jacobian_columns

@@ -18,8 +18,8 @@ import torch
 
 from drgs import runtime
 from drgs.cameras import Camera, cameras_of_one_size
+from drgs.checks.arguments import ArgumentError, kind_of, must_be
 from drgs.ellipsoids import DeformableScene, Gaussians, Scene
-from drgs.guards.arguments import ArgumentError, kind_of, must_be
 from drgs.settings import RenderSettings
 from drgs.tracing.bridge import differentiable
 from drgs.tracing.call import Call, Output
@@ -198,7 +198,7 @@ def render_with_offsets(
         mean_absolute: (N, 2) zeros; what a backward pass gives as their gradient is the sum over all pixels of the
             absolute value of each pixel's gradient by the projected means (Ye et al. 2024, AbsGS).
         strains: (N, 6) zeros, the elements xx, xy, xz, yy, yz, zz of a symmetric E that stretches each Gaussian by
-            I + E along its own axes: `drgs.covariances.factors`.
+            I + E along its own axes: `drgs.splats.covariances.factors`.
     """
     check_view("render", gaussians, camera, settings)
     call = Call(

@@ -40,12 +40,13 @@ import torch
 
 from drgs import runtime
 from drgs.cameras import Camera, camera_list
+from drgs.cameras.checks import as_numpy
+from drgs.cameras.sizes import at_most
+from drgs.checks.arguments import ArgumentError, check_path, kind_of, must_be
 from drgs.ellipsoids import Gaussians
 from drgs.fitting.config import FitConfig
 from drgs.fitting.online import OnlineFit
 from drgs.gain import Information
-from drgs.guards.arguments import ArgumentError, check_path, kind_of, must_be
-from drgs.guards.camera_checks import as_numpy
 from drgs.io import atomic
 from drgs.io.checkpoint import load_state, save_state, state_header
 from drgs.io.json_files import check_json, parse_json
@@ -55,7 +56,6 @@ from drgs.selection.informed import compute_candidates
 from drgs.selection.pool import Pick, Pool, Selection
 from drgs.selection.refining import Refine
 from drgs.settings import RenderSettings
-from drgs.sizes import at_most
 
 __all__ = ["Cost", "PlannedView", "Planner", "ViewPlan", "default_config"]
 

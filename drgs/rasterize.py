@@ -20,14 +20,14 @@ import numpy as np
 import torch
 
 from drgs.cameras import Camera
-from drgs.covariances import factors, strained
+from drgs.cameras.shutters import SHUTTERS
+from drgs.checks.arguments import ArgumentError
 from drgs.ellipsoids import Y_00, semi_axes
-from drgs.guards.arguments import ArgumentError
 from drgs.integrator import render_normals, render_with_offsets
 from drgs.runtime import uncompiled
 from drgs.settings import EPS_ALPHA, RenderSettings
-from drgs.shutters import SHUTTERS
 from drgs.splats import Splats, cameras_of, check_shapes, inside, inside_opacities
+from drgs.splats.covariances import factors, strained
 from drgs.tracing.harmonics import higher_harmonics
 from drgs.tracing.pose import rigid_pose
 from drgs.tracing.shutter import middle_pose

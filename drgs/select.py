@@ -25,8 +25,8 @@ from typing import Any
 import torch
 
 from drgs.cameras import Camera, camera_list
+from drgs.checks.arguments import must_be
 from drgs.ellipsoids import Scene, check_any_scene
-from drgs.guards.arguments import must_be
 from drgs.information.choices import METHODS, POLICIES
 from drgs.information.criteria import CRITERIA
 from drgs.information.inputs import Masks, mask_list

@@ -12,8 +12,8 @@ import typing
 from collections.abc import Iterable
 from typing import Any, Literal
 
-from drgs.guards.arguments import check_fields, must_be
-from drgs.guards.registry import Registry
+from drgs.checks.arguments import check_fields, must_be
+from drgs.checks.registry import Registry
 
 __all__ = ["EPS_ALPHA", "PRESETS", "RESPONSES", "Preset", "RenderSettings", "check_settings", "legal"]
 

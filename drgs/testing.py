@@ -41,9 +41,9 @@ def assert_matches(
         cameras: Views of the scene; both are given, or none.
         preset: Preset that it claims to compute, or `auto`.
         background: RGB of the background; black hides what happens to its gradient.
-        allow: Verdicts (drgs.crossval.VERDICTS) besides `agreement` that pass.
+        allow: Verdicts (drgs.lab.crossval.VERDICTS) besides `agreement` that pass.
         seeds: Seeds of the random scenes.
-        options: Further arguments of `drgs.crossval.crossval`.
+        options: Further arguments of `drgs.lab.crossval.crossval`.
     Returns:
         A `Result` a scene.
     Raises:

@@ -17,12 +17,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from drgs import metrics, runtime
+from drgs import runtime
 from drgs.codecs.ply import save_ply
 from drgs.data.view_checks import check_cameras, check_parallax
 from drgs.display.pictures import file_names, write_png
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
+from drgs.fitting import metrics
 from drgs.fitting.active import ActiveViews
 from drgs.fitting.components.base import Component, Setup, check_conflicts
 from drgs.fitting.components.table import components_of
@@ -45,13 +46,13 @@ from drgs.fitting.stages import fitted_times
 from drgs.fitting.start import start
 from drgs.fitting.threads import fewer_torch_threads, one_thread
 from drgs.fitting.trainer import StepResult, Trainer
-from drgs.guards.memory import is_out_of_memory
 from drgs.integrator import render
 from drgs.io import interrupts
 from drgs.io.checkpoint import save_state
 from drgs.io.outputs import lock_folder
 from drgs.io.run import Run
 from drgs.runtime.machine import peak_memory
+from drgs.runtime.memory import is_out_of_memory
 
 if TYPE_CHECKING:
     from drgs.data import Dataset
@@ -342,7 +343,7 @@ class _Loop:
         self._saved_at = time.monotonic()
 
     def measured(self, pictures: Path | None = None) -> dict:
-        """Metrics of the held-out views as things are now; `pictures` as of `drgs.metrics.evaluate`."""
+        """Metrics of the held-out views as things are now; `pictures` as of `drgs.fitting.metrics.evaluate`."""
         trainer = self.trainer
         options: dict[str, Any] = {}
         for component in trainer.components:

@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 
 import drgs
-from drgs.sizes import at_most
+from drgs.cameras.sizes import at_most
 
 CANDIDATES = 30  # places, at most, that are compared at a time
 

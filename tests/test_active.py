@@ -14,10 +14,11 @@ import torch
 from test_data import HEIGHT, WIDTH, gradient, poses, save, write_colmap, write_image, write_llff, write_transforms
 
 import drgs
-from drgs import cli, metrics
+from drgs import cli
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, orbit
 from drgs.data import load
 from drgs.files import Run, load_state
+from drgs.fitting import metrics
 from drgs.fitting.active import ActiveViews
 from drgs.fitting.config import SelectionConfig
 from drgs.fitting.frames import load_frames
@@ -413,8 +414,8 @@ def test_scores_know_masks(still, tmp_path, monkeypatch, mask, empty):
 
 
 def test_held_out_views_are_measured_on_the_way(still, tmp_path, monkeypatch):
-    """At the numbers of views that are asked for, just before the next pick: as drgs.metrics measures that model; the
-    fit is the same to the bit, and one that is killed between measuring and saving ends alike.
+    """At the numbers of views that are asked for, just before the next pick: as drgs.fitting.metrics measures that
+    model; the fit is the same to the bit, and one that is killed between measuring and saving ends alike.
     """
     how, pick, left, own = config(deterministic=True), ActiveViews.pick, [2], []
     plain = fit(lazily(still), tmp_path / "plain", how.replace(selection=plan()), progress=False)

@@ -34,8 +34,8 @@ from drgs.data.images import can_hold, image_size, is_whole, read_image, stated_
 from drgs.features.decoder import Decoder, load_decoder, save_decoder
 from drgs.features.teacher import read_map
 from drgs.files import Run
+from drgs.fitting.metrics import _read_weights
 from drgs.lab.rasterizers import read_dump
-from drgs.metrics import _read_weights
 
 pytestmark = pytest.mark.core
 

@@ -12,9 +12,9 @@ import torch
 import drgs
 from drgs import runtime
 from drgs.cameras import orbit
+from drgs.checks import registry
 from drgs.fitting.config import SelectionConfig
 from drgs.gain import CRITERIA, Prior, ViewCriterion, criterion_named, information_gain, scorer
-from drgs.guards import registry
 from drgs.information.blocks import ImageBlock, SceneBlocks
 from drgs.information.choices import BLOCK_NAMES, BLOCKS, CRITERION_NAMES, GAUSSIAN_GROUPS, POLICIES, POLICY_NAMES
 from drgs.information.groups import GROUPS

@@ -35,7 +35,7 @@ from drgs.data.dataset import HELD_OUT, write_held_out
 from drgs.display.progress import Bar, duration
 from drgs.files import Run, load_state
 from drgs.fitting.config import FitConfig
-from drgs.sharing import npm
+from drgs.pages.sharing import npm
 from drgs.train import SelectionConfig, Trainer, fit
 
 pytest.importorskip("pycolmap")

@@ -30,13 +30,13 @@ from drgs.fitting.components.table import COMPONENTS
 from drgs.fitting.config import SelectionConfig
 from drgs.fitting.density import add_gaussians, relocate
 from drgs.fitting.frames import Frame, load_frames
+from drgs.fitting.metrics import evaluate
 from drgs.fitting.networks import Network, saved_networks
 from drgs.fitting.records import check_checkpoint, load_run
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.trainer import StepResult, Trainer
 from drgs.integrator import render
 from drgs.io.checkpoint import load_state, save_state
-from drgs.metrics import evaluate
 from drgs.select import select
 from drgs.train import fit
 

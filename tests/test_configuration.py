@@ -10,10 +10,10 @@ import sys
 import pytest
 
 from drgs import cli
+from drgs.checks.records import options_in, part_of
 from drgs.commands.command_line import HEADINGS, config_fields, help_page, written
 from drgs.commands.values import ORBIT_KEYS, parsed_orbit
 from drgs.fitting.config import FitConfig, SelectionConfig
-from drgs.guards.records import options_in, part_of
 from drgs.information.prior import Prior
 from drgs.settings import RenderSettings
 

@@ -11,8 +11,8 @@ from test_rasterize_rays import oracle
 
 import drgs
 from drgs.cameras import Camera
-from drgs.covariances import factors
 from drgs.settings import RenderSettings
+from drgs.splats.covariances import factors
 
 SHAPES = {
     "any": (0.5, 0.3, 0.2),

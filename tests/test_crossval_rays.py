@@ -19,6 +19,7 @@ from torch_rays import DEFECTS, LENSES
 
 from drgs import cli
 from drgs.cameras import Camera, c2w_to_opengl
+from drgs.cameras.shutters import SHUTTERS
 from drgs.ellipsoids import Gaussians
 from drgs.files import save_ply
 from drgs.lab import rasterizers
@@ -27,7 +28,6 @@ from drgs.lab.ladder import ladder
 from drgs.lab.parameters import MOTIONS, PARAMETERS, raw_of
 from drgs.lab.rasterizers import function, load_rasterizer, ours
 from drgs.settings import RenderSettings
-from drgs.shutters import SHUTTERS
 from drgs.testing import assert_matches
 
 pytestmark = pytest.mark.usefixtures("functions_in_float64")

@@ -163,7 +163,7 @@ def test_a_capture_goes_on_after_a_full_disk(disk, tmp_path, capsys, monkeypatch
     from test_sfm import corner_camera, corner_photo, corner_walls, write_photo
     from test_share import write_viewer
 
-    from drgs.sharing import npm
+    from drgs.pages.sharing import npm
 
     write_viewer(tmp_path / "npm")
     monkeypatch.setattr(npm, "PACKAGED", tmp_path / "npm")

@@ -129,7 +129,7 @@ def test_every_block_says_what_it_is():
 
 def test_commands_in_the_text_exist():
     """Options, scripts and targets that running text names are there."""
-    from drgs.guards.records import options_in
+    from drgs.checks.records import options_in
 
     for page in PAGES:
         for command in inline_commands(page):

@@ -26,12 +26,12 @@ from drgs.files import Run, load_ply, load_state, save_state
 from drgs.fitting.components.motion import FIELD, MotionComponent, is_held_open, moving_share
 from drgs.fitting.density import add_gaussians
 from drgs.fitting.frames import load_frames
+from drgs.fitting.metrics import evaluate, psnr
 from drgs.fitting.records import load_run
 from drgs.fitting.renderers import ANY
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.stages import first_time, times_of
 from drgs.integrator import render
-from drgs.metrics import evaluate, psnr
 from drgs.settings import RenderSettings
 from drgs.train import FitConfig, Trainer, fit
 

@@ -12,7 +12,7 @@ import torch
 from scenes_random import camera, gaussians
 
 from drgs import fisher, settings
-from drgs.guards import registry
+from drgs.checks import registry
 from drgs.integrator import render, render_jvp
 from drgs.oracle import reference
 from drgs.tracing.peak import Peak

@@ -414,9 +414,9 @@ def test_one_default_criterion():
     """
     import inspect
 
+    from drgs.checks.records import options_in
     from drgs.commands.options import Fit, Select
     from drgs.fitting.config import SelectionConfig
-    from drgs.guards.records import options_in
     from drgs.select import Scoring
 
     for function in (information_gain, scorer):

@@ -53,7 +53,7 @@ EVERYTHING += ("--filter-3d", "on")
 def parsed(line: str) -> dict:
     """Name of an option -> its value, of every option that a line of words is parsed into, as JSON has it."""
     from drgs import cli
-    from drgs.guards.records import options_in
+    from drgs.checks.records import options_in
 
     def plain(value):
         if isinstance(value, list | tuple):

@@ -10,8 +10,8 @@ from dense_jacobian import GROUPS, error
 from scenes_random import camera, gaussians
 
 from drgs import fisher, reference
+from drgs.checks.arguments import ArgumentError
 from drgs.gain import information_gain
-from drgs.guards.arguments import ArgumentError
 from drgs.information.semantics import SemanticMetric
 from drgs.select import Cache, select
 from drgs.settings import RenderSettings

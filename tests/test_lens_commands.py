@@ -18,9 +18,9 @@ from drgs.data import View
 from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.display.pictures import write_png
 from drgs.files import Run
-from drgs.report import pictures
-from drgs.report.account import account_of
-from drgs.report.write import _Cast
+from drgs.pages.report import pictures
+from drgs.pages.report.account import account_of
+from drgs.pages.report.write import _Cast
 
 LENS = (-0.3, 0.08, 0.002, -0.003, 0.0)
 

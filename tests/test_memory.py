@@ -1,4 +1,4 @@
-"""Claims of drgs.guards.memory: what cannot fit is refused before it starts, whoever sets limit and size."""
+"""Claims of drgs.runtime.memory: what cannot fit is refused before it starts, whoever sets limit and size."""
 
 from __future__ import annotations
 
@@ -19,8 +19,7 @@ from drgs import cli, runtime
 from drgs.cameras import orbit
 from drgs.data.camera_lists import save_cameras_json
 from drgs.files import save_ply
-from drgs.guards import memory
-from drgs.runtime import machine
+from drgs.runtime import machine, memory
 from drgs.tracing import tiles
 
 TILES = drgs.RenderSettings.preset("fast")
@@ -74,7 +73,7 @@ def test_the_tightest_limit_counts(tmp_path, monkeypatch):
 
 def test_address_space_counts(tmp_path):
     """`ulimit -v` is a limit too."""
-    code = "from drgs.guards import memory; print(memory.available())"
+    code = "from drgs.runtime import memory; print(memory.available())"
     limit = 3 << 30
     done = subprocess.run(
         [sys.executable, "-c", code],

@@ -1,4 +1,6 @@
-"""Claims of drgs.metrics: values against their definitions, masks, and what is missing is null with a reason."""
+"""Claims of drgs.fitting.metrics: values against their definitions, masks, and what is missing is null with a
+reason.
+"""
 
 import dataclasses
 import importlib.util
@@ -9,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from drgs import metrics
 from drgs.cameras import orbit
 from drgs.commands.eval import print_table
+from drgs.fitting import metrics
 from drgs.fitting.frames import Frame
 from drgs.settings import RenderSettings
 
@@ -92,7 +94,7 @@ class Rendered:
 
 def evaluate(monkeypatch, image, frames, alpha=None, **options):
     alpha = torch.ones(image.shape[:2]) if alpha is None and image is not None else alpha
-    monkeypatch.setattr("drgs.metrics.render", lambda g, camera, settings: Rendered(image, alpha))
+    monkeypatch.setattr("drgs.fitting.metrics.render", lambda g, camera, settings: Rendered(image, alpha))
     return metrics.evaluate(None, frames, RenderSettings.preset("fast"), **options)
 
 
@@ -195,8 +197,8 @@ def test_cut_out_objects_have_a_number_for_the_object_and_one_for_the_frame(rng,
     assert row["uncovered"] == 1
     assert full["psnr_object"] == full["psnr_frame"] == full["psnr"]
     assert result["mean"]["psnr_object"] == pytest.approx((row["psnr_object"] + 100) / 2)
-    monkeypatch.setattr("drgs.metrics.render", lambda g, camera, settings, outputs: Rendered(image, shown))
-    monkeypatch.setattr("drgs.metrics.colors_only", lambda g, time: g)
+    monkeypatch.setattr("drgs.fitting.metrics.render", lambda g, camera, settings, outputs: Rendered(image, shown))
+    monkeypatch.setattr("drgs.fitting.metrics.colors_only", lambda g, time: g)
     found = metrics.through_renderers(None, [cut], {"fast": RenderSettings.preset("fast")}, "test")
     assert found["rows"][0]["worst"] == {
         "name": "a/b 1",

@@ -12,11 +12,11 @@ from typing import Literal
 import pytest
 
 from drgs import cli, fisher, gain, runtime, select
+from drgs.checks.records import Record, option, options_in, part
 from drgs.commands import options
 from drgs.commands.command_line import help_page, parsed_options, words_of
 from drgs.fitting.config import FitConfig, SelectionConfig
 from drgs.fitting.renderers import own_preset
-from drgs.guards.records import Record, option, options_in, part
 from drgs.information.choices import CRITERION_NAMES, POLICY_NAMES
 from drgs.settings import PRESETS, RenderSettings
 from drgs.sfm import reconstruction

@@ -13,10 +13,10 @@ from test_rasterize import along_motions, arguments
 import drgs
 from drgs import reference
 from drgs.cameras import Camera
-from drgs.covariances import factors
+from drgs.cameras.shutters import SHUTTERS
 from drgs.ellipsoids import Gaussians, semi_axes
 from drgs.settings import RenderSettings
-from drgs.shutters import SHUTTERS
+from drgs.splats.covariances import factors
 
 RADIAL = (-0.2, 0.05, 0.01, 0.02, 0.0, 0.0)
 TANGENTIAL = (0.003, -0.002)

@@ -1,4 +1,4 @@
-"""Claims of drgs.guards.registry: rows load when asked for, come from other packages, too, and errors name them."""
+"""Claims of drgs.checks.registry: rows load when asked for, come from other packages, too, and errors name them."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from drgs.guards import registry
-from drgs.guards.registry import Registry
+from drgs.checks import registry
+from drgs.checks.registry import Registry
 
 pytestmark = pytest.mark.core
 

@@ -9,15 +9,16 @@ import pytest
 from test_active import write_still
 from test_train import SIZE, config, dataset, trainer_of  # noqa: F401
 
-from drgs import cli, metrics
+from drgs import cli
 from drgs.commands.eval import print_table
 from drgs.commands.report import fit_command
-from drgs.evaluation import evaluate_run
+from drgs.fitting import metrics
 from drgs.fitting.config import FitConfig
+from drgs.fitting.evaluation import evaluate_run
 from drgs.fitting.frames import load_frames
+from drgs.fitting.metrics import renderers_table
 from drgs.fitting.renderers import ANY, RendererSchedule, renderers_to_measure
 from drgs.fitting.resume import lock_run
-from drgs.metrics import renderers_table
 from drgs.settings import RenderSettings
 from drgs.train import Trainer, fit
 

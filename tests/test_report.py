@@ -27,8 +27,8 @@ from drgs.display.pictures import file_names
 from drgs.files import Run
 from drgs.fitting.config import FitConfig, SelectionConfig
 from drgs.information.prior import Prior
-from drgs.report import pictures
-from drgs.report.account import account_of
+from drgs.pages.report import pictures
+from drgs.pages.report.account import account_of
 from drgs.settings import RenderSettings
 from drgs.train import fit
 

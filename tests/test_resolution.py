@@ -14,11 +14,11 @@ from test_active import plan
 from test_semantic_fit import MAP, semantic_trainer, taught  # noqa: F401 (a fixture)
 from test_train import SIZE, config, dataset, masked, trainer_of  # noqa: F401 (a fixture)
 
-from drgs import metrics, select
+from drgs import select
 from drgs.cameras import Camera, intrinsics, look_at
 from drgs.deform import FieldConfig
 from drgs.files import Run, load_state
-from drgs.fitting import resolution, trainer
+from drgs.fitting import metrics, resolution, trainer
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.losses import ssim_map
 from drgs.fitting.resolution import Resolution, halved_size

@@ -167,7 +167,7 @@ _WRITERS = {
     "data/dataset.py": {"held_out.json"},
     "io/run.py": {"config.json", "env.json", "log.jsonl"},
     "fitting/active.py": {"selection.json"},
-    "metrics.py": {"metrics.json"},
+    "fitting/metrics.py": {"metrics.json"},
 }
 """Module that writes JSON for users -> the files whose fields are told."""
 _OTHERS = {
@@ -183,8 +183,8 @@ _OTHERS = {
     "io/locks.py",  # .drgs.lock
     "io/outputs.py",  # .drgs.jsonl
     "planner.py",  # the header of Planner.save's file: docs/planner.md
-    "report/page.py",  # a cell of the report
-    "sharing/page.py",  # what a page is told
+    "pages/report/page.py",  # a cell of the report
+    "pages/sharing/page.py",  # what a page is told
 }
 """Modules that make JSON which is no such file."""
 

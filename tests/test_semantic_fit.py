@@ -10,7 +10,7 @@ import torch
 from test_train import FAST, SIZE, config, dataset, masked, scene  # noqa: F401 (a fixture)
 
 import drgs
-from drgs import cli, metrics
+from drgs import cli
 from drgs.commands import render as render_command
 from drgs.commands.eval import run as run_eval
 from drgs.commands.options import Eval
@@ -21,6 +21,7 @@ from drgs.display.pictures import write_png
 from drgs.features.pictures import label_colors
 from drgs.features.segmentation import Classes, classify
 from drgs.files import Run
+from drgs.fitting import metrics
 from drgs.fitting import trainer as trainer_module
 from drgs.fitting.active import ActiveViews
 from drgs.fitting.components import semantics

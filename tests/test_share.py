@@ -26,10 +26,10 @@ from drgs.codecs.clustering import morton_order
 from drgs.codecs.sog import load_sog
 from drgs.commands.options import Share
 from drgs.commands.share import shared_of
-from drgs.sharing import npm
-from drgs.sharing.gaussians import archive_of
-from drgs.sharing.layers import uncertainty_layer
-from drgs.sharing.placing import upright_matrix
+from drgs.pages.sharing import npm
+from drgs.pages.sharing.gaussians import archive_of
+from drgs.pages.sharing.layers import uncertainty_layer
+from drgs.pages.sharing.placing import upright_matrix
 
 
 def blobs(count: int = 300, degree: int = 3, seed: int = 0) -> drgs.Gaussians:

@@ -17,9 +17,9 @@ from drgs.cameras import Camera, intrinsics, look_at
 from drgs.codecs import load_gaussians
 from drgs.codecs.sog import encode_sog
 from drgs.integrator import render
+from drgs.pages.sharing import npm
+from drgs.pages.sharing.write import Shared, write_page
 from drgs.settings import RenderSettings
-from drgs.sharing import npm
-from drgs.sharing.write import Shared, write_page
 
 WIDTH, HEIGHT = 480, 320
 BACKGROUND = (0.2, 0.3, 0.1)

@@ -15,8 +15,8 @@ from drgs.commands.options import Share
 from drgs.commands.share import shared_of
 from drgs.deform import DynamicGaussians
 from drgs.dynamics.lives import Lives
-from drgs.sharing.layers import moments_of
-from drgs.sharing.write import write_page
+from drgs.pages.sharing.layers import moments_of
+from drgs.pages.sharing.write import write_page
 
 
 def shared_of_run(run):  # noqa: F811

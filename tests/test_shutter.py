@@ -13,9 +13,9 @@ from test_integrator import check
 
 from drgs import fisher, reference, render, render_jvp
 from drgs.cameras import Camera
+from drgs.cameras.shutters import SHUTTERS, line_poses, line_times
+from drgs.cameras.sizes import cropped
 from drgs.settings import RenderSettings
-from drgs.shutters import SHUTTERS, line_poses, line_times
-from drgs.sizes import cropped
 from drgs.tracing import tiles
 from drgs.tracing.free_rays import FreeRays
 

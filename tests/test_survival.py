@@ -17,7 +17,7 @@ from test_active import write_still
 from drgs import cli
 from drgs.files import Run, load_state
 from drgs.fitting.trainer import Trainer
-from drgs.guards.memory import is_out_of_memory
+from drgs.runtime.memory import is_out_of_memory
 
 ROOT = Path(__file__).parents[1]
 OPTIONS = "--max-steps 8 --max-gaussians 60 --sh-degree 1 --save-every 2 --deterministic --no-report --quiet"
@@ -143,7 +143,7 @@ def test_a_command_without_memory_says_so(tmp_path, monkeypatch, capsys):
         def fail(*_, error=error, **__):
             raise error
 
-        monkeypatch.setattr("drgs.evaluation.evaluate", fail)
+        monkeypatch.setattr("drgs.fitting.evaluation.evaluate", fail)
         assert cli.main(["eval", str(tmp_path / "run"), "--quiet"]) == 2
         assert capsys.readouterr().err == (
             "drgs eval: there must be more memory, none was left; free some, or ask for smaller views\n"
@@ -152,7 +152,7 @@ def test_a_command_without_memory_says_so(tmp_path, monkeypatch, capsys):
     def broken(*_, **__):
         raise RuntimeError("a bug")
 
-    monkeypatch.setattr("drgs.evaluation.evaluate", broken)
+    monkeypatch.setattr("drgs.fitting.evaluation.evaluate", broken)
     with pytest.raises(RuntimeError, match="a bug"):
         cli.main(["eval", str(tmp_path / "run"), "--quiet"])
 

@@ -130,7 +130,7 @@ def test_image_smaller_than_a_tile_and_larger(rng):
 @pytest.mark.slow
 def test_too_many_pairs(monkeypatch):
     """2^32 list entries are refused before anything of that size is allocated, however much memory there is."""
-    monkeypatch.setattr("drgs.guards.memory.available", lambda: None)
+    monkeypatch.setattr("drgs.runtime.memory.available", lambda: None)
     rng = np.random.default_rng(0)
     cam, g = camera(rng, (2**15, 2**15)), gaussians(rng, 300, 1, scale=1e3)
     with pytest.raises(ValueError, match="fewer than 2\\^32 entries.*lower extent or image size"):

@@ -13,13 +13,13 @@ from scenes_random import assert_same_sums
 from test_data import gradient, write_image, write_transforms
 
 from drgs.cameras import Camera, orbit
+from drgs.checks.arguments import ArgumentError
 from drgs.data import load
 from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.data.view_checks import check_cameras, check_parallax
 from drgs.data.views import View
 from drgs.ellipsoids import Gaussians, Scene
 from drgs.fitting.frames import load_frames
-from drgs.guards.arguments import ArgumentError
 from drgs.integrator import render, render_jvp
 from drgs.select import select
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from drgs.sharing import npm
+from drgs.pages.sharing import npm
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -53,6 +53,6 @@ def test_it_has_the_viewer_of_shared_pages(wheel):
         npm.viewer_files()
     except OSError as error:
         pytest.skip(str(error))
-    wanted = {f"drgs/sharing/npm/{package.folder}/{name}" for package in npm.PACKAGES for name in package.files}
+    wanted = {f"drgs/pages/sharing/npm/{package.folder}/{name}" for package in npm.PACKAGES for name in package.files}
     assert wanted <= set(wheel)
     assert sum(name.endswith("/LICENSE") for name in wanted) == len(npm.PACKAGES) == 2

@@ -87,7 +87,7 @@ def ended(command: list[str], limit: float, **environ: str) -> dict:
 
 def versus_gsplat() -> list[dict]:
     """Verdicts of crossval against gsplat's kernels, a row for each path and scene."""
-    from drgs.crossval import crossval
+    from drgs.lab.crossval import crossval
     from drgs.lab.rasterizers import load_rasterizer
     from drgs.testing import random_scene
 

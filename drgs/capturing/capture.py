@@ -19,9 +19,9 @@ from drgs.data.images import read_image
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import fit_record, is_run
-from drgs.guards import memory
 from drgs.io.checkpoint import state_header
 from drgs.io.run import Run
+from drgs.runtime import memory
 
 if TYPE_CHECKING:
     from drgs.data import Dataset

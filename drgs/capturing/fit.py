@@ -14,8 +14,8 @@ from drgs.fitting.records import fit_record, is_run
 from drgs.fitting.resume import FILES, last_checkpoint, lock_run
 from drgs.io.checkpoint import save_state
 from drgs.io.outputs import lock_folder
-from drgs.report.write import FILE as REPORT
-from drgs.sharing.scene import FILE as PAGE
+from drgs.pages.report.write import FILE as REPORT
+from drgs.pages.sharing.scene import FILE as PAGE
 from drgs.train import fit
 from drgs.viewing.placed_views import NEXT
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from drgs.cameras.sizes import at_most
 from drgs.capturing.places import Place, meters_of, places_around
 from drgs.data.camera_layout import upright
 from drgs.data.camera_lists import camera_to_json
@@ -27,7 +28,6 @@ from drgs.meshing.depths import seen_distance
 from drgs.select import select
 from drgs.selection.cache import Cache
 from drgs.settings import RenderSettings
-from drgs.sizes import at_most
 from drgs.viewing.placed_views import NEXT
 
 if TYPE_CHECKING:

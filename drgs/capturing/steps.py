@@ -35,11 +35,11 @@ from drgs.io import interrupts
 from drgs.io.atomic import is_full
 from drgs.io.outputs import lock_folder
 from drgs.io.run import Run
-from drgs.report.write import FILE as REPORT
+from drgs.pages.report.write import FILE as REPORT
+from drgs.pages.sharing.scene import FILE as PAGE
+from drgs.pages.sharing.scene import scene_of_run
+from drgs.pages.sharing.write import write_page
 from drgs.sfm.image_folder import make_image_folder, named_files, usable_files
-from drgs.sharing.scene import FILE as PAGE
-from drgs.sharing.scene import scene_of_run
-from drgs.sharing.write import write_page
 
 if TYPE_CHECKING:
     from drgs.capturing.poses import Outcome

@@ -23,8 +23,8 @@ from drgs import runtime
 from drgs.cluster.options import check_options
 from drgs.cluster.workers import WORKER_SECONDS, Cluster
 from drgs.display.progress import Bar
-from drgs.guards.memory import available, is_out_of_memory
 from drgs.io.atomic import temporary_folder
+from drgs.runtime.memory import available, is_out_of_memory
 
 if TYPE_CHECKING:
     from distributed import Client, LocalCluster

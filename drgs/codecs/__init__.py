@@ -20,11 +20,11 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from drgs.checks.arguments import ArgumentError, check_path
+from drgs.checks.registry import Registry
 from drgs.codecs.codec import Codec
 from drgs.codecs.folders import file_of_folder, is_checkpoint, refuse_checkpoint
 from drgs.codecs.ply import load_ply, save_ply
-from drgs.guards.arguments import ArgumentError, check_path
-from drgs.guards.registry import Registry
 from drgs.io.foreign import refuse_foreign
 from drgs.io.outputs import atomic_write
 

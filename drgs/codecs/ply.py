@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from drgs.checks.arguments import ArgumentError, check_path
 from drgs.codecs.ply_headers import EXTRA, extra_kind, is_antialiased, ply_source, read_ply_header
-from drgs.guards.arguments import ArgumentError, check_path
 from drgs.io.foreign import refuse_foreign
 from drgs.io.outputs import atomic_write
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from drgs.ellipsoids import LOGIT_ENDS, Y_00, Gaussians
-from drgs.guards.memory import require
+from drgs.runtime.memory import require
 
 __all__ = [
     "SH_COUNTS",

@@ -4,7 +4,7 @@
                      ^
     a file of --config, whose nested objects are the records of `drgs.fitting.config.FitConfig`
 
-What an option is called, may be and means is stated once, where its field is declared (`drgs.guards.records`). Imports
+What an option is called, may be and means is stated once, where its field is declared (`drgs.checks.records`). Imports
 nothing heavy.
 """
 
@@ -20,11 +20,11 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any, Literal
 
+from drgs.checks.records import Option, hints_of, nearest, nested, options_in, stated, ways_of
 from drgs.commands.options import Common
 from drgs.commands.values import ORBIT_KEYS, override
 from drgs.fitting.config import FitConfig
 from drgs.fitting.renderers import AUTO
-from drgs.guards.records import Option, hints_of, nearest, nested, options_in, stated, ways_of
 from drgs.io.json_files import read_json, read_toml
 from drgs.settings import RenderSettings
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from drgs import runtime
+from drgs.cameras.sizes import at_most
 from drgs.commands.orbits import Wish
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import seen_views
@@ -16,7 +17,6 @@ from drgs.lab import ladder, rasterizers
 from drgs.lab.crossval import Result, crossval
 from drgs.lab.report import html
 from drgs.settings import PRESETS, RenderSettings
-from drgs.sizes import at_most
 
 if TYPE_CHECKING:
     from drgs.commands.options import Crossval

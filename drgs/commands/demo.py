@@ -17,23 +17,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from drgs import metrics, reference, runtime
+from drgs import reference, runtime
 from drgs.cameras import Camera, intrinsics_from_fov, look_at
+from drgs.cameras.sizes import cropped
 from drgs.commands.report import report_of
 from drgs.commands.scene import maker_of
 from drgs.data import load
 from drgs.display import pictures, tables
 from drgs.display.progress import Bar
+from drgs.fitting import metrics
 from drgs.fitting.frames import Frame, frames_for
 from drgs.fitting.losses import psnr_of
 from drgs.information.nuisances import Nuisances
 from drgs.integrator import render
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import LockedFolder, lock_folder, write_json
-from drgs.report import pictures as report_pictures
-from drgs.report.write import FILE
+from drgs.pages.report import pictures as report_pictures
+from drgs.pages.report.write import FILE
 from drgs.settings import RenderSettings
-from drgs.sizes import cropped
 from drgs.train import FitConfig, fit
 
 if TYPE_CHECKING:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from drgs.display import tables
-from drgs.evaluation import evaluate_run
+from drgs.fitting.evaluation import evaluate_run
+from drgs.fitting.metrics import METRICS, MOVING, OBJECT, Lpips, renderers_table
 from drgs.fitting.records import fit_record
 from drgs.fitting.resume import lock_run
 from drgs.io.run import Run
-from drgs.metrics import METRICS, MOVING, OBJECT, Lpips, renderers_table
 
 if TYPE_CHECKING:
     from drgs.commands.options import Eval

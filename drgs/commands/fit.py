@@ -12,7 +12,7 @@ from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import fit_record, is_run
 from drgs.fitting.resume import lock_run
 from drgs.io.run import Run
-from drgs.report.write import FILE
+from drgs.pages.report.write import FILE
 from drgs.train import fit
 
 if TYPE_CHECKING:

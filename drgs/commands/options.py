@@ -1,7 +1,7 @@
 """The options of every command: a frozen dataclass each, whose fields say all that there is to say of an option.
 
 The name of a field is that of the option, its type what may be chosen, and `option` has its default, text and range;
-`part` holds a record of the package, whose fields are options in the same way (`drgs.guards.records`). The command
+`part` holds a record of the package, whose fields are options in the same way (`drgs.checks.records`). The command
 line, its help and configuration files are read from these alone (`command_line.py`). Imports nothing heavy: `drgs
 --help` reads it.
 """
@@ -15,11 +15,11 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+from drgs.checks.records import check_ranges, option, options_in, part, same_option
 from drgs.cluster.options import check_options
 from drgs.commands.values import ORBIT_KEYS, check_color, parsed
 from drgs.fitting.config import COUNT, SEED, FitConfig, SelectionConfig, UndistortUse
 from drgs.fitting.renderers import AUTO, own_preset
-from drgs.guards.records import check_ranges, option, options_in, part, same_option
 from drgs.information.scoring import Scoring
 from drgs.meshing.options import MeshOptions
 from drgs.settings import Preset, RenderSettings
@@ -102,7 +102,7 @@ class Common:
 
     @classmethod
     def values(cls, given: Mapping[str, Any], line: Collection[str]) -> dict[tuple[str, ...], Any]:
-        """Path of a field -> its value, as `drgs.guards.records.nested` makes these options of them.
+        """Path of a field -> its value, as `drgs.checks.records.nested` makes these options of them.
 
         Args:
             given: Name of an option -> its value, of a file of --config and of the command line, which wins.

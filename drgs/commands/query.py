@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from drgs.cameras.sizes import at_most
 from drgs.codecs.ply import save_ply
 from drgs.commands.orbits import Wish
 from drgs.commands.painters import OPAQUE
@@ -25,7 +26,6 @@ from drgs.features.teacher import read_tensor
 from drgs.integrator import render
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import lock_folder, write_json
-from drgs.sizes import at_most
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

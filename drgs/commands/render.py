@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from drgs import runtime
+from drgs.cameras.sizes import cropped
 from drgs.commands.films import (
     Film,
     at_times,
@@ -44,11 +45,10 @@ from drgs.display import pictures
 from drgs.display.mp4 import Mp4, need_mp4
 from drgs.display.progress import Bar, duration
 from drgs.ellipsoids import colors_only
-from drgs.guards import memory
 from drgs.integrator import render
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import lock_folder, write_json
-from drgs.sizes import cropped
+from drgs.runtime import memory
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

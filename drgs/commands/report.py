@@ -8,6 +8,7 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from drgs.checks.records import options_in
 from drgs.commands.command_line import words_of
 from drgs.commands.options import Fit
 from drgs.commands.values import override
@@ -16,11 +17,10 @@ from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import fit_record
 from drgs.fitting.renderers import own_preset
 from drgs.fitting.resume import lock_run
-from drgs.guards.records import options_in
 from drgs.io.outputs import check_file
 from drgs.io.run import Run
-from drgs.report.page import GENERATOR
-from drgs.report.write import FILE, write_report
+from drgs.pages.report.page import GENERATOR
+from drgs.pages.report.write import FILE, write_report
 
 if TYPE_CHECKING:
     from drgs.commands.options import Report

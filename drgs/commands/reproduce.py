@@ -15,12 +15,12 @@ from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import check_lenses, held_out_views, known_views
 from drgs.display import tables
 from drgs.display.progress import Bar
+from drgs.fitting.metrics import Lpips
 from drgs.information.blocks import MAP_PRIOR
 from drgs.information.scoring import Scoring
 from drgs.io.journal import SCHEMA
 from drgs.io.json_files import check_json, read_json
 from drgs.io.outputs import atomic_write, lock_folder, write_json
-from drgs.metrics import Lpips
 from drgs.runtime.machine import commit, cpu_model
 from drgs.settings import RenderSettings
 from drgs.studies.cells import run_cells

@@ -15,9 +15,9 @@ from drgs.fitting.resume import lock_run
 from drgs.io.foreign import refuse_foreign
 from drgs.io.outputs import check_file
 from drgs.io.run import Run
-from drgs.sharing.page import SHARED_BY
-from drgs.sharing.scene import FILE, scene_of_file, scene_of_run
-from drgs.sharing.write import Shared, write_page
+from drgs.pages.sharing.page import SHARED_BY
+from drgs.pages.sharing.scene import FILE, scene_of_file, scene_of_run
+from drgs.pages.sharing.write import Shared, write_page
 from drgs.viewing.placed_views import read_ranking
 
 if TYPE_CHECKING:

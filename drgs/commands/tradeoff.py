@@ -29,6 +29,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from drgs import runtime
+from drgs.cameras.sizes import at_most
 from drgs.commands.orbits import Wish
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import seen_views
@@ -51,7 +52,6 @@ from drgs.lab.tradeoff import (
     plot,
     recommend,
 )
-from drgs.sizes import at_most
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

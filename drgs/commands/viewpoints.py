@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from drgs import data
+from drgs.cameras.sizes import at_most, resized_alike
 from drgs.codecs.folders import cameras_of_model
 from drgs.commands.nerfstudio_frame import DATAPARSER_TRANSFORMS
 from drgs.commands.options import SIDE
@@ -31,7 +32,6 @@ from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import FitRecord, fit_record, fitted_views, is_run
 from drgs.io.run import Run
 from drgs.meshing.depths import seen_distance
-from drgs.sizes import at_most, resized_alike
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -9,6 +9,7 @@ import shlex
 from pathlib import Path
 from typing import Any
 
+from drgs.checks.registry import Registry
 from drgs.data.camera_layout import scene_extent
 from drgs.data.colmap import find_model
 from drgs.data.dataset import Dataset, apply_held_out
@@ -22,7 +23,6 @@ from drgs.data.sidecars import attach
 from drgs.data.videos import list_videos
 from drgs.data.view_checks import check_times, drop_duplicates, mark_partial_masks
 from drgs.data.views import View
-from drgs.guards.registry import Registry
 from drgs.io.foreign import refuse_foreign
 
 __all__ = [

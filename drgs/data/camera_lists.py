@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera, intrinsics
+from drgs.checks.arguments import kind_of
 from drgs.data.checks import inverse_pose
-from drgs.guards.arguments import kind_of
 from drgs.io.json_files import check_json, read_json
 from drgs.io.outputs import atomic_write
 

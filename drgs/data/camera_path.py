@@ -28,9 +28,9 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera, c2w_from_opengl, intrinsics
+from drgs.cameras.checks import check_handedness
+from drgs.checks.records import nearest
 from drgs.data.checks import check_last_row, inverse_pose
-from drgs.guards.camera_checks import check_handedness
-from drgs.guards.records import nearest
 from drgs.io.journal import SCHEMA
 from drgs.io.json_files import check_json, read_json
 

@@ -19,9 +19,9 @@ from typing import IO
 
 import numpy as np
 
-from drgs.guards import memory
-from drgs.guards.camera_checks import check_distance
+from drgs.cameras.checks import check_distance
 from drgs.io.foreign import is_file, refuse_foreign
+from drgs.runtime import memory
 
 __all__ = [
     "check_last_row",

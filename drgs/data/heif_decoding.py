@@ -18,7 +18,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 
 from drgs.data.hdr import HDR, in_srgb
 from drgs.data.reader_process import serve
-from drgs.guards import memory
+from drgs.runtime import memory
 
 __all__ = ["encoded_jpeg", "pixels", "size"]
 

@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 
 from drgs.data.reader_process import Child
-from drgs.guards import memory
 from drgs.io.foreign import refuse_foreign
+from drgs.runtime import memory
 
 __all__ = [
     "IMAGE_SUFFIXES",

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from drgs.cameras import Camera, c2w_from_llff, intrinsics
+from drgs.cameras.checks import check_handedness
 from drgs.data.checks import inverse_pose, read_npy
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
@@ -17,7 +18,6 @@ from drgs.data.resampling import fit_to_image
 from drgs.data.videos import list_videos
 from drgs.data.view_checks import make_names_unique
 from drgs.data.views import View
-from drgs.guards.camera_checks import check_handedness
 
 __all__ = ["LLFF", "POSES_BOUNDS", "load_llff", "pose_rows", "row_camera"]
 

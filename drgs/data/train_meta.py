@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera
+from drgs.cameras.checks import check_distance
 from drgs.data.camera_layout import Focus
 from drgs.data.checks import file_inside, read_npz, repaired_pose
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
 from drgs.data.synchronous import Recording, evenly_spaced, synchronous
-from drgs.guards.camera_checks import check_distance
 from drgs.io.json_files import check_json, read_json
 
 __all__ = ["TRAIN_META", "load_train_meta"]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera, c2w_from_opengl, intrinsics
+from drgs.cameras.checks import check_handedness
 from drgs.data.checks import check_last_row, file_inside, inverse_pose, local_names, repaired_pose
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
@@ -21,7 +22,6 @@ from drgs.data.resampling import fit_to_image
 from drgs.data.synchronous import CAMERA_NAME
 from drgs.data.view_checks import make_names_unique, report_missing_images
 from drgs.data.views import View
-from drgs.guards.camera_checks import check_handedness
 from drgs.io.foreign import is_file
 from drgs.io.json_files import check_json, read_json
 

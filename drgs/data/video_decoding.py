@@ -23,7 +23,7 @@ from drgs.data.hdr import HDR, HdrReader, hdr_transfer
 from drgs.data.images import native_stderr
 from drgs.data.reader_process import serve
 from drgs.display.pictures import shrunk
-from drgs.guards import memory
+from drgs.runtime import memory
 
 __all__ = ["frame", "gray", "walk"]
 

@@ -16,8 +16,8 @@ from typing import Any
 
 import torch
 
+from drgs.checks.derivatives import first_only
 from drgs.dynamics.hexplane import HexPlane, levels
-from drgs.guards.derivatives import first_only
 
 __all__ = ["plane_smoothness", "time_l1", "time_smoothness"]
 

@@ -15,8 +15,8 @@ from typing import Any
 
 import torch
 
-from drgs.guards.archives import check_archive
-from drgs.guards.arguments import check_path
+from drgs.checks.arguments import check_path
+from drgs.io.archives import check_archive
 from drgs.io.foreign import refuse_foreign
 from drgs.io.outputs import atomic_write
 

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from drgs.checks.arguments import kind_of
 from drgs.features.decoder import Decoder
-from drgs.guards.arguments import kind_of
 
 __all__ = ["SCORE_DEFINITIONS", "Classes", "classify", "cosines", "scores"]
 

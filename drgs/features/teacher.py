@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.guards.archives import check_archive
+from drgs.io.archives import check_archive
 from drgs.io.foreign import refuse_foreign
 
 if TYPE_CHECKING:

@@ -1,5 +1,5 @@
 """Behind drgs.train: photographs, losses, steps, density control, views chosen on the way."""
 
-from drgs.guards.imports import modules_of
+from drgs.checks.imports import modules_of
 
 __getattr__ = modules_of(__name__)

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from drgs.cameras.sizes import at_most, resized_alike
 from drgs.data.camera_lists import camera_to_json
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
@@ -32,7 +33,6 @@ from drgs.io.journal import SCHEMA
 from drgs.io.outputs import write_json
 from drgs.io.run import Run
 from drgs.sfm.guided import Matches
-from drgs.sizes import at_most, resized_alike
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -280,7 +280,7 @@ class ActiveViews:
         return count in self.active.measure and all(record["views"] != count for record in self.measured)
 
     def add_measured(self, step: int, result: dict) -> None:
-        """Record what `drgs.metrics.evaluate` found, without single views.
+        """Record what `drgs.fitting.metrics.evaluate` found, without single views.
 
         Args:
             step: Steps done.

@@ -9,8 +9,8 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+from drgs.checks.records import Record, first_difference, one_of, option, part
 from drgs.fitting.renderers import AUTO, check_renderers, named_renderers, planar_of
-from drgs.guards.records import Record, first_difference, one_of, option, part
 from drgs.information.choices import POLICIES, POLICY_NAMES, check_named
 from drgs.information.scoring import Scoring
 from drgs.settings import RenderSettings

@@ -13,10 +13,10 @@ import numpy as np
 import torch
 
 from drgs import data
+from drgs.cameras.sizes import reduced_size
 from drgs.data.resampling import resize_area
 from drgs.data.synchronous import late_cameras
 from drgs.display.progress import Bar
-from drgs.sizes import reduced_size
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

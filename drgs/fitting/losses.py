@@ -1,7 +1,7 @@
 """What a step minimizes: a list of terms, among them L1 and structural similarity, cheap enough for two CPU cores.
 
 SSIM is the training variant of 3DGS: 11x11 Gaussian window with sigma 1.5, zero padding, one value per pixel and
-channel, mean over all of them. `drgs.metrics` also reports the variant without padding that papers print.
+channel, mean over all of them. `drgs.fitting.metrics` also reports the variant without padding that papers print.
 """
 
 from __future__ import annotations
@@ -164,7 +164,7 @@ def psnr_of(mse: float) -> float:
 
 
 def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float:
-    """Peak signal-to-noise ratio in dB, as `drgs.metrics.DEFINITIONS` says.
+    """Peak signal-to-noise ratio in dB, as `drgs.fitting.metrics.DEFINITIONS` says.
 
     Args:
         image, target: (H, W, 3) in [0, 1].

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from drgs.cameras import Camera
+from drgs.cameras.sizes import at_most
 from drgs.data import scene_extent
 from drgs.data.resampling import resize_area
 from drgs.ellipsoids import Gaussians
@@ -28,7 +29,6 @@ from drgs.fitting.trainer import Trainer
 from drgs.integrator import render
 from drgs.io.json_files import check_json
 from drgs.sfm.proposals import propose_along_rays, random_subset
-from drgs.sizes import at_most
 
 __all__ = ["OnlineFit"]
 

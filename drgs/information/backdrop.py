@@ -22,13 +22,13 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import torch
 
+from drgs.cameras.sizes import at_most
 from drgs.ellipsoids import colors_only
 from drgs.information.complement import left
 from drgs.information.nuisances import NO_NUISANCES, Nuisances
 from drgs.information.quantity import Quantity, ViewContext
 from drgs.information.sums import Information
 from drgs.settings import RenderSettings
-from drgs.sizes import at_most
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

@@ -1,7 +1,7 @@
 """What views can be judged and chosen by, by name; loads nothing heavy, for the options of the command line read it.
 
 What stands behind a name is imported when it is first looked up. Rows that other packages add are found by entry points
-(`drgs.guards.registry`), and have no part in what is the default.
+(`drgs.checks.registry`), and have no part in what is the default.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import typing
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
-from drgs.guards.registry import Registry
+from drgs.checks.registry import Registry
 from drgs.information.criteria import criterion_named
 
 __all__ = [

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import torch
 
-from drgs.guards.arguments import must_be
+from drgs.checks.arguments import must_be
 from drgs.information.groups import groups_of, scene_groups
 from drgs.information.quantity import Quantity
 from drgs.integrator import render_jvp

@@ -9,7 +9,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from drgs.guards.registry import Registry
+from drgs.checks.registry import Registry
 
 if TYPE_CHECKING:
     import torch

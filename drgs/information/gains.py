@@ -22,8 +22,8 @@ from typing import Any
 
 import torch
 
-from drgs.guards.arguments import must_be
-from drgs.guards.derivatives import ends_of
+from drgs.checks.arguments import must_be
+from drgs.checks.derivatives import ends_of
 from drgs.information.criteria import criterion_named
 from drgs.information.prior import Prior
 from drgs.information.sums import Information

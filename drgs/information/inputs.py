@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from drgs.cameras import Camera
-from drgs.guards.arguments import ArgumentError, kind_of, must_be
+from drgs.checks.arguments import ArgumentError, kind_of, must_be
 
 __all__ = ["Masks", "mask_list", "three_weights"]
 

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from drgs.checks.arguments import must_be
 from drgs.ellipsoids import Y_00
-from drgs.guards.arguments import must_be
 from drgs.information.backdrop import BACKDROP, CELLS, backdrop_variance
 from drgs.information.gains import variances
 from drgs.information.groups import groups_of

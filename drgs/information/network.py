@@ -36,9 +36,9 @@ from typing import TYPE_CHECKING, ClassVar
 
 import torch
 
+from drgs.checks.arguments import must_be
 from drgs.dynamics.jacobian import scene_jacobian
 from drgs.ellipsoids import DeformableScene
-from drgs.guards.arguments import must_be
 from drgs.information.choices import NETWORK_ESTIMATES, NetworkEstimate
 from drgs.information.complement import Eliminated
 from drgs.information.elimination import eliminated_of

@@ -8,7 +8,7 @@ import typing
 from collections.abc import Sequence
 from typing import ClassVar, Literal
 
-from drgs.guards.records import Record, option
+from drgs.checks.records import Record, option
 
 __all__ = ["NO_NUISANCES", "NUISANCES", "Nuisance", "Nuisances"]
 

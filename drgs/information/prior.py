@@ -8,7 +8,7 @@ import numbers
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar
 
-from drgs.guards.records import option
+from drgs.checks.records import option
 
 if TYPE_CHECKING:
     import torch

@@ -7,8 +7,8 @@ import numbers
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
-from drgs.guards.arguments import kind_of, must_be
-from drgs.guards.records import TRANSIENT, Record, one_of, option, part
+from drgs.checks.arguments import kind_of, must_be
+from drgs.checks.records import TRANSIENT, Record, one_of, option, part
 from drgs.information.choices import (
     BLOCK_NAMES,
     BLOCKS,

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 
-from drgs.guards.arguments import must_be
+from drgs.checks.arguments import must_be
 from drgs.information.choices import ESTIMATES, Estimate
 
 if TYPE_CHECKING:

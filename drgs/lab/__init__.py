@@ -1,5 +1,5 @@
 """Measuring: rasterizers against models, settings against their cost, extremes against float64."""
 
-from drgs.guards.imports import modules_of
+from drgs.checks.imports import modules_of
 
 __getattr__ = modules_of(__name__)

@@ -18,13 +18,13 @@ import torch
 
 from drgs import reference
 from drgs.cameras import Camera, rigid
+from drgs.cameras.shutters import SHUTTERS
 from drgs.display.srgb import linear_from_srgb
 from drgs.ellipsoids import Y_00
 from drgs.integrator import render
 from drgs.lab.parameters import COLORS, gaussians_of, image_of, posed
 from drgs.oracle import activate, float64, rolling_poses, screen_rows
 from drgs.settings import RenderSettings
-from drgs.shutters import SHUTTERS
 
 __all__ = ["BETWEEN", "DISTORTIONS", "LEAST", "ORDERS", "Finding", "SearchResult", "ReferenceModel", "find"]
 
@@ -77,7 +77,7 @@ class ReferenceModel:
             rho^2 = |d' x o'|^2 is not divided by |d'|^2.
         peaks: Whether peaks of Gaussians count `in front` of the ray's origin only, or `everywhere`.
         distortion: What is made of the coefficients of a lens: `as given`, or one of the others of `DISTORTIONS`.
-        shutter: Direction of a rolling shutter: `as given`, or one of `drgs.shutters.SHUTTERS`.
+        shutter: Direction of a rolling shutter: `as given`, or one of `drgs.cameras.shutters.SHUTTERS`.
     """
 
     settings: RenderSettings

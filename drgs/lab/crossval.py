@@ -25,6 +25,7 @@ import numpy as np
 import torch
 
 from drgs.cameras import Camera
+from drgs.cameras.sizes import cropped
 from drgs.ellipsoids import Gaussians
 from drgs.integrator import render
 from drgs.lab import conventions
@@ -34,7 +35,6 @@ from drgs.lab.parameters import COLORS, MOTIONS, PARAMETERS, raw_of, with_colors
 from drgs.lab.rasterizers import Dump, Rasterizer, cotangents, one_line
 from drgs.lab.verdicts import Case, Compared, GroupRow, ViewRow, compared, judge, with_errors
 from drgs.settings import RenderSettings
-from drgs.sizes import cropped
 
 __all__ = ["VERDICTS", "Crop", "Result", "crops", "crossval"]
 

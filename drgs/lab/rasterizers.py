@@ -22,9 +22,9 @@ import numpy as np
 import torch
 
 from drgs.cameras import Camera
+from drgs.checks.imports import imported_function
 from drgs.data.checks import check_npz
 from drgs.ellipsoids import Gaussians, sh_degree_of
-from drgs.guards.imports import imported_function
 from drgs.integrator import render
 from drgs.io.foreign import refuse_foreign
 from drgs.io.outputs import atomic_write

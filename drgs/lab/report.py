@@ -94,7 +94,7 @@ def html(report: dict, images: list[dict], ladder: str = "") -> str:
     """The page.
 
     Args:
-        report: The `report` of a `drgs.crossval.Result`, with `scene` and `source`.
+        report: The `report` of a `drgs.lab.crossval.Result`, with `scene` and `source`.
         images: The `images` of that result: a dict a view of (H, W, 3) arrays.
         ladder: Table of the ladder in Markdown, its cells without markup.
     """

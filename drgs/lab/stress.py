@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from drgs.sizes import cropped
+from drgs.cameras.sizes import cropped
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

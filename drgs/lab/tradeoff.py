@@ -27,10 +27,10 @@ import numpy as np
 import torch
 
 from drgs import fisher, reference, runtime
+from drgs.cameras.sizes import at_most, by_share
 from drgs.integrator import render, render_rays
 from drgs.io.outputs import replacing
 from drgs.settings import RenderSettings
-from drgs.sizes import at_most, by_share
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from drgs.cameras.sizes import at_most
 from drgs.integrator import render
 from drgs.settings import RenderSettings
-from drgs.sizes import at_most
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

@@ -16,10 +16,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from drgs import fisher
-from drgs.guards import memory
 from drgs.meshing.depths import DepthView, depth_views, footprint
 from drgs.meshing.fusion import bricks_of, sampled, surface
 from drgs.meshing.options import POINTS, MeshOptions
+from drgs.runtime import memory
 from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:

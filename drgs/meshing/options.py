@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import ClassVar, Literal
 
-from drgs.guards.records import Record, option
+from drgs.checks.records import Record, option
 
 __all__ = ["BRICK", "POINTS", "DepthKind", "MeshOptions"]
 

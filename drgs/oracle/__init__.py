@@ -14,9 +14,9 @@ from typing import Any
 import torch
 
 from drgs.cameras import check_camera, rigid
+from drgs.checks.arguments import ArgumentError
+from drgs.checks.derivatives import refuse_meta
 from drgs.ellipsoids import check_gaussians
-from drgs.guards.arguments import ArgumentError
-from drgs.guards.derivatives import refuse_meta
 from drgs.settings import RenderSettings, check_settings
 
 __all__ = [

@@ -17,8 +17,8 @@ import numpy as np
 import torch
 
 from drgs.cameras import Camera
+from drgs.checks.arguments import must_be
 from drgs.ellipsoids import Gaussians, Scene
-from drgs.guards.arguments import must_be
 from drgs.information.choices import GAUSSIAN_GROUPS
 from drgs.information.sums import Information
 from drgs.io.json_files import check_json

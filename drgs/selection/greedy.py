@@ -21,12 +21,12 @@ from typing import NamedTuple
 import torch
 
 from drgs.cameras import Camera
-from drgs.guards.memory import available
 from drgs.information.gains import Gain, check
 from drgs.information.network_groups import NETWORK_GROUPS
 from drgs.information.prior import Prior
 from drgs.information.quantity import Quantity
 from drgs.information.sums import Information, add
+from drgs.runtime.memory import available
 from drgs.selection.cache import Cache, size_of
 from drgs.selection.combine import Combination
 from drgs.selection.pool import Pool, Selection

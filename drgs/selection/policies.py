@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from drgs.guards.arguments import kind_of, must_be
+from drgs.checks.arguments import kind_of, must_be
 from drgs.information.choices import POLICIES, check_named
 from drgs.selection.pool import Pick, Pool, Selection
 

@@ -12,8 +12,8 @@ from typing import Any, Protocol
 import torch
 
 from drgs.cameras import Camera
+from drgs.checks.arguments import must_be
 from drgs.ellipsoids import Scene
-from drgs.guards.arguments import must_be
 from drgs.information.choices import Combine
 from drgs.information.criteria import criterion_named
 from drgs.information.quantity import Quantity, ViewContext, once_per_time

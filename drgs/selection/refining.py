@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.cameras import Camera
-from drgs.guards.arguments import ArgumentError, kind_of
+from drgs.checks.arguments import ArgumentError, kind_of
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Scene

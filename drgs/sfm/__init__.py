@@ -3,6 +3,6 @@
 It reads photographs by `drgs.data`, which knows nothing of it.
 """
 
-from drgs.guards.imports import modules_of
+from drgs.checks.imports import modules_of
 
 __getattr__ = modules_of(__name__)

@@ -148,6 +148,6 @@ def _code() -> bytes:
     digest = hashlib.blake2b(cv2.__version__.encode(), digest_size=20)
     package = Path(__file__).parents[1]
     rooms = (*sorted((package / "data").glob("*.py")), *sorted((package / "sfm").glob("*.py")))
-    for path in (*rooms, package / "cameras.py", package / "lenses.py"):
+    for path in (*rooms, *sorted((package / "cameras").glob("*.py"))):
         digest.update(_content(path))
     return digest.digest()

@@ -17,10 +17,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drgs.evaluation import evaluate_run
 from drgs.fitting.active import SELECTION, ActiveViews
 from drgs.fitting.config import FitConfig, SelectionConfig, Start
+from drgs.fitting.evaluation import evaluate_run
 from drgs.fitting.frames import load_dataset
+from drgs.fitting.metrics import Lpips
 from drgs.fitting.records import fit_record
 from drgs.fitting.resume import lock_run
 from drgs.fitting.timetable import VIEWS_TO_ADD
@@ -28,7 +29,6 @@ from drgs.io.atomic import is_full
 from drgs.io.json_files import read_json
 from drgs.io.locks import InUse
 from drgs.io.run import Run
-from drgs.metrics import Lpips
 from drgs.runtime.machine import forget_peak_memory
 from drgs.studies.protocols import PROTOCOLS
 from drgs.studies.rows import Cell, append_row, is_done, read_study

@@ -13,7 +13,7 @@ import drjit as dr
 import torch
 
 from drgs import runtime
-from drgs.guards.derivatives import first_only, refuse_batched, unwrapped
+from drgs.checks.derivatives import first_only, refuse_batched, unwrapped
 
 if TYPE_CHECKING:
     from drgs.tracing.call import Call

@@ -10,10 +10,10 @@ import torch
 
 from drgs import runtime
 from drgs.cameras import Camera
+from drgs.checks.arguments import ArgumentError, kind_of, must_be
+from drgs.checks.derivatives import check_has_numbers, unwrapped
 from drgs.ellipsoids import DeformableScene, Gaussians
-from drgs.guards import memory
-from drgs.guards.arguments import ArgumentError, kind_of, must_be
-from drgs.guards.derivatives import check_has_numbers, unwrapped
+from drgs.runtime import memory
 from drgs.settings import EPS_ALPHA, RenderSettings
 from drgs.tracing import projection
 from drgs.tracing.arrays import UInt32
@@ -83,8 +83,8 @@ class Call:
         mean_offsets: (N, 2) zeros in pixels, added to projected means, of a model of the image plane; differentiated.
         mean_absolute: (N, 2) zeros, whose gradient is to be the sum over all pixels of the absolute value of each
             pixel's gradient by projected means.
-        strains: (N, 6) zeros, by how much space is stretched around each mean: `drgs.covariances`; differentiated.
-        oriented: The features, (N, 3), are axes that are turned towards each ray: `Channels.oriented`.
+        strains: (N, 6) zeros, by how much space is stretched around each mean: `drgs.splats.covariances`;
+        differentiated. oriented: The features, (N, 3), are axes that are turned towards each ray: `Channels.oriented`.
     Attributes:
         inputs: Torch tensors by name, what is differentiated: raw parameters of the Gaussians or of the scene, perhaps
             `time`, `w2c` (12 floats), rays where they are traced.

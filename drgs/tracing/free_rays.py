@@ -20,7 +20,7 @@ import drjit as dr
 import numpy as np
 
 from drgs.cameras import Camera
-from drgs.lenses import LENS_MODELS
+from drgs.cameras.lenses import LENS_MODELS
 from drgs.tracing import records as layout
 from drgs.tracing.arrays import Float, Int32, Lib, Mask, UInt32
 from drgs.tracing.lens_rays import NARROW, LensRays, guides_of, tile_boxes

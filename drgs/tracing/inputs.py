@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from drgs.cameras import Camera, check_camera
+from drgs.checks.arguments import ArgumentError, must_be
 from drgs.ellipsoids import Gaussians, Scene, check_any_scene, check_gaussians
-from drgs.guards.arguments import ArgumentError, must_be
 from drgs.settings import check_settings
 
 __all__ = ["check_scene", "check_view", "gaussians_at"]

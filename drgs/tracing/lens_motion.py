@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from drgs.cameras import Camera
-from drgs.lenses import LENS_MODELS, distorted, equirectangular, linear_part
+from drgs.cameras.lenses import LENS_MODELS, distorted, equirectangular, linear_part
 
 __all__ = ["LensMotion"]
 

@@ -26,7 +26,7 @@ import drjit as dr
 import numpy as np
 
 from drgs.cameras import Camera
-from drgs.lenses import LENS_MODELS, Guide
+from drgs.cameras.lenses import LENS_MODELS, Guide
 from drgs.tracing import records as layout
 from drgs.tracing.arrays import Float, Int32, Lib, Mask, UInt32
 from drgs.tracing.pose import local_rays

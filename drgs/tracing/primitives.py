@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 
 import drjit as dr
 
-from drgs.lenses import Guide
+from drgs.cameras.lenses import Guide
 from drgs.settings import RenderSettings
 from drgs.tracing.arrays import Float, Lib, Mask
 from drgs.tracing.harmonics import sh_basis, sh_color

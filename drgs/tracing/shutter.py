@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from drgs.cameras import Camera
-from drgs.shutters import BY_COLUMN, line_times
+from drgs.cameras.shutters import BY_COLUMN, line_times
 
 __all__ = ["middle_pose", "rolling_view"]
 

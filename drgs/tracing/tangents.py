@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import torch
 
-from drgs.guards import memory
+from drgs.runtime import memory
 from drgs.settings import EPS_ALPHA
 from drgs.tracing.bridge import to_drjit
 from drgs.tracing.call import OF_VIEW, Call, Output, checked_pixel_rays, numbers

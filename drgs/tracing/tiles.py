@@ -17,7 +17,7 @@ import drjit as dr
 import torch
 
 from drgs import runtime
-from drgs.guards import memory
+from drgs.runtime import memory
 from drgs.settings import RenderSettings
 from drgs.tracing import records as layout
 from drgs.tracing.arrays import Float, Int32, Lib, Mask, UInt32, UInt64

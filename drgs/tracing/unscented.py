@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from drgs.cameras import Camera
-from drgs.lenses import angle_polynomial, distorted, fisheye_polynomial
+from drgs.cameras.lenses import angle_polynomial, distorted, fisheye_polynomial
 from drgs.tracing.arrays import Float, Lib, Mask
 from drgs.tracing.primitives import Activated
 

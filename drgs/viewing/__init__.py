@@ -13,6 +13,6 @@ client        the browser's cameras and Gaussians, and ours
 placed_views  where photographs were taken, or could be
 """
 
-from drgs.guards.imports import modules_of
+from drgs.checks.imports import modules_of
 
 __getattr__ = modules_of(__name__)

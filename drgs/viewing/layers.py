@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import torch
 
+from drgs.cameras.sizes import at_most, cropped
 from drgs.display import pictures
 from drgs.ellipsoids import colors_only
 from drgs.gain import Information, Prior, check, variances
 from drgs.information.sums import add
 from drgs.integrator import Output, render
-from drgs.sizes import at_most, cropped
 
 if TYPE_CHECKING:
     import torch

@@ -353,7 +353,7 @@ class Component:
         """The line on stderr for an event of the log that is its own; None: none."""
 
     def evaluation(self, fit: Fit, held_out: list[Frame]) -> dict[str, Any]:
-        """Arguments of `drgs.metrics.evaluate`."""
+        """Arguments of `drgs.fitting.metrics.evaluate`."""
         return {}
 
     def metrics(self, fit: Fit, held_out: list[Frame]) -> dict[str, Any]:

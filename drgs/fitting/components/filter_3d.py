@@ -26,8 +26,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from drgs.cameras.lenses import LENS_MODELS
 from drgs.fitting.components.base import Checkpoint, Component, Conflict, Fit, Setup
-from drgs.lenses import LENS_MODELS
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from drgs.cameras import Camera
+from drgs.cameras.sizes import at_most
 from drgs.display.progress import Bar
 from drgs.fitting.components.base import Component, Conflict, Fit, Setup
 from drgs.fitting.renderers import RendererSchedule, planar_of
-from drgs.sizes import at_most
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

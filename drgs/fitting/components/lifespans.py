@@ -35,6 +35,7 @@ import numpy as np
 import torch
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d
 
+from drgs.cameras.sizes import reduced_size
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
 from drgs.fitting.components.base import Checkpoint, Component, Fit, Setup
@@ -42,7 +43,6 @@ from drgs.fitting.components.motion import WARM_UP, MotionComponent, limited_lif
 from drgs.fitting.rates import means_rate
 from drgs.fitting.stages import dynamic_stage, shows_first_time, spacing
 from drgs.integrator import render
-from drgs.sizes import reduced_size
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from drgs.cameras.sizes import at_most
 from drgs.data.camera_lists import save_cameras_json
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
@@ -36,7 +37,6 @@ from drgs.fitting.components.base import Checkpoint, Component, Conflict, Fit, R
 from drgs.fitting.losses import psnr
 from drgs.fitting.networks import Network
 from drgs.integrator import render, render_jvp
-from drgs.sizes import at_most
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from drgs.checks.registry import Registry
 from drgs.fitting.components.base import Component
-from drgs.guards.registry import Registry
 
 __all__ = ["COMPONENTS", "components_of"]
 

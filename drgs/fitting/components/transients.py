@@ -22,11 +22,11 @@ import numpy as np
 import torch
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d, pad
 
+from drgs.cameras.sizes import reduced_size
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
 from drgs.fitting.components.base import Checkpoint, Component, Conflict, Fit, Setup
 from drgs.integrator import render
-from drgs.sizes import reduced_size
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.shutters import BY_COLUMN, FORWARD
+from drgs.cameras.shutters import BY_COLUMN, FORWARD
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

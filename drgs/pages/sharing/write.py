@@ -13,11 +13,11 @@ from drgs.codecs.clustering import morton_order
 from drgs.data.camera_layout import middle_camera
 from drgs.display.progress import Bar
 from drgs.io.outputs import atomic_write
-from drgs.sharing.gaussians import archive_of
-from drgs.sharing.layers import moments_of, uncertainty_layer
-from drgs.sharing.npm import viewer_files
-from drgs.sharing.page import scene_html
-from drgs.sharing.placing import PhotoKind, columns, photo, upright_matrix
+from drgs.pages.sharing.gaussians import archive_of
+from drgs.pages.sharing.layers import moments_of, uncertainty_layer
+from drgs.pages.sharing.npm import viewer_files
+from drgs.pages.sharing.page import scene_html
+from drgs.pages.sharing.placing import PhotoKind, columns, photo, upright_matrix
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

@@ -21,7 +21,7 @@ __all__ = ["BuildWithViewer"]
 
 
 class BuildWithViewer(build_py):
-    """`build_py`, and the packages of `drgs.sharing.npm` beside the modules."""
+    """`build_py`, and the packages of `drgs.pages.sharing.npm` beside the modules."""
 
     def run(self) -> None:
         """Without a network a wheel goes without it, which is said: `drgs share` then fetches it at first use."""
@@ -35,7 +35,7 @@ class BuildWithViewer(build_py):
             return
         for package in _npm().PACKAGES:
             for name in package.files:
-                target = Path(self.build_lib) / "drgs" / "sharing" / "npm" / package.folder / name
+                target = Path(self.build_lib) / "drgs" / "pages" / "sharing" / "npm" / package.folder / name
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(viewer / package.folder / name, target)
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
+from drgs.cameras.sizes import reduced_size
 from drgs.display.pictures import file_names
 from drgs.fitting.components.base import RunViews
 from drgs.fitting.components.table import COMPONENTS
 from drgs.fitting.frames import frames_for, load_dataset
+from drgs.fitting.metrics import VIEW_PICTURES, Lpips, evaluate, through_renderers, write_metrics
 from drgs.fitting.records import fit_record, fitted_views, load_run
 from drgs.fitting.renderers import renderers_to_measure
 from drgs.fitting.stages import moving_labels
-from drgs.metrics import VIEW_PICTURES, Lpips, evaluate, through_renderers, write_metrics
-from drgs.sizes import reduced_size
 
 if TYPE_CHECKING:
     from drgs.data import Dataset, View
@@ -41,7 +41,7 @@ def evaluate_run(
         run: What to measure.
         output: Its folder, as `drgs.fitting.resume.lock_run` returns it.
         split: `test`, `train` (of an active fit the views that it saw) or `all`.
-        lpips: LPIPS for `drgs.metrics.evaluate`.
+        lpips: LPIPS for `drgs.fitting.metrics.evaluate`.
         strict: Refuse a data set some of whose images are missing.
         renderer: Preset to measure with beside the run's own settings, or `all`; None: those that it was fitted for,
             and what viewers draw with.

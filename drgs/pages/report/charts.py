@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from drgs.cameras import Camera
-    from drgs.report.account import Account
+    from drgs.pages.report.account import Account
 
 __all__ = ["camera_map", "is_available", "progress", "score_bars"]
 

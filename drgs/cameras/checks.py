@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from drgs.guards.arguments import ArgumentError, kind_of
-from drgs.lenses import LENS_MODELS
-from drgs.shutters import SHUTTERS
+from drgs.cameras.lenses import LENS_MODELS
+from drgs.cameras.shutters import SHUTTERS
+from drgs.checks.arguments import ArgumentError, kind_of
 
 __all__ = [
     "IMAGE_MAX",
@@ -49,7 +49,7 @@ def as_numpy(value: Any) -> np.ndarray:
     """An array of what is an array, a list or a torch tensor (detached)."""
     if not is_tensor(value):
         return np.asarray(value)
-    from drgs.guards.derivatives import unwrapped
+    from drgs.checks.derivatives import unwrapped
 
     def array(x: Any) -> np.ndarray:
         # NumPy has no bfloat16, nor torch's floats of 8 bits; float32 has all of their values.
@@ -67,7 +67,7 @@ def read_only(array: np.ndarray) -> np.ndarray:
 
 def _numbers(where: str, name: str, value: Any) -> np.ndarray:
     if is_tensor(value):
-        from drgs.guards.derivatives import check_has_numbers
+        from drgs.checks.derivatives import check_has_numbers
 
         check_has_numbers(where, name, value)
     try:

@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any
 from drgs.display.progress import duration
 from drgs.fitting.components.table import COMPONENTS
 from drgs.fitting.config import FitConfig, SelectionConfig
-from drgs.metrics import MOVING, OBJECT, renderers_table
-from drgs.report.pictures import Picture
+from drgs.fitting.metrics import MOVING, OBJECT, renderers_table
+from drgs.pages.report.pictures import Picture
 
 if TYPE_CHECKING:
-    from drgs.report.account import Account
+    from drgs.pages.report.account import Account
 
 __all__ = ["GENERATOR", "Shown", "page_html"]
 

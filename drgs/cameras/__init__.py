@@ -30,8 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from drgs.guards.arguments import ArgumentError, kind_of, must_be
-from drgs.guards.camera_checks import (
+from drgs.cameras.checks import (
     IMAGE_MAX,
     as_numpy,
     check_proportions,
@@ -44,9 +43,10 @@ from drgs.guards.camera_checks import (
     is_tensor,
     read_only,
 )
-from drgs.lenses import LENS_MODELS
+from drgs.cameras.lenses import LENS_MODELS
+from drgs.cameras.shutters import BY_COLUMN, FORWARD, line_poses, line_times, points_seen, turn_between
+from drgs.checks.arguments import ArgumentError, kind_of, must_be
 from drgs.runtime import uncompiled
-from drgs.shutters import BY_COLUMN, FORWARD, line_poses, line_times, points_seen, turn_between
 
 __all__ = [
     "Camera",
@@ -94,7 +94,8 @@ class Camera:
         name: Name in messages and of files.
         time: Time at which the view was taken, in the scene's unit of time (0 to 1 over a sequence in most data sets),
             or None where that does not matter.
-        shutter: One of `drgs.shutters.SHUTTERS`: `global`, or which way lines of the image are exposed while the camera
+        shutter: One of `drgs.cameras.shutters.SHUTTERS`: `global`, or which way lines of the image are exposed while
+        the camera
             moves from w2c to w2c_end, e.g. `rolling_top_to_bottom`.
         w2c_end: (4,4) world to camera when the last line is exposed, as w2c; None of a global shutter. The pose of each
             line is between the two: shutters.py.

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from drgs.cameras.sizes import at_most
 from drgs.data.camera_layout import Focus, upright
 from drgs.fitting.records import fitted_views, load_run
 from drgs.fitting.renderers import VIEWERS, planar_of
 from drgs.information.nuisances import Nuisances
 from drgs.meshing.depths import seen_distance
-from drgs.report.pictures import spread
-from drgs.sharing.layers import classes_layer, uncertainty_of
-from drgs.sharing.write import Shared
-from drgs.sizes import at_most
+from drgs.pages.report.pictures import spread
+from drgs.pages.sharing.layers import classes_layer, uncertainty_of
+from drgs.pages.sharing.write import Shared
 from drgs.viewing.placed_views import NEXT, Ranking, placed_views_of, read_ranking
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.fitting.records import LoadedRun
     from drgs.io.run import Run
-    from drgs.sharing.placing import PhotoKind
+    from drgs.pages.sharing.placing import PhotoKind
 
 __all__ = ["FILE", "MOMENTS", "scene_of_file", "scene_of_run"]
 

@@ -17,9 +17,9 @@ from typing import Any, TypedDict
 import torch
 
 from drgs.cameras import Camera
+from drgs.checks.arguments import ArgumentError
+from drgs.checks.derivatives import check_has_numbers, unwrapped
 from drgs.ellipsoids import Y_00, Gaussians
-from drgs.guards.arguments import ArgumentError
-from drgs.guards.derivatives import check_has_numbers, unwrapped
 
 __all__ = [
     "SplatScene",

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import torch
 
-from drgs.guards.arguments import ArgumentError
+from drgs.checks.arguments import ArgumentError
 
 __all__ = ["factors", "strained"]
 

@@ -10,6 +10,6 @@ npm         the viewer's code, fetched by version and hash
 wheel       the step that puts it into a wheel
 """
 
-from drgs.guards.imports import modules_of
+from drgs.checks.imports import modules_of
 
 __getattr__ = modules_of(__name__)

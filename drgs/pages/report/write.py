@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.cameras.sizes import at_most
 from drgs.data.camera_lists import camera_from_json
 from drgs.display.progress import Bar
 from drgs.fitting.records import load_run
 from drgs.information.nuisances import Nuisances
 from drgs.io.outputs import atomic_write
 from drgs.io.run import Run
-from drgs.report import charts, pictures
-from drgs.report.account import Account, account_of
-from drgs.report.page import Shown, page_html
-from drgs.sizes import at_most
+from drgs.pages.report import charts, pictures
+from drgs.pages.report.account import Account, account_of
+from drgs.pages.report.page import Shown, page_html
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera

@@ -17,7 +17,7 @@ import typing
 from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar, Self
 
-from drgs.guards.arguments import ArgumentError, check_fields, kind_of, must_be
+from drgs.checks.arguments import ArgumentError, check_fields, kind_of, must_be
 
 __all__ = [
     "TRANSIENT",

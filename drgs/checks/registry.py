@@ -7,7 +7,7 @@ import importlib
 from collections.abc import Iterator, Mapping, MutableMapping
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from drgs.guards.imports import imported_function
+from drgs.checks.imports import imported_function
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint

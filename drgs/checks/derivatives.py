@@ -11,7 +11,7 @@ from typing import Any, NoReturn, TypeVar
 
 import torch
 
-from drgs.guards.arguments import ArgumentError
+from drgs.checks.arguments import ArgumentError
 
 __all__ = [
     "check_has_numbers",

@@ -17,8 +17,8 @@ from drgs.display.pictures import file_names, write_png
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
 from drgs.fitting.losses import psnr
-from drgs.guards.archives import check_archive
 from drgs.integrator import render
+from drgs.io.archives import check_archive
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import write_json
 from drgs.settings import RenderSettings

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from drgs.sharing.npm import PACKAGES
+from drgs.pages.sharing.npm import PACKAGES
 
 __all__ = ["SHARED_BY", "scene_html"]
 

@@ -23,7 +23,7 @@ __all__ = ["PACKAGED", "PACKAGES", "Package", "fetch_into", "viewer_files"]
 PACKAGED = Path(__file__).parent / "npm"
 """Where a wheel has the files of the packages, in a folder for each."""
 
-_log = logging.getLogger("drgs.sharing.npm")  # by this name where it is loaded by itself, too
+_log = logging.getLogger("drgs.pages.sharing.npm")  # by this name where it is loaded by itself, too
 _TIMEOUT = 60.0  # seconds without an answer
 _LARGEST = 64 << 20  # bytes of an archive
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Scene
     from drgs.information.choices import Block
     from drgs.information.nuisances import Nuisances
-    from drgs.report.account import Account
+    from drgs.pages.report.account import Account
     from drgs.settings import RenderSettings
 
 __all__ = ["Picture", "jpeg", "maps", "previews", "spread", "stills", "uncertain", "view_pictures"]

@@ -1,0 +1,1 @@
+"""Arguments and names that are refused in one line, where they are wrong."""

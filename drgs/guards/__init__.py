@@ -1,1 +1,0 @@
-"""What keeps bad input out, and files that drgs did not make as they were."""
