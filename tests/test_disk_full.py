@@ -6,6 +6,7 @@ import contextlib
 import os
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,6 @@ import torch
 from drgs import cli
 from drgs.display.progress import Bar
 from drgs.files import load_state
-from drgs.fitting.config import FitConfig
 
 WRITERS = """
 import os, resource, sys
@@ -163,12 +163,13 @@ def test_a_capture_goes_on_after_a_full_disk(disk, tmp_path, capsys, monkeypatch
     from test_sfm import corner_camera, corner_photo, corner_walls, write_photo
     from test_share import write_viewer
 
+    from drgs.commands import capture
     from drgs.pages.sharing import npm
 
     write_viewer(tmp_path / "npm")
     monkeypatch.setattr(npm, "PACKAGED", tmp_path / "npm")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(FitConfig, "of", lambda **_: CONFIG)
+    monkeypatch.setattr(capture, "FitConfig", lambda: types.SimpleNamespace(replace=lambda **_: CONFIG))
     walls = corner_walls(np.random.default_rng(5))
     (tmp_path / "photos").mkdir()
     for index in range(3):

@@ -20,7 +20,7 @@ from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.data.images import read_image
 from drgs.data.point_ply import read_point_ply
 from drgs.files import Run, load_ply, load_state, save_ply, save_state
-from drgs.fitting.config import FitConfig
+from drgs.fitting.config import FitConfig, SelectionConfig
 from drgs.fitting.frames import Frame
 from drgs.fitting.records import check_checkpoint, fitted_views
 from drgs.fitting.rows import GaussianRows
@@ -147,10 +147,11 @@ def test_images(tmp_path, damage, capfd, suffix):
 def test_run_records(tmp_path, damage):
     """150 edits of config.json and of selection.json each."""
     fit = FitConfig().to_json()
-    good = {"schema": SCHEMA, "data": "/x", "train": ["a", "b"], "test": ["c"], "fit": fit, "active": None}
+    good = {"schema": SCHEMA, "data": "/x", "train": ["a", "b"], "test": ["c"], "fit": fit}
     path = tmp_path / "config.json"
     attempt(lambda: fitted_views(Run(tmp_path)), path, (damaged_json(good, damage) for _ in range(150)))
-    path.write_text(json.dumps(good | {"active": {"add": 1}}))
+    active = FitConfig(selection=SelectionConfig(add=1)).to_json()
+    path.write_text(json.dumps(good | {"fit": active}))
     chosen = {"start": [{"index": 0, "name": "a"}], "picks": [{"index": 1, "name": "b", "score": 1.0}]}
     versions = (damaged_json(chosen, damage) for _ in range(150))
     attempt(lambda: fitted_views(Run(tmp_path)), tmp_path / "selection.json", versions)
