@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -71,7 +72,9 @@ def test_command_help(name, capsys):
         cli.main([name, "--help"])
     assert not end.value.code
     text = capsys.readouterr().out
-    assert f"usage: drgs {name}" in text
+    usage = text.splitlines()[0]
+    assert usage.startswith(f"usage: drgs {name}")
+    assert re.search(r" --\w+ .*[A-Z]+ [A-Z]+ \[", usage) is None, "what stands without an option comes first"
     assert all(option in text for option in ("--debug", "--quiet", "--variant", "--threads"))
 
 

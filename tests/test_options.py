@@ -95,7 +95,8 @@ def test_one_field_is_an_option_everywhere():
         ("x -o y --share 2", r"--share must be in \[0, 1\], got 2; correct it"),
         ("x -o y --size 3", "--size must have 2 values, got 3"),
         ("x -o y --kind tow", "--kind must be one of one, two, got 'tow'; did you mean two"),
-        ("x -o y --loud=yes", "--loud must be without a value, got 'yes'"),
+        ("x -o y --loud=yes", "--loud must be without a value, got 'yes'; drop it, or say --no-loud"),
+        ("x -o y --no-loud=3", "--no-loud must be without a value, got '3'; drop it, or say --loud"),
         ("x -o y --no-count 3", "got --no-count"),
     ],
 )

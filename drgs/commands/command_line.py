@@ -92,7 +92,8 @@ def _read(options: Mapping[str, Option], words: Sequence[str]) -> dict[str, Any]
             raise ValueError(f"options must be those of the command, got {flag}; {near}")
         if option.hint is bool:
             if equals:
-                raise ValueError(f"{flag} must be without a value, got {value!r}; drop it, or say --no-{flag[2:]}")
+                opposite = option.flag if is_no else f"--no-{option.flag[2:]}"
+                raise ValueError(f"{flag} must be without a value, got {value!r}; drop it, or say {opposite}")
             given[option.name] = not is_no
             continue
         value = _values(option, [value] if equals else _taken(option, left))
@@ -314,7 +315,8 @@ def help_page(command: str, kind: type[Common], words: Sequence[str] = ()) -> st
     options = {name: option for name, option in options_in(kind).items() if not option.spec.file_only}
     defaults = _of_file(kind, _config_of(words)) if "config" in options else {}
     shown = [option for option in options.values() if everything or not option.spec.rare]
-    wanted = [option for option in shown if option.spec.positional or _is_required(option)]
+    wanted = [option for option in shown if option.spec.positional]
+    wanted += [option for option in shown if _is_required(option) and not option.spec.positional]
     usage = [_flags(option).split(", ")[-1] for option in wanted]
     lines = [f"usage: drgs {command} {' '.join([*usage, '[options]'])}", ""]
     lines += textwrap.wrap(" ".join((kind.__doc__ or "").split()), width)
