@@ -22,6 +22,11 @@ Importing this package imports none of its heavy dependencies; names and modules
 from __future__ import annotations
 
 import importlib
+import importlib.abc
+import importlib.util
+import sys
+from importlib.machinery import ModuleSpec
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from drgs import runtime
@@ -191,6 +196,28 @@ if TYPE_CHECKING:
     from drgs.select import select as select_views
     from drgs.settings import RenderSettings
     from drgs.train import FitConfig, SelectionConfig, fit
+
+
+class _ByPublicName(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Imports a module by its name in `_MODULES`, as in `from drgs.metrics import psnr`: the same module, no copy."""
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
+        public = name.removeprefix("drgs.")
+        is_elsewhere = public != name and _MODULES.get(public, public) != public
+        return importlib.util.spec_from_loader(name, self) if is_elsewhere else None
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        module = importlib.import_module(f"drgs.{_MODULES[spec.name.removeprefix('drgs.')]}")
+        spec.loader_state = module.__spec__
+        return module
+
+    def exec_module(self, module: ModuleType) -> None:
+        assert module.__spec__ is not None  # importlib has just put that of the public name there
+        module.__spec__ = module.__spec__.loader_state
+
+
+# Last: modules that are where their names say never come here.
+sys.meta_path.append(_ByPublicName())
 
 # Before anything can import drjit: it loads libLLVM at once, and the wrong one aborts the process.
 runtime.prepare()

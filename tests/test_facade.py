@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import re
 import subprocess
@@ -46,6 +47,26 @@ def test_a_plain_import_is_enough():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("name", sorted(name for name, place in drgs._MODULES.items() if name != place))
+def test_a_module_is_imported_by_its_public_name(name):
+    """`from drgs.metrics import psnr` works wherever the module stands, and gives that module, not a second copy."""
+    module = importlib.import_module(f"drgs.{name}")
+    assert module is importlib.import_module(f"drgs.{drgs._MODULES[name]}") is getattr(drgs, name)
+    assert module.__spec__.name == module.__name__ == f"drgs.{drgs._MODULES[name]}"
+    with pytest.raises(ModuleNotFoundError, match=f"drgs.data.{name}'"):
+        importlib.import_module(f"drgs.data.{name}")
+
+
+def test_points_are_functions_of_data_too():
+    """`drgs.data.initial_points`, as in 0.2.0, is that of structure from motion; other names are refused."""
+    from drgs.data import initial_points
+    from drgs.sfm import points
+
+    assert initial_points is points.initial_points
+    assert all(getattr(drgs.data, name) is getattr(points, name) for name in points.__all__)
+    assert not hasattr(drgs.data, "initial_pionts")
 
 
 def test_what_users_import_is_public():
