@@ -519,6 +519,9 @@ class Planner:
         finally:
             self._cache.computes = True
         now = time.monotonic()
+        if self._cache.forgot_saved:  # a file of another version named quantities otherwise: they are computed now
+            self._cache.forgot_saved = False
+            return self._plan(k, None if seconds is None else max(seconds - (now - begun), 0.0))
         self._answer_seconds.note((now - answering) / calls)
         return dataclasses.replace(plan, computed=computed, seconds=now - begun)
 

@@ -96,6 +96,7 @@ class Cache:
         computes: With a bound, whether views that have changed by more are to be computed anew. If not, what is kept is
             used as it is, and `NotKept` is raised where nothing is.
         changes: Camera, as `camera_key` gives it -> largest change of what was used of it since this was emptied.
+        forgot_saved: Whether what a file had was forgotten, because other quantities were looked for (`restore`).
         bytes: Bytes of all tensors that are kept now.
         hits, misses: Views that were kept, and that were computed, so far. With the block `backdrop` a view counts
             twice: its information, and how far away its surfaces are.
@@ -126,6 +127,7 @@ class Cache:
         self._now: tuple[Scene | None, Shapes] | None = None  # with one: the scene, and what of it is compared
         self._cameras: dict[Hashable, Camera] = {}  # that are expected
         self._seen: dict[Hashable, torch.Tensor] = {}  # camera -> (N,) how much of its image each Gaussian makes up
+        self.forgot_saved = False
         self._unclaimed: set[str] = set()  # quantities of a file that have not been looked for again
         # To the Gaussians as they are now: id of shapes -> (N,); key -> of its view.
         self._changes: dict[int, torch.Tensor] = {}
@@ -391,9 +393,10 @@ class Cache:
             name = named_by(quantity)
             if name not in self._unclaimed:
                 if all(key.quantity != quantity for key in self._views()):  # other quantities are computed now
-                    for key in [key for key in self._views() if isinstance(key.quantity, _Saved)]:
+                    for key in self._views():  # what is left of a view would say that nothing of it has changed
                         self._forget(key)
                     self._unclaimed.clear()
+                    self.forgot_saved = True
                 return
             self._unclaimed.discard(name)
             saved = _Saved(name)
