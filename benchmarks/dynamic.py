@@ -220,7 +220,7 @@ def main() -> None:
     }
     first = made[next(iter(shares))]
     if args.run is None:
-        result["pick"] = pick(first.parts.scene(first.rows), shown)
+        result["pick"] = pick(first.scene(), shown)
     print(json.dumps(result))
     print(table([result]))
     if not args.quick:

@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+import types
 
 import pytest
 from doc_pages import PAGES, ROOT, blocks, elsewhere, figures, inline_commands, lines_of, make_folder, smaller
@@ -51,7 +52,9 @@ def test_blocks_run(page, made, tmp_path, monkeypatch, capsys):
     monkeypatch.syspath_prepend(folder)
     for registry in (POLICIES, CRITERIA, BLOCKS, RESPONSES, LOADERS, CODECS):  # which pages add to
         monkeypatch.setattr(registry, "_rows", dict(registry._rows))
-    names: dict = {"__name__": "docs"}
+    module = types.ModuleType("docs")  # in which classes of a page find their annotations, as in a script
+    monkeypatch.setitem(sys.modules, "docs", module)
+    names = vars(module)
     for block in blocks(page):
         where = f"{_name(page)}:{block.line}"
         if block.language == "python":
