@@ -160,7 +160,10 @@ def _lazy(folder: Path) -> None:
     from drgs.data import load
 
     load(folder)
-    load(folder, lazy=True, points=False)  # of what is whole, without what is not needed
+    dataset = load(folder, lazy=True, points=False)  # of what is whole, without what is not needed
+    dataset.split()
+    for view in dataset.views:
+        _ = view.camera.undistorted().resized(4, 4).c2w  # as commands do
 
 
 def _cameras(folder: Path) -> None:

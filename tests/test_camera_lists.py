@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import zlib
 
 import numpy as np
 import pytest
@@ -156,3 +157,25 @@ def test_a_transposed_pose_is_refused(tmp_path):
     path.write_text(json.dumps([value]))
     with pytest.raises(ValueError, match=r"camera 0: the pose must be camera-to-world by rows .* is it transposed"):
         load_cameras_json(path)
+
+
+def test_json_has_limits(tmp_path):
+    """Nesting, integers of thousands of digits, and files that are not UTF-8 end in one line."""
+    path = tmp_path / "cameras.json"
+    for data, told in (
+        (b"[" * 200_000, "nested too deeply"),
+        (b'{"a":' * 100_000, "nested too deeply"),
+        (b"\xff\xfe[]", "must be valid JSON"),
+        (zlib.compress(b"[]"), "must be valid JSON"),
+    ):
+        path.write_bytes(data)
+        with pytest.raises(ValueError, match=told) as error:
+            load_cameras_json(path)
+        assert "\n" not in str(error.value)
+    entry = '{"width": 8, "height": 6, "fx": 9, "fy": 9, "position": [0, 0, %s], "rotation": [[1,0,0],[0,1,0],[0,0,1]]}'
+    for digits in (30, 400, 5000):
+        path.write_text("[" + entry % ("9" * digits) + "]")
+        with pytest.raises(ValueError, match=r"position\[2\] must be a finite number|must be within 1e\+15"):
+            load_cameras_json(path)
+    path.write_bytes(b"\xef\xbb\xbf[" + (entry % "1").encode() + b"]")  # Windows' mark of UTF-8
+    assert len(load_cameras_json(path)) == 1

@@ -447,6 +447,12 @@ def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict)
     queue = tensors["queue"]
     if queue.numel() and not (int(queue.min()) >= 0 and int(queue.max()) < len(header["views"])):
         raise ValueError(f"{path}: queue must hold numbers of the {len(header['views'])} views; {advice}")
+    for name in ("rng", "policy_rng"):
+        try:
+            if name in tensors:
+                torch.Generator().set_state(tensors[name])
+        except RuntimeError:
+            raise ValueError(f"{path}: {name} must be a state of torch's generator, is damaged; {advice}") from None
 
 
 def _expected(checkpoint: Checkpoint) -> dict[str, tuple[torch.dtype, tuple[int, ...]]]:
