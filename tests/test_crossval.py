@@ -26,7 +26,7 @@ from drgs.lab import rasterizers
 from drgs.lab.crossval import crossval
 from drgs.lab.parameters import PARAMETERS, depth_of, posed, raw_of, with_pose
 from drgs.lab.rasterizers import function
-from drgs.lab.verdicts import _extrapolated, central
+from drgs.lab.verdicts import central
 from drgs.testing import assert_matches, random_scene
 
 pytestmark = pytest.mark.usefixtures("functions_in_float64")
@@ -289,17 +289,6 @@ def test_central_differences(dtype):
         size = own.values[name].abs().max()
         assert (error <= own.uncertainty[name] + 1e-5 * size).double().mean() >= 0.8
         assert error.max() <= (1e-5 if dtype == torch.float64 else 5e-3) * size, name
-
-
-def test_extrapolation():
-    """Differences that converge with h^2 give a value, others none."""
-    smooth = [3 + 0.5 * h * h for h in (0.4, 0.2, 0.1, 0.05)]
-    value, error = _extrapolated(smooth, [1e-12] * 4)
-    assert abs(value - 3) <= error + 1e-9
-    assert error < 2e-3
-    assert _extrapolated([3 + 0.5 * h for h in (0.4, 0.2, 0.1, 0.05)], [1e-12] * 4)[0] is None
-    assert _extrapolated([1.0, 1.1, 2.0, 4.0], [1e-12] * 4)[0] is None
-    assert _extrapolated([0.0, 0.0, 0.0, 0.0], [1e-12] * 4) == (0.0, 1e-12)
 
 
 def test_entries_that_jump_are_left_out():
