@@ -141,22 +141,3 @@ def test_command(stage, tmp_path, monkeypatch, capsys):
     assert truth["pose_error"] == {"degrees": 1, "meters": 0}
     assert not truth["passer_by"]
     assert not (out / "light").exists()
-
-
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (["capture", "--views", "3"], "views must be at least 4, got 3"),
-        (["capture", "--pose-error", "1"], "--pose-error: must be DEGREES,METERS, got '1'"),
-        (["capture", "--pose-error", "11,0"], "pose_error must be degrees from 0 to 10 and meters from 0 to 0.1"),
-        (["room", "--exposure", "auto"], "--exposure: is for `drgs scene capture`, not for room"),
-        (["still_life", "--no-shadow"], "--no-shadow: is for `drgs scene capture`, not for still_life"),
-    ],
-)
-def test_bad_arguments(words, says, tmp_path, capsys):
-    """One line, exit code 2, nothing written."""
-    assert cli.main(["scene", words[0], "-o", str(tmp_path / "x"), *words[1:]]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert says in error
-    assert list(tmp_path.iterdir()) == []

@@ -101,17 +101,24 @@ def test_signal_ends_a_command(start, tmp_path, kind, signum, code, name):
     assert not list(tmp_path.iterdir())
 
 
-def test_an_operation_of_drjit_is_interrupted_as_python_is(monkeypatch):
-    """Most of a render is inside Dr.Jit's operation, which makes errors of its own of whatever is raised there."""
+@pytest.mark.parametrize(
+    ("owner", "name", "call"),
+    [(Compositor, "forward", drgs.render), (jacobian, "weighted_squares", drgs.diagonal)],
+    ids=["operation", "walk"],
+)
+def test_what_is_inside_of_drjit_is_interrupted_as_python_is(monkeypatch, owner, name, call):
+    """Most of a render is inside Dr.Jit's operation, which makes errors of its own of whatever is raised there;
+    information is asked in loops and branches that Dr.Jit traces, with no operation around them.
+    """
 
     def interrupted(*_):
         raise interrupts.Terminated(signal.SIGTERM)
 
-    monkeypatch.setattr(Compositor, "forward", interrupted)
+    monkeypatch.setattr(owner, name, interrupted)
     one = drgs.Gaussians.from_arrays([[0, 0, 2.0]], [[1.0, 0, 0, 0]], [[0.1] * 3], [0.5], [[[0.0] * 3]])
     K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
     with pytest.raises(interrupts.Terminated):
-        drgs.render(one, drgs.Camera(K=K, w2c=np.eye(4), width=8, height=8))
+        call(one, drgs.Camera(K=K, w2c=np.eye(4), width=8, height=8))
 
 
 def test_step_is_finished_and_the_same_signal_twice_is_one(start):
@@ -226,16 +233,3 @@ def test_pycolmap_is_imported_in_one_place():
     folder = Path(interrupts.__file__).parents[1]
     lines = [(path.name, line.strip()) for path in folder.rglob("*.py") for line in path.read_text().splitlines()]
     assert [name for name, line in lines if line == "import pycolmap"] == ["colmap_bindings.py"]
-
-
-def test_a_walk_is_interrupted_as_python_is(monkeypatch):
-    """Information is asked in loops and branches that Dr.Jit traces, with no operation around them."""
-
-    def interrupted(*_):
-        raise interrupts.Terminated(signal.SIGTERM)
-
-    monkeypatch.setattr(jacobian, "weighted_squares", interrupted)
-    one = drgs.Gaussians.from_arrays([[0, 0, 2.0]], [[1.0, 0, 0, 0]], [[0.1] * 3], [0.5], [[[0.0] * 3]])
-    K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
-    with pytest.raises(interrupts.Terminated):
-        drgs.diagonal(one, drgs.Camera(K=K, w2c=np.eye(4), width=8, height=8))

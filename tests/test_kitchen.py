@@ -320,31 +320,6 @@ def test_command(stage, tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out == ""
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (["--size", "4x4"], "width must be an integer from 8"),
-        (["--size", "24x17"], "width and height must be even, as videos have them, got 24x17"),
-        (["--cameras", "0"], "cameras must be an integer from 1"),
-        (["--times", "0"], "times must be an integer from 1"),
-        (["--seed", "-1"], "--seed must be in [0, 2147483647]"),
-        (["--teacher-size", "0x1"], "teacher_width must be an integer from 1"),
-        (
-            ["--views", "3"],
-            "--views: is for `drgs scene capture` and `drgs scene room` and `drgs scene still_life`, not for kitchen",
-        ),
-        (["--test-every", "3"], "--test-every: is for `drgs scene room`, not for kitchen"),
-    ],
-)
-def test_bad_arguments(words, says, tmp_path, capsys):
-    """One line, exit code 2, nothing written."""
-    assert cli.main(["scene", "kitchen", "-o", str(tmp_path / "x"), *words]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert says in error
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_video_that_cannot_be_written(tmp_path):
     """Where OpenCV cannot write a video, one line says so, and no broken file stays."""
     with pytest.raises(OSError, match="must be writable as FFV1"):

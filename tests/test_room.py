@@ -253,33 +253,3 @@ def test_command(built, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(room, "scene", lambda seed: pytest.fail("made again"))
     assert cli.main([*command, "--quiet"]) == 0
     assert capsys.readouterr().out == ""
-
-
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (["--size", "320"], "--size: must be WIDTHxHEIGHT, got '320'"),
-        (["--size", "4x4"], "width must be an integer from 8"),
-        (["--views", "0"], "views must be an integer from 1"),
-        (["--spp", "0"], "spp must be an integer from 1"),
-        (["--teacher-size", "0x1"], "teacher_width must be an integer from 1"),
-        (["--test-every", "1"], "test_every must be an integer from 2"),
-    ],
-)
-def test_bad_arguments(words, says, tmp_path, capsys):
-    """One line, exit code 2, nothing written."""
-    assert cli.main(["scene", "room", "-o", str(tmp_path / "x"), *words]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert says in error
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_still_life_has_no_teacher(tmp_path, capsys):
-    """An option of the room alone is refused for the still life, and a scene that is not there by name."""
-    assert cli.main(["scene", "still_life", "-o", str(tmp_path / "x"), "--teacher-size", "8x8"]) == 2
-    assert "is for `drgs scene room`" in capsys.readouterr().err
-    assert cli.main(["scene", "still_life", "-o", str(tmp_path / "x"), "--test-every", "3"]) == 2
-    assert "is for `drgs scene room`" in capsys.readouterr().err
-    assert cli.main(["scene", "bathroom", "-o", str(tmp_path / "x")]) == 2
-    assert "NAME must be one of room" in capsys.readouterr().err

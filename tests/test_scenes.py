@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from drgs import scenes
+from drgs import cli, scenes
 from drgs.scenes import output, still_life
 
 WIDTH, HEIGHT, VIEWS = 64, 48, 3
@@ -292,3 +292,43 @@ def test_bad_input(tmp_path, capsys):
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert "spp" in error
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("room --size 320", "--size: must be WIDTHxHEIGHT, got '320'"),
+        ("room --size 4x4", "width must be an integer from 8"),
+        ("room --views 0", "views must be an integer from 1"),
+        ("room --spp 0", "spp must be an integer from 1"),
+        ("room --teacher-size 0x1", "teacher_width must be an integer from 1"),
+        ("room --test-every 1", "test_every must be an integer from 2"),
+        ("kitchen --size 4x4", "width must be an integer from 8"),
+        ("kitchen --size 24x17", "width and height must be even, as videos have them, got 24x17"),
+        ("kitchen --cameras 0", "cameras must be an integer from 1"),
+        ("kitchen --times 0", "times must be an integer from 1"),
+        ("kitchen --seed -1", "--seed must be in [0, 2147483647]"),
+        ("kitchen --teacher-size 0x1", "teacher_width must be an integer from 1"),
+        (
+            "kitchen --views 3",
+            "--views: is for `drgs scene capture` and `drgs scene room` and `drgs scene still_life`, not for kitchen",
+        ),
+        ("kitchen --test-every 3", "--test-every: is for `drgs scene room`, not for kitchen"),
+        ("capture --views 3", "views must be at least 4, got 3"),
+        ("capture --pose-error 1", "--pose-error: must be DEGREES,METERS, got '1'"),
+        ("capture --pose-error 11,0", "pose_error must be degrees from 0 to 10 and meters from 0 to 0.1"),
+        ("room --exposure auto", "--exposure: is for `drgs scene capture`, not for room"),
+        ("still_life --no-shadow", "--no-shadow: is for `drgs scene capture`, not for still_life"),
+        ("still_life --teacher-size 8x8", "is for `drgs scene room`"),
+        ("still_life --test-every 3", "is for `drgs scene room`"),
+        ("bathroom", "NAME must be one of room"),
+    ],
+)
+def test_bad_arguments(words, says, tmp_path, capsys):
+    """Of every scene: one line, exit code 2, nothing written."""
+    name, *options = words.split()
+    assert cli.main(["scene", name, "-o", str(tmp_path / "x"), *options]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert says in error
+    assert list(tmp_path.iterdir()) == []
