@@ -17,7 +17,6 @@ from drgs.data import load
 from drgs.data.images import stated_size
 from drgs.data.view_checks import check_parallax
 from drgs.data.views import View
-from drgs.display import pictures
 from drgs.settings import RenderSettings
 from drgs.train import FitConfig
 
@@ -221,10 +220,3 @@ def test_truncated_photograph(tmp_path, capfd, caplog):
     assert drgs.data.images.read_image(path).shape == (64, 64, 3)
     assert "is damaged, part of it may be wrong (Corrupt JPEG data" in caplog.text
     assert not capfd.readouterr().err
-
-
-def test_file_names_do_not_meet():
-    """Names that are equal once they are file names, and those that a number would make equal, stay apart."""
-    names = pictures.file_names(["a_0002", "a", "a", "a/b", "a_b", ""])
-    assert names[:2] == ["a_0002", "a"]
-    assert len(set(names)) == 6

@@ -164,16 +164,6 @@ def test_a_mean_at_the_eye_is_ambiguous(eye, preset, traversal):
         assert (off < 1e-5).all()
 
 
-def test_negative_quaternion_is_the_same_rotation():
-    """q and -q, and any positive multiple, render the same image."""
-    rng = np.random.default_rng(0)
-    g, cam = gaussians(rng, 12, 4), camera(rng, (9, 7))
-    settings = RenderSettings.preset("exact")
-    a = render(g.detach(), cam, settings)
-    b = render(g.replace(quats=-g.quats).detach(), cam, settings)
-    assert torch.equal(a.rgb, b.rgb)
-
-
 def test_float32_means_far_away_are_warned_about():
     """Detail that float32 has already lost cannot be rendered: the constructor says so."""
     from drgs import Gaussians

@@ -5,19 +5,16 @@ from __future__ import annotations
 import concurrent.futures
 import dataclasses
 
-import drjit as dr
 import numpy as np
 import pytest
 import torch
 from scenes_random import assert_same_sums, camera, gaussians
 
-from drgs import fisher, runtime
+from drgs import fisher
 from drgs.ellipsoids import DeformableScene, Gaussians
 from drgs.fisher import SemanticMetric
 from drgs.integrator import render, render_jvp
 from drgs.settings import RenderSettings
-from drgs.tracing.bridge import to_drjit
-from drgs.tracing.field import Field
 
 FAST = RenderSettings.preset("fast", transmittance_min=1e-10)
 BVH = RenderSettings.preset("exact", traversal="bvh")
@@ -185,58 +182,6 @@ def test_errors_of_a_field_are_told_as_they_are(view):
         with pytest.raises(ValueError, match=r"^Swarm: time must be") as error:
             call()
         assert error.value is told
-
-
-def test_the_bridge_is_dr_wrap(view):
-    """Forward and once backward it has the bits of `dr.wrap` around the function itself; backward again, where that
-    fails, the same bits again; and it computes nothing for what no derivative is asked of."""
-    scene, cam = view
-    lib, names = runtime.dr_types(), ["means", "in.weight", "out.weight"]
-    given = {**scene.parameters(), "unused": torch.ones(2)}
-    scene.deform = lambda p, time: Swarm.deform(scene, {k: x for k, x in p.items() if k != "unused"}, time)
-    fields = list(scene.start.parameters())
-    itself = dr.wrap(source="drjit", target="torch")(Field(scene, cam.time, fields).values)
-    draw = [{name: torch.randn_like(given[name]) for name in some} for some in (names, fields, fields)]
-
-    def attached(function, some):
-        inputs = {name: to_drjit(lib, x) for name, x in given.items()}
-        dr.enable_grad([inputs[name] for name in some])
-        return inputs, function(inputs)
-
-    def forward(function):
-        inputs, out = attached(function, names)
-        for name in names:
-            dr.set_grad(inputs[name], to_drjit(lib, draw[0][name]))
-        dr.forward_to(list(out.values()), flags=dr.ADFlag.ClearEdges)
-        return [dr.grad(x).torch().clone() for x in out.values()]
-
-    def backward(function, cotangents):
-        inputs, out = attached(function, names)
-        found = []
-        for cotangent in cotangents:
-            for name, x in out.items():
-                dr.set_grad(x, to_drjit(lib, cotangent[name]))
-            dr.enqueue(dr.ADMode.Backward, list(out.values()))
-            dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
-            found.append([dr.grad(inputs[name]).torch().clone() for name in names])
-            for name in names:
-                dr.set_grad(inputs[name], 0)
-        return found
-
-    bridge = Field(scene, cam.time, fields)
-    del given["unused"]  # of which `dr.wrap` itself has no gradient, nor None to take for it
-    pairs = [*zip(forward(itself), forward(bridge), strict=True)]
-    first, again = backward(bridge, draw[1:])
-    pairs += [*zip(backward(itself, draw[1:2])[0], first, strict=True)]
-    pairs += [*zip(backward(itself, draw[2:])[0], again, strict=True)]
-    assert all(torch.equal(a, b) for a, b in pairs)
-    assert all(x.any() for x in (pairs[0][0], *first, *again))
-    given["unused"] = torch.ones(2)
-    inputs, out = attached(bridge, [*names, "unused"])
-    dr.backward_from(dr.sum(out["means"].array))
-    assert not dr.grad(inputs["unused"]).torch().any()
-    assert dr.grad(inputs["in.weight"]).torch().any()
-    assert dr.grad_enabled(inputs["sh"]) is False
 
 
 def test_threads_take_turns(view):

@@ -152,3 +152,6 @@ def test_names_of_pictures():
     assert len(set(found)) == len(names)
     assert max(len(name.encode()) for name in found) <= 110
     assert not any(name.startswith(".") or "/" in name for name in found)
+    found = file_names(["a_0002", "a", "a", "a/b", "a_b", ""])  # a number must not make two of them equal
+    assert found[:2] == ["a_0002", "a"]
+    assert len(set(found)) == 6

@@ -3,8 +3,6 @@
 import dataclasses
 import importlib
 import inspect
-import subprocess
-import sys
 import typing
 from pathlib import Path
 from typing import Literal
@@ -161,10 +159,3 @@ def test_a_command_is_a_module(name):
     run = importlib.import_module(f"drgs.commands.{name}").run
     (args,) = inspect.signature(run).parameters.values()
     assert (args.name, args.annotation) == ("args", cli.COMMANDS[name].__name__)
-
-
-def test_options_import_nothing_heavy():
-    """The lists and records that options are read from come without torch, NumPy and Dr.Jit."""
-    code = "import sys; import drgs.cli; print([x for x in ('torch', 'numpy', 'drjit', 'cv2') if x in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"

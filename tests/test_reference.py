@@ -94,14 +94,6 @@ def _rigid(rng):
     return motion, q
 
 
-def _multiply(q, p):
-    """Quaternion product of one wxyz quaternion with (N, 4)."""
-    w, v = q[0], torch.tensor(q[1:])
-    real = w * p[:, :1] - (p[:, 1:] * v).sum(1, keepdim=True)
-    cross = torch.linalg.cross(v.expand(len(p), 3), p[:, 1:])
-    return torch.cat([real, w * p[:, 1:] + p[:, :1] * v + cross], dim=1)
-
-
 # ------------------------------------------------------------------------------------ closed forms
 
 
@@ -131,20 +123,6 @@ def test_one_gaussian_peak():
     _close(out.visibility, [a + 0.8])
     assert out.count.tolist() == [1, 1]
     assert not out.ambiguous.any()
-
-
-def test_two_gaussians_peak():
-    """Front over back, whatever their index."""
-    near = {"mean": (0, 0, 3), "opacity": 0.4, "color": (1, 0, 0)}
-    far = {"mean": (0, 0, 5), "opacity": 0.9, "color": (0, 1, 0)}
-    for pair in ((near, far), (far, near)):
-        for order in ("center", "ray", "entry"):
-            out = _through(_gaussians(*pair), order=order, background=(0, 0, 1))
-            _close(out.rgb[0], [0.4, 0.54, 0.06])
-            _close(out.alpha, [0.94])
-            _close(out.depth, [(0.4 * 3 + 0.54 * 5) / 0.94])
-            _close(out.median_depth, [5])
-            assert out.count.item() == 2
 
 
 @pytest.mark.parametrize("response", ["peak", "integral"])
@@ -318,52 +296,6 @@ def test_ties_go_by_index():
     _close(out.alpha, [1 - 0.999**2000])
 
 
-def test_depth_key():
-    """A Gaussian at the side can be nearer in z and farther in distance."""
-    g = _gaussians(
-        {"mean": (0, 0, 4.2), "scale": 2, "color": (1, 0, 0)},
-        {"mean": (3, 0, 4.0), "scale": 2, "color": (0, 1, 0)},
-    )
-    rgb = {k: render(g, _camera(), _settings(depth_key=k)).rgb[3, 4] for k in ("z", "distance")}
-    assert rgb["distance"][0] > rgb["distance"][1]
-    assert rgb["z"][0] < rgb["distance"][0]
-    assert rgb["z"][1] > rgb["distance"][1]
-
-
-def test_near_plane():
-    """z <= near is culled by mean, and only when near > 0."""
-    items = [{"mean": (0, 0, z), "scale": 0.1, "opacity": 0.3} for z in (0.19, 0.2, 0.21, 3)]
-    cam = _camera()
-    assert render(_gaussians(*items), cam, _settings(near=0.2)).count[3, 4] == 2
-    assert render(_gaussians(*items), cam, _settings()).count[3, 4] == 4
-    out = render(_gaussians(*items), cam, _settings(near=0.2))
-    assert (out.visibility > 0).tolist() == [False, False, True, True]
-    assert out.ambiguous[3, 4]
-
-
-@pytest.mark.parametrize(("stop", "hits"), [("after", 3), ("before", 2), ("before_eq", 1)])
-def test_stop(stop, hits):
-    """T is 1/2, 1/4, 1/8 behind the hits; at 1/4 the three rules part."""
-    layers = [{"mean": (0, 0, 3 + i), "opacity": 0.5} for i in range(5)]
-    out = _through(_gaussians(*layers), stop=stop, transmittance_min=0.25, background=(1, 1, 1))
-    assert out.count.item() == hits
-    assert out.ambiguous.item()
-    _close(out.alpha, [1 - 0.5**hits])
-    _close(out.rgb[0, 0], 0.7 * (1 - 0.5**hits) + 0.5**hits)
-    clear = _through(_gaussians(*layers), stop=stop, transmittance_min=0.2)
-    assert clear.count.item() == (3 if stop == "after" else 2)
-
-
-def test_alpha_min():
-    """Hits below alpha_min are skipped and let light through."""
-    layers = [{"mean": (0, 0, 3), "opacity": 0.009}, {"mean": (0, 0, 4), "opacity": 0.011}]
-    out = _through(_gaussians(*layers), alpha_min=0.01)
-    _close(out.alpha, [0.011])
-    assert not out.ambiguous.item()
-    assert _through(_gaussians({"opacity": 0.01 + 1e-9}), alpha_min=0.01).ambiguous.item()
-    assert _through(_gaussians({"opacity": 0.01 - 1e-9}), alpha_min=0.01).ambiguous.item()
-
-
 @pytest.mark.parametrize("response", ["peak", "integral"])
 def test_alpha_max(response):
     """The clamp and both of its gradients, through the hit and through what lies behind."""
@@ -378,59 +310,6 @@ def test_alpha_max(response):
 
 
 # -------------------------------------------------------------------------------------- symmetries
-
-
-@pytest.mark.parametrize(("response", "order"), LEGAL)
-def test_permutation(rng, response, order):
-    """The order of the arrays does not matter; visibility follows it."""
-    g, cam, settings = _random(rng), _camera(), _settings(response, order)
-    p = torch.tensor(rng.permutation(6))
-    a = render(g, cam, settings)
-    b = render(SimpleNamespace(**{k: v[p] for k, v in vars(g).items()}), cam, settings)
-    for field in ("rgb", "alpha", "depth", "median_depth", "features"):
-        _close(getattr(a, field), getattr(b, field), 1e-13)
-    _close(a.visibility[p], b.visibility, 1e-12)
-    assert torch.equal(a.count, b.count)
-
-
-@pytest.mark.parametrize(("response", "order"), LEGAL)
-def test_rigid_motion(rng, response, order):
-    """Moving scene and camera together changes nothing (SH degree 0)."""
-    g, settings = _random(rng, K=1), _settings(response, order, near=0.1)
-    motion, q = _rigid(rng)
-    a = render(g, _camera(), settings)
-    means = g.means @ torch.tensor(motion[:3, :3]).T + torch.tensor(motion[:3, 3])
-    moved = SimpleNamespace(**{**vars(g), "means": means, "quats": _multiply(q, g.quats)})
-    b = render(moved, _camera(w2c=np.linalg.inv(motion)), settings)
-    for field in ("rgb", "alpha", "depth", "visibility"):
-        _close(getattr(a, field), getattr(b, field), 1e-11)
-
-
-def test_moving_the_colors_too(rng):
-    """Degree-1 SH turn as vectors: with them turned as well, nothing changes, in both directions.
-
-    Coefficients m = -1, 0, 1 multiply (-y, z, -x).
-    """
-    motion, q = _rigid(rng)
-    g = _random(rng, K=4)
-    turn = torch.tensor(motion[:3, :3])
-    vector = torch.stack([-g.sh[:, 3], -g.sh[:, 1], g.sh[:, 2]], 1)
-    x, y, z = torch.einsum("ij,njc->nic", turn, vector).unbind(1)
-    moved = SimpleNamespace(
-        **{
-            **vars(g),
-            "means": g.means @ turn.T + torch.tensor(motion[:3, 3]),
-            "quats": _multiply(q, g.quats),
-            "sh": torch.stack([g.sh[:, 0], -y, z, -x], 1),
-        }
-    )
-    for direction in ("gaussian", "ray"):
-        settings = _settings(order="ray", sh_direction=direction)
-        a, b = (
-            render(g, _camera(), settings),
-            render(moved, _camera(w2c=np.linalg.inv(motion)), settings),
-        )
-        _close(a.rgb, b.rgb, 1e-12)
 
 
 def test_quaternion_sign_and_length(rng):

@@ -15,7 +15,7 @@ import drgs
 from drgs import cli
 from drgs.files import Run, load_state, save_ply, save_state
 from drgs.fitting.records import load_run
-from drgs.fitting.resume import FILES, PREVIOUS, last_checkpoint
+from drgs.fitting.resume import FILES, PREVIOUS
 from drgs.io import locks
 from drgs.train import Trainer, fit
 
@@ -218,11 +218,6 @@ def test_outputs_are_checked_first(tmp_path, monkeypatch, capsys):
         assert error.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
     assert (tmp_path / "file").read_text() == "mine"
-
-
-def test_last_checkpoint_of_nothing(tmp_path):
-    """`--resume` in a script works on the first start."""
-    assert last_checkpoint(Run(tmp_path)) == (None, None)
 
 
 @pytest.mark.parametrize("options", ["", "--views active --policy random --add 1 --every 2"], ids=["all", "active"])

@@ -227,17 +227,6 @@ def test_import_is_light_and_prepares():
     assert best < 0.3
 
 
-def test_lazy_names():
-    """Names load on access; an unknown one is an AttributeError naming it."""
-    import drgs
-
-    assert drgs.runtime is runtime
-    assert drgs.RenderSettings.__module__ == "drgs.settings"
-    assert {"Camera", "Gaussians", "render", "load_ply"} <= set(dir(drgs))
-    with pytest.raises(AttributeError, match="no attribute 'splat'"):
-        drgs.splat  # noqa: B018
-
-
 def test_backend_computes():
     """The active backend runs the minimum that aborts the process on LLVM 15 and 16."""
     import drjit as dr

@@ -25,7 +25,6 @@ from drgs.io.locks import InUse
 from drgs.io.outputs import write_json
 from drgs.studies import cells as engine
 from drgs.studies.cells import Metric, Study, distinct_seeds, run_cell, run_cells
-from drgs.studies.experiments import EXPERIMENTS
 from drgs.studies.rows import Cell, append_row, cell_of, read_study
 from drgs.studies.statistics import (
     at_views,
@@ -697,62 +696,6 @@ def test_data_files_come_from_their_rows(monkeypatch):
     assert sorted(path.name for path in written) == ["predict-psnr.csv", "predict.csv", "uncertainty.csv"]
     for path, lines in written.items():
         assert path.read_text() == predict.studies.csv_text(lines), path.name
-
-
-def test_the_semantic_study_is_whole_units(monkeypatch, tmp_path):
-    """Whatever has run: all ten policies on a unit before the next, each scene's first unit before any second one, the
-    paper's protocol on the first room alone; every cell's configs are legal and all differ.
-    """
-    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
-    semantic = importlib.import_module("semantic")
-    monkeypatch.setattr(semantic, "distinct_seeds", lambda study, scene, split, count: list(range(count)))
-    for scale in semantic.SCALES:
-        study = semantic.study_of(scale, tmp_path)
-        cells = study.cells(semantic.units_of(study, 3))
-        assert len(cells) == len({cell.name for cell in cells}) == 3 * 5 * 10
-        for start in range(0, len(cells), 10):
-            assert [cell.policy for cell in cells[start : start + 10]] == list(study.policies)
-            assert len({dataclasses.replace(cell, policy="") for cell in cells[start : start + 10]}) == 1
-        assert [cell.seed for cell in cells] == sorted(cell.seed for cell in cells)
-        assert {cell.scene for cell in cells if cell.protocol == "paper"} == {"room-1"}
-        assert len({repr(study.config_of(cell)) for cell in cells[:10]}) == 10
-        assert {policy for pair in study.comparisons for policy in pair} <= set(study.policies)
-    assert not list(tmp_path.iterdir()), "nothing is made before it is needed"
-
-
-def test_the_kitchen_study_is_whole_units(monkeypatch, tmp_path):
-    """All policies on a unit before the next; their configs are legal and all differ; the page's table has the default
-    first and others below it, the data files every fit and every policy against random picks.
-    """
-    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
-    kitchen = importlib.import_module("kitchen")
-    for scale in kitchen.SCALES:
-        study = kitchen.study_of(scale, tmp_path)
-        cells = study.cells(kitchen.units_of(study, 3))
-        count = len(study.policies)
-        assert len(cells) == len({cell.name for cell in cells}) == 3 * count
-        assert [cell.policy for cell in cells] == 3 * list(study.policies)
-        assert len({repr(study.config_of(cell)) for cell in cells[:count]}) == count
-        assert {study.config_of(cell).data.test_cameras for cell in cells} == {("cam00",)}
-        rows = [
-            {
-                **row_of(cell.scene, (0, 0), cell.policy, psnr=number),
-                "study": study.name,
-                "camera": cell.camera,
-                "metrics": {metric.key: float(number) for metric in study.metrics},
-            }
-            for number, cell in enumerate(cells)
-        ]
-        text = kitchen.report(study, rows)
-        lines = [line.split(" | ")[0] for line in text.splitlines() if line.startswith("| `")]
-        assert lines == [f"| `{label}`" for label in (kitchen.DEFAULT, *kitchen.SHOWN)]
-        assert f"{len(cells)} fits" in text
-        assert len(list(kitchen.unit_lines(study, rows))) == 1 + len(cells)
-        compared = {(line[0], line[1]) for line in kitchen.difference_lines(study, rows)}
-        assert compared >= {(label, "random") for label in study.policies if label != "random"}
-        tables = [table.policies for table in EXPERIMENTS.values() if table.study == "dynamic"]
-        assert {label for policies in tables for label in policies} == set(study.policies)
-    assert not list(tmp_path.iterdir()), "nothing is made before it is needed"
 
 
 def test_auto_of_lenses_is_what_the_run_has_made_of_it(tmp_path):
