@@ -177,7 +177,7 @@ def pixels_of_webp(where: str, data: bytes, least: int, most: int) -> np.ndarray
     Raises:
         ValueError: If it is no lossless WebP image or of another size.
     """
-    import cv2  # a base dependency; its bytes are those of libwebp (tests/test_sog.py compares them with Pillow's)
+    import cv2  # a base dependency; its bytes are those of libwebp (tests/test_codecs.py compares them with Pillow's)
 
     width, height = _webp_size(where, data)
     if not least <= width * height <= most:
