@@ -1,4 +1,4 @@
-"""The documentation is run: every block of every page, its figures' commands, its links, the tests that it names."""
+"""The documentation is run: every block of every page, its figures' commands, its links."""
 
 from __future__ import annotations
 
