@@ -81,7 +81,7 @@ def measured(scene: str, run: Path, ground: tuple[float, ...], pictures: Path | 
     everything = load_frames(dataset.views, CONFIG.data.max_pixels)
     names = {view.name for view in dataset.split()[1]}
     moving = load_run(run).scene
-    shown = moving.moving | moving.living
+    shown = moving.moving | moving.has_lifespan
     rows, strips = [], []
     for frame in (frame for frame in everything if frame.name in names):
         at = moving.at(frame.camera.time)

@@ -22,7 +22,7 @@ from drgs.checks.arguments import ArgumentError, must_be
 from drgs.checks.derivatives import ends_of
 from drgs.dynamics.hexplane import HexPlane, corners_of, features, product
 from drgs.dynamics.jacobian import scene_jacobian
-from drgs.dynamics.lives import LIVES, Lives, drift, living, logit_at
+from drgs.dynamics.lifespans import LIFESPAN_PARAMETERS, Lifespans, drift, is_limited, logit_at
 from drgs.ellipsoids import Gaussians
 
 if TYPE_CHECKING:
@@ -251,7 +251,7 @@ class DynamicGaussians:
         gaussians: The canonical ones.
         field: What moves them.
         motion: (N,) logit of the gate; None: all move as the field says.
-        lives: Times at which each is there, and how it drifts; None: all are there all the time.
+        lifespans: When each is visible, and how it moves then; None: all are visible at all times.
     """
 
     def __init__(
@@ -259,7 +259,7 @@ class DynamicGaussians:
         gaussians: Gaussians,
         field: DeformationField,
         motion: torch.Tensor | None = None,
-        lives: Lives | None = None,
+        lifespans: Lifespans | None = None,
     ) -> None:
         must_be("DynamicGaussians", "gaussians", gaussians, Gaussians, "the canonical ones")
         must_be(
@@ -272,12 +272,12 @@ class DynamicGaussians:
                     f"DynamicGaussians: motion must be {len(gaussians)} floats, one a Gaussian, got {motion.dtype} of "
                     f"shape {tuple(motion.shape)}; pass None to let all move"
                 )
-        if lives is not None:
-            _check_lives(lives, len(gaussians))
+        if lifespans is not None:
+            _check_lifespans(lifespans, len(gaussians))
         self.gaussians = gaussians
         self.field = field
         self.motion = motion
-        self.lives = lives
+        self.lifespans = lifespans
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -287,26 +287,26 @@ class DynamicGaussians:
         """(N,) bool, which Gaussians the field is evaluated for."""
         if self.motion is None:
             return torch.ones(len(self), dtype=torch.bool, device=self.gaussians.means.device)
-        return self.motion.detach() >= 0  # who moves has no derivative
+        return self.motion.detach() >= 0  # the choice has no derivative
 
     @property
-    def living(self) -> torch.Tensor:
-        """(N,) bool, which Gaussians are there for a time alone."""
-        if self.lives is None:
+    def has_lifespan(self) -> torch.Tensor:
+        """(N,) bool, which Gaussians have a limited lifespan."""
+        if self.lifespans is None:
             return torch.zeros(len(self), dtype=torch.bool, device=self.gaussians.means.device)
         first, last = (float(x) for x in self.field.grid.span)
-        return living(self.lives.log_widths, last - first)
+        return is_limited(self.lifespans.log_widths, last - first)
 
-    def without_lives(self) -> DynamicGaussians:
-        """The same, all of them there all the time, where they are at their birth."""
+    def without_lifespans(self) -> DynamicGaussians:
+        """The same scene with unlimited lifespans: each mean is where it is at its reference time."""
         return DynamicGaussians(self.gaussians, self.field, self.motion)
 
     def parameters(self) -> dict[str, torch.Tensor]:
-        """Raw parameters of the Gaussians, `motion` if there is one, those of `lives`, and the field's: `phi.grid.*`,
-        `phi.mlp.*`.
+        """Raw parameters of the Gaussians, `motion` if there is one, those of `lifespans`, and the field's:
+        `phi.grid.*`, `phi.mlp.*`.
         """
         gate = {} if self.motion is None else {"motion": self.motion}
-        gate |= {} if self.lives is None else dict(zip(LIVES, self.lives, strict=False))
+        gate |= {} if self.lifespans is None else dict(zip(LIFESPAN_PARAMETERS, self.lifespans, strict=False))
         return self.gaussians.parameters() | gate | {PHI + name: x for name, x in self.field.named_parameters()}
 
     def at(self, time: float | torch.Tensor | None) -> Gaussians:
@@ -324,7 +324,7 @@ class DynamicGaussians:
         with torch.no_grad():  # a check, which leaves no graph
             checked = [*moved]
             checked += [] if self.motion is None else [self.motion]
-            checked += [] if self.lives is None else [seen.logit_opacities, *self.lives]
+            checked += [] if self.lifespans is None else [seen.logit_opacities, *self.lifespans]
             if not all(is_finite(x) for x in checked):
                 _name_what_is_not_finite(parameters, dict(zip(Deltas._fields, moved, strict=True)))
         return seen
@@ -336,12 +336,16 @@ class DynamicGaussians:
         fields = dict(parameters)
         phi = {name.removeprefix(PHI): fields.pop(name) for name in parameters if name.startswith(PHI)}
         motion = fields.pop("motion", None)
-        lives = None if self.lives is None else Lives.of(fields, self.lives.births.to(fields["means"].device))
-        fields = {name: x for name, x in fields.items() if name not in LIVES}
+        lifespans = (
+            None
+            if self.lifespans is None
+            else Lifespans.of(fields, self.lifespans.reference_times.to(fields["means"].device))
+        )
+        fields = {name: x for name, x in fields.items() if name not in LIFESPAN_PARAMETERS}
         means = fields["means"]
         index = None
         if motion is not None:
-            index = (motion.detach() >= 0).nonzero()[:, 0]  # who moves has no derivative
+            index = (motion.detach() >= 0).nonzero()[:, 0]  # the choice has no derivative
             means = means[index]
         deltas = self.field.evaluate(phi, means, time, self.gaussians.origin)
         for name, delta in zip(Deltas._fields, deltas, strict=True):
@@ -351,8 +355,8 @@ class DynamicGaussians:
             else:
                 factor = (0.5 * motion[index]).tanh()  # 2 sigmoid(m) - 1
                 fields[name] = fields[name].index_add(0, index, delta * factor.to(delta.dtype)[:, None])
-        if lives is not None:
-            self._live(fields, lives, time)
+        if lifespans is not None:
+            self._apply_lifespans(fields, lifespans, time)
         return self.gaussians.replace(**fields)
 
     def squared_slopes(
@@ -379,13 +383,15 @@ class DynamicGaussians:
         found = self.field.squared_slopes(means, time, Deltas(*of_deltas), self.gaussians.origin)
         return {PHI + name: x for name, x in found.items()}
 
-    def _live(self, fields: dict[str, torch.Tensor], lives: Lives, time: float | torch.Tensor) -> None:
-        """Put those that are there for a time where they are at a time, as opaque as they are then."""
-        index = self.living.nonzero()[:, 0]
-        mortal = lives.take(index)
-        fields["means"] = fields["means"].index_add(0, index, drift(mortal, time).to(fields["means"].dtype))
+    def _apply_lifespans(
+        self, fields: dict[str, torch.Tensor], lifespans: Lifespans, time: float | torch.Tensor
+    ) -> None:
+        """Set the mean and the opacity of the Gaussians with a limited lifespan at a time, in `fields`."""
+        index = self.has_lifespan.nonzero()[:, 0]
+        limited = lifespans.take(index)
+        fields["means"] = fields["means"].index_add(0, index, drift(limited, time).to(fields["means"].dtype))
         logits = fields["logit_opacities"]
-        fields["logit_opacities"] = logits.index_copy(0, index, logit_at(logits[index], mortal, time))
+        fields["logit_opacities"] = logits.index_copy(0, index, logit_at(logits[index], limited, time))
 
 
 @scene_jacobian.register(DynamicGaussians)
@@ -411,14 +417,14 @@ def is_finite(x: torch.Tensor) -> bool:
     return x.numel() == 0 or all(map(math.isfinite, ends_of(x)))
 
 
-def _check_lives(lives: Lives, count: int) -> None:
-    """Raise ValueError unless they are of so many Gaussians."""
-    must_be("DynamicGaussians", "lives", lives, Lives, "a center, a width, ... a Gaussian")
-    for name, x in zip(Lives._fields, lives, strict=True):
+def _check_lifespans(lifespans: Lifespans, count: int) -> None:
+    """Raise ValueError unless every tensor has a row for each of `count` Gaussians."""
+    must_be("DynamicGaussians", "lifespans", lifespans, Lifespans, "a center, a width, ... a Gaussian")
+    for name, x in zip(Lifespans._fields, lifespans, strict=True):
         shape = (count, 3) if name in ("velocities", "accelerations") else (count,)
         if tuple(x.shape) != shape or not x.is_floating_point():
             raise ArgumentError(
-                f"DynamicGaussians: lives.{name} must be floats of shape {shape}, got {x.dtype} of shape "
+                f"DynamicGaussians: lifespans.{name} must be floats of shape {shape}, got {x.dtype} of shape "
                 f"{tuple(x.shape)}; give each Gaussian its own"
             )
 

@@ -17,7 +17,7 @@ from drgs.cameras import orbit
 from drgs.data import Dataset, View
 from drgs.deform import DeformationField, DynamicGaussians, FieldConfig
 from drgs.display.pictures import write_png
-from drgs.dynamics.lives import LIVES, Lives, living, logit_at
+from drgs.dynamics.lifespans import LIFESPAN_PARAMETERS, Lifespans, is_limited, logit_at
 from drgs.ellipsoids import Gaussians
 from drgs.files import load_state, save_state
 from drgs.fitting.components.lifespans import REFERENCE_TIMES, LifetimeTerm, find_new_gaussians
@@ -44,7 +44,7 @@ def scene_of(g: Gaussians, generator: torch.Generator) -> DynamicGaussians:
     rand = lambda *shape: torch.rand(*shape, generator=generator, dtype=g.means.dtype)  # noqa: E731
     widths = (0.2 + 0.6 * rand(10)).log()
     widths[7:] = math.log(30.0)
-    lives = Lives(2 * rand(10), widths, 0.4 * rand(10, 3) - 0.2, rand(10, 3) - 0.5, 2 * rand(10))
+    lives = Lifespans(2 * rand(10), widths, 0.4 * rand(10, 3) - 0.2, rand(10, 3) - 0.5, 2 * rand(10))
     return DynamicGaussians(g, field_of(g), torch.linspace(-1, 2.5, 10).to(g.means.dtype), lives)
 
 
@@ -58,11 +58,11 @@ def view(rng):
 def plain(scene: DynamicGaussians, time: float | torch.Tensor) -> Gaussians:
     """The Gaussians at a time once more, from the equations, in float64."""
     base = DynamicGaussians(scene.gaussians, scene.field, scene.motion).at(time)
-    lives = scene.lives
+    lives = scene.lifespans
     there = torch.sigmoid(base.logit_opacities) * torch.exp(
         -0.5 * ((time - lives.centers) / lives.log_widths.exp()) ** 2
     )
-    ahead = (time - lives.births)[:, None]
+    ahead = (time - lives.reference_times)[:, None]
     ends = lives.log_widths.exp() < 10 * (SPAN[1] - SPAN[0])
     return base.replace(
         means=base.means
@@ -75,7 +75,7 @@ def double(scene: DynamicGaussians) -> DynamicGaussians:
     g = scene.gaussians.replace(**{name: x.double() for name, x in scene.gaussians.parameters().items()})
     field = DeformationField(scene.field.config, scene.field.grid.bounds, SPAN).double()
     field.load_state_dict(scene.field.state_dict())
-    return DynamicGaussians(g, field, scene.motion.double(), Lives(*[x.double() for x in scene.lives]))
+    return DynamicGaussians(g, field, scene.motion.double(), Lifespans(*[x.double() for x in scene.lifespans]))
 
 
 def test_opacity_and_place_at_a_time(view):
@@ -89,14 +89,14 @@ def test_opacity_and_place_at_a_time(view):
         now, rest = scene.at(time), DynamicGaussians(scene.gaussians, scene.field, scene.motion).at(time)
         for name, x in now.parameters().items():
             assert torch.equal(x[7:], rest.parameters()[name][7:])
-    assert living(scene.lives.log_widths, 2.0).tolist() == [True] * 7 + [False] * 3
+    assert is_limited(scene.lifespans.log_widths, 2.0).tolist() == [True] * 7 + [False] * 3
 
 
 @pytest.mark.parametrize("logit", [-90.0, -20.0, 0.0, 20.0, 80.0])
 @pytest.mark.parametrize("distance", [0.0, 1e-3, 1.0, 30.0, 1e4])
 def test_logits_at_the_extremes(logit, distance):
     """However opaque, transparent or long ago, logit and derivatives are finite, and right where float64 tells."""
-    lives = Lives(torch.zeros(1), torch.zeros(1), torch.zeros(1, 3), torch.zeros(1, 3), torch.zeros(1))
+    lives = Lifespans(torch.zeros(1), torch.zeros(1), torch.zeros(1, 3), torch.zeros(1, 3), torch.zeros(1))
     x = torch.tensor([logit], requires_grad=True)
     time = torch.tensor(distance, requires_grad=True)
     found = logit_at(x, lives, time)
@@ -114,12 +114,14 @@ def test_forward_is_the_transpose_of_reverse(view, preset):
     scene, cam = view
     settings = RenderSettings.preset(preset)
     draw = torch.Generator().manual_seed(2)
-    leaves = [x.clone().requires_grad_() for x in scene.lives[:4]]
-    live = DynamicGaussians(scene.gaussians, scene.field, scene.motion, Lives(*leaves, scene.lives.births))
+    leaves = [x.clone().requires_grad_() for x in scene.lifespans[:4]]
+    live = DynamicGaussians(
+        scene.gaussians, scene.field, scene.motion, Lifespans(*leaves, scene.lifespans.reference_times)
+    )
     image = render(live, cam, settings).rgb
     cotangent = torch.randn(image.shape, generator=draw)
     slopes = torch.autograd.grad(image, leaves, cotangent)
-    for name, slope in zip(LIVES, slopes, strict=True):
+    for name, slope in zip(LIFESPAN_PARAMETERS, slopes, strict=True):
         along = torch.randn(slope.shape, generator=draw)
         pushed = float((render_jvp(scene, cam, {name: along}, settings).rgb * cotangent).sum())
         size = float((slope.abs() * along.abs()).sum())
@@ -132,17 +134,19 @@ def test_derivatives_against_the_reference(view):
     """Of an image in float64 from the equations, by every new parameter and by the time."""
     scene, cam = view
     exact = double(scene)
-    leaves = [x.clone().requires_grad_() for x in exact.lives[:4]]
+    leaves = [x.clone().requires_grad_() for x in exact.lifespans[:4]]
     time = torch.tensor(cam.time, dtype=torch.float64, requires_grad=True)
-    lives = Lives(*leaves, exact.lives.births)
+    lives = Lifespans(*leaves, exact.lifespans.reference_times)
     image = reference.render(
         plain(DynamicGaussians(exact.gaussians, exact.field, exact.motion, lives), time), cam, SMOOTH
     )
     draw = torch.Generator().manual_seed(3)
     cotangent = torch.randn(image.rgb.shape, generator=draw, dtype=torch.float64)
     want = torch.autograd.grad(image.rgb, [*leaves, time], cotangent)
-    own = [x.clone().requires_grad_() for x in scene.lives[:4]]
-    live = DynamicGaussians(scene.gaussians, scene.field, scene.motion, Lives(*own, scene.lives.births))
+    own = [x.clone().requires_grad_() for x in scene.lifespans[:4]]
+    live = DynamicGaussians(
+        scene.gaussians, scene.field, scene.motion, Lifespans(*own, scene.lifespans.reference_times)
+    )
     moment = torch.tensor(cam.time, requires_grad=True)
     found = torch.autograd.grad(render(live.at(moment), cam, SMOOTH).rgb, [*own, moment], cotangent.float())
     for slope, other in zip(found, want, strict=True):
@@ -153,8 +157,8 @@ def test_information_of_lives(view):
     """Exact columns are the squares of forward derivatives of single parameters; nothing is told of what is always
     there."""
     scene, cam = view
-    found = fisher.diagonal(scene, cam, FAST, "columns", groups=list(LIVES))
-    for name in LIVES:
+    found = fisher.diagonal(scene, cam, FAST, "columns", groups=list(LIFESPAN_PARAMETERS))
+    for name in LIFESPAN_PARAMETERS:
         x = scene.parameters()[name]
         for index in (0, 3, 8):
             along = torch.zeros_like(x)
@@ -169,14 +173,16 @@ def test_information_of_lives(view):
 def test_what_is_wrong_is_named(view):
     """The tensor, what must hold and what was got."""
     scene, cam = view
-    short = scene.lives._replace(velocities=torch.zeros(10))
-    with pytest.raises(ValueError, match=r"lives\.velocities must be floats of shape \(10, 3\), got torch\.float32 of"):
+    short = scene.lifespans._replace(velocities=torch.zeros(10))
+    with pytest.raises(
+        ValueError, match=r"lifespans\.velocities must be floats of shape \(10, 3\), got torch\.float32 of"
+    ):
         DynamicGaussians(scene.gaussians, scene.field, scene.motion, short)
-    for name in LIVES:
+    for name in LIFESPAN_PARAMETERS:
         x = scene.parameters()[name].clone()
         x[1] = math.nan
         names = ("centers", "log_widths", "velocities", "accelerations")
-        damaged = scene.lives._replace(**{names[LIVES.index(name)]: x})
+        damaged = scene.lifespans._replace(**{names[LIFESPAN_PARAMETERS.index(name)]: x})
         with pytest.raises(ValueError, match=rf"DynamicGaussians\.at: {name} must be finite, got nan at index \[1"):
             render(DynamicGaussians(scene.gaussians, scene.field, scene.motion, damaged), cam, FAST)
 
@@ -325,8 +331,8 @@ def test_a_fit_shows_what_flies(dataset, tmp_path):
         assert ("living" in result.metrics["motion"]) == (lives == "auto")
     assert found["auto"] < 0.33 * found["off"]  # measured: see the closing assertion
     scene = load_run(fit(dataset, tmp_path / "short", config(max_steps=60), progress=False).run).scene
-    assert int(scene.living.sum()) > 0
-    assert not scene.gaussians.sh[scene.living][:, 1:].any()  # one color in all directions
+    assert int(scene.has_lifespan.sum()) > 0
+    assert not scene.gaussians.sh[scene.has_lifespan][:, 1:].any()  # one color in all directions
 
 
 @pytest.mark.slow
@@ -352,7 +358,7 @@ def test_what_appears_and_vanishes(tmp_path):
 @pytest.mark.slow
 @pytest.mark.same_bits
 def test_a_fit_that_was_stopped_ends_with_the_same_bits(dataset, tmp_path):
-    """Lives are in the checkpoint; damaged ones are refused, with their name."""
+    """Lifespans are in the checkpoint; damaged ones are refused, with their name."""
     how = config(max_steps=60, deterministic=True, save_every=30)
     whole = fit(dataset, tmp_path / "whole", how, progress=False).run
     step = Trainer.step
@@ -369,7 +375,7 @@ def test_a_fit_that_was_stopped_ends_with_the_same_bits(dataset, tmp_path):
     parts = fit(dataset, tmp_path / "parts", how, resume=True, progress=False).run
     wanted, _ = load_state(whole.state)
     found, header = load_state(parts.state)
-    assert {"parameter.births", *(f"parameter.{name}" for name in LIVES)} <= set(wanted)
+    assert {"parameter.births", *(f"parameter.{name}" for name in LIFESPAN_PARAMETERS)} <= set(wanted)
     assert all(torch.equal(x, wanted[name]) for name, x in found.items())
     parts.point_cloud.unlink()  # else it would be shown instead
     nan = torch.full_like(found["parameter.births"], math.nan)
@@ -390,7 +396,7 @@ def test_what_the_static_stage_shows(tmp_path):
 def test_only_lives_that_other_times_confirm_are_lengthened():
     """One that is shorter than the time between two photographs is left as it is."""
     widths = torch.tensor([0.05, 0.3]).log().requires_grad_()
-    rows = SimpleNamespace(tensors={REFERENCE_TIMES: torch.zeros(2), LIVES[1]: widths})
+    rows = SimpleNamespace(tensors={REFERENCE_TIMES: torch.zeros(2), LIFESPAN_PARAMETERS[1]: widths})
     loss = LifetimeTerm(rows, 0.1, 2.0)(None, None, None)
     assert float(loss) == pytest.approx(2 * 0.1 / 0.3 / 2)
     loss.backward()

@@ -12,7 +12,7 @@ from test_network_information import TIME, swarm
 
 from drgs import fisher
 from drgs.dynamics.jacobian import TorchJacobian, scene_jacobian
-from drgs.dynamics.lives import Lives
+from drgs.dynamics.lifespans import Lifespans
 from drgs.information import network
 from drgs.information.network import NetworkInformation, _Reduced, _Rows
 from drgs.information.pullback import Pullback
@@ -142,10 +142,10 @@ def test_those_that_live_for_a_time():
     """What is there for a time is as opaque as it is then."""
     scene, cam = made(seed=3)
     n = len(scene)
-    lives = Lives(
+    lives = Lifespans(
         torch.linspace(0, 1, n), torch.full((n,), -1.0), 0.1 * torch.ones(n, 3), torch.zeros(n, 3), torch.zeros(n)
     )
-    scene.lives = lives
+    scene.lifespans = lives
     close(*both(scene, cam, RenderSettings.preset("fast")))
 
 

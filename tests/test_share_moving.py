@@ -14,7 +14,7 @@ from drgs.codecs.clustering import morton_order
 from drgs.commands.options import Share
 from drgs.commands.share import shared_of
 from drgs.deform import DynamicGaussians
-from drgs.dynamics.lives import Lives
+from drgs.dynamics.lifespans import Lifespans
 from drgs.pages.sharing.layers import moments_of
 from drgs.pages.sharing.write import write_page
 
@@ -27,7 +27,7 @@ def shared_of_run(run):  # noqa: F811
         for name, weights in shared.moving.field.named_parameters():
             weights += (3.0 if name == "mlp.means.3.weight" else 0.2) * torch.randn_like(weights)
         shared.moving.gaussians.logit_opacities.add_(4.0)
-    moving = shared.moving.without_lives()
+    moving = shared.moving.without_lifespans()
     return dataclasses.replace(shared, moving=moving, gaussians=moving.at(shared.times[0]).detach())
 
 
@@ -76,7 +76,7 @@ def with_lives(shared):
     widths[::2] = 5.0  # of spans of 1: always
     velocities = torch.tensor([0.6, 0.1, 0.0]).expand(n, 3) / (last - first)
     bent = torch.tensor([0.0, 0.4, 0.0]).expand(n, 3) / (last - first) ** 2
-    lives = Lives(torch.linspace(first, last, n), widths, velocities, bent, torch.full((n,), first))
+    lives = Lifespans(torch.linspace(first, last, n), widths, velocities, bent, torch.full((n,), first))
     return dataclasses.replace(shared, moving=DynamicGaussians(scene.gaussians, scene.field, scene.motion, lives))
 
 
@@ -86,11 +86,11 @@ def test_lives_of_a_page(run):  # noqa: F811
     order = morton_order(shared.gaussians.means.numpy())
     _, places, _, lives = moments_of(shared.moving, shared.times, shared.gaussians, order)
     places, lives = np.frombuffer(places, "<u4"), np.frombuffer(lives, "<f4").reshape(9, -1)
-    living = shared.moving.living.numpy()[order]
+    living = shared.moving.has_lifespan.numpy()[order]
     assert set(np.flatnonzero(living)) <= set(places.tolist())
     assert (lives[1] > 0).tolist() == living[places].tolist()
-    held = shared.moving.lives
-    held_rows = (held.centers, held.log_widths.exp(), *held.velocities.T, *held.accelerations.T, held.births)
+    held = shared.moving.lifespans
+    held_rows = (held.centers, held.log_widths.exp(), *held.velocities.T, *held.accelerations.T, held.reference_times)
     for row, x in enumerate(held_rows):
         np.testing.assert_allclose(lives[row][living[places]], x.numpy()[order][places][living[places]], rtol=1e-6)
 

@@ -282,7 +282,7 @@ def write_plys(scene: Scene, cameras: list[Camera], folder: Path, moving: bool, 
     """
     from drgs.deform import DynamicGaussians
 
-    chosen = scene.moving | scene.living if isinstance(scene, DynamicGaussians) else None
+    chosen = scene.moving | scene.has_lifespan if isinstance(scene, DynamicGaussians) else None
     if moving and (chosen is None or not bool(chosen.any())):
         raise ValueError("--moving must have a scene where something moves, nothing does here; drop it")
     names = ply_names(cameras)

@@ -346,9 +346,9 @@ class MotionConfig(Record):
     be found before what is in the wrong place has become transparent. A gate is a logit a Gaussian; what no photograph
     shows to move comes to a rest by their weight, and is not deformed.
 
-    Something that goes further between photographs than it is large, or that appears, is born where photographs of its
-    time show it: Gaussians with a center and a width in time and a velocity of their own, so that no photograph of
-    another time fades them (`drgs.fitting.lives`).
+    Where something moves between photographs by more than its size, or appears, Gaussians are added where photographs
+    of its time show it: with a center and a width in time and a velocity of their own, so that no photograph of
+    another time fades them (`drgs.fitting.components.lifespans`).
 
     Reference:
         [1] Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", CVPR 2024, and its code.

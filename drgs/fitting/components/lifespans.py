@@ -10,7 +10,7 @@ other cameras. Long lifetimes make neighbors in time agree: the loss has `life_w
 the time between two photographs over the width of the lifetime. One that is shorter than that time is left alone: no
 other time has confirmed where the Gaussian would be then, and what shows there at the wrong place is faded by the
 photographs that see it. From ten times the span of all photographs on a lifetime is unlimited
-(`drgs.dynamics.lives.LASTING`).
+(`drgs.dynamics.lifespans.LASTING`).
 
 **Where they are added.** A photograph differs from its rendering where something is at its time that is not there at
 others. A pixel of it is on a ray; how far along, and how fast it moves, is what other photographs of the same time and
@@ -39,14 +39,14 @@ from drgs.cameras.sizes import reduced_size
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
 from drgs.fitting.components.base import Checkpoint, Component, Fit, Setup
-from drgs.fitting.components.motion import WARM_UP, MotionComponent, limited_lifetimes
+from drgs.fitting.components.motion import WARM_UP, MotionComponent, limited_lifespans
 from drgs.fitting.rates import means_rate
 from drgs.fitting.stages import dynamic_stage, shows_first_time, spacing
 from drgs.integrator import render
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
-    from drgs.dynamics.lives import Lives
+    from drgs.dynamics.lifespans import Lifespans
     from drgs.ellipsoids import Gaussians, Scene
     from drgs.fitting.config import FitConfig
     from drgs.fitting.frames import Frame
@@ -62,9 +62,9 @@ __all__ = [
     "NewGaussians",
     "Search",
     "add_new_gaussians",
-    "checked_lifetimes",
+    "checked_lifespans",
     "find_new_gaussians",
-    "lifetimes_of",
+    "lifespans_of",
 ]
 
 REFERENCE_TIMES = "births"
@@ -210,11 +210,11 @@ class LifespansComponent(Component):
     def _use(self, fit: Fit) -> None:
         """Rates of tensors of lifetimes, in the unit of length of the field."""
         length = next((x.field_length for x in fit.components if isinstance(x, MotionComponent)), fit.extent)
-        self.rates = lifetime_rates(fit.config, self.times, length)
+        self.rates = lifespan_rates(fit.config, self.times, length)
 
     def scene(self, fit: Fit, scene: Scene) -> Scene:
         """See `Component`."""
-        return _with_lifetimes(scene, lifetimes_of(fit.rows.tensors))
+        return _with_lifespans(scene, lifespans_of(fit.rows.tensors))
 
     def after_backward(self, fit: Fit) -> None:
         """See `Component`: what has a limited lifetime keeps one color in all directions.
@@ -223,7 +223,7 @@ class LifespansComponent(Component):
         """
         rest = fit.rows.tensors["sh_rest"].grad
         if self.times and rest is not None:
-            limited = limited_lifetimes(fit.rows, self.times)
+            limited = limited_lifespans(fit.rows, self.times)
             if limited is not None:
                 rest[limited] = 0
 
@@ -248,30 +248,30 @@ class LifespansComponent(Component):
         if "field" not in checkpoint.header:
             return scene
         count = len(checkpoint.tensors["parameter.means"])
-        return _with_lifetimes(scene, checked_lifetimes(checkpoint.tensors, count, checkpoint.where))
+        return _with_lifespans(scene, checked_lifespans(checkpoint.tensors, count, checkpoint.where))
 
 
-def _with_lifetimes(scene: Scene, lives: Lives | None) -> Scene:
+def _with_lifespans(scene: Scene, lifespans: Lifespans | None) -> Scene:
     """A scene that moves, whose Gaussians have lifetimes."""
-    if lives is None:
+    if lifespans is None:
         return scene
     from drgs.deform import DynamicGaussians
 
     assert isinstance(scene, DynamicGaussians)  # what has lifetimes has a field
-    return DynamicGaussians(scene.gaussians, scene.field, scene.motion, lives)
+    return DynamicGaussians(scene.gaussians, scene.field, scene.motion, lifespans)
 
 
-def lifetimes_of(tensors: Mapping[str, torch.Tensor]) -> Lives | None:
+def lifespans_of(tensors: Mapping[str, torch.Tensor]) -> Lifespans | None:
     """When Gaussians live, of the tensors of their rows; None where all are always there."""
     if REFERENCE_TIMES not in tensors:
         return None
-    from drgs.dynamics.lives import Lives
+    from drgs.dynamics.lifespans import Lifespans
 
-    return Lives.of(tensors, tensors[REFERENCE_TIMES].detach())  # constants
+    return Lifespans.of(tensors, tensors[REFERENCE_TIMES].detach())  # constants
 
 
-def checked_lifetimes(tensors: Mapping[str, torch.Tensor], count: int, where: str) -> Lives | None:
-    """`lifetimes_of` of a checkpoint.
+def checked_lifespans(tensors: Mapping[str, torch.Tensor], count: int, where: str) -> Lifespans | None:
+    """`lifespans_of` of a checkpoint.
 
     Args:
         tensors: Its contents.
@@ -280,23 +280,23 @@ def checked_lifetimes(tensors: Mapping[str, torch.Tensor], count: int, where: st
     Raises:
         ValueError: If a tensor is missing, not finite, or not of as many Gaussians.
     """
-    from drgs.dynamics.lives import LIVES
+    from drgs.dynamics.lifespans import LIFESPAN_PARAMETERS
 
     held = {name.removeprefix("parameter."): x for name, x in tensors.items() if name.startswith("parameter.")}
-    names = (*LIVES, REFERENCE_TIMES)
+    names = (*LIFESPAN_PARAMETERS, REFERENCE_TIMES)
     if not any(name in held for name in names):
         return None
     for name in names:
-        shape = (count, 3) if name in LIVES[2:] else (count,)
+        shape = (count, 3) if name in LIFESPAN_PARAMETERS[2:] else (count,)
         if name not in held or tuple(held[name].shape) != shape or not bool(torch.isfinite(held[name]).all()):
             raise ValueError(
                 f"{where}: {name} must be finite and of shape {shape}, is not; restore the file, or fit again in "
                 "another folder"
             )
-    return lifetimes_of(held)
+    return lifespans_of(held)
 
 
-def lifetime_rates(config: FitConfig, times: Sequence[float], length: float) -> dict[str, Rate]:
+def lifespan_rates(config: FitConfig, times: Sequence[float], length: float) -> dict[str, Rate]:
     """Learning rates of lifetimes; of reference times, which stay as they are, 0.
 
     Args:
@@ -304,15 +304,15 @@ def lifetime_rates(config: FitConfig, times: Sequence[float], length: float) -> 
         times: Times of all photographs, sorted.
         length: Unit of length of the field, world units.
     """
-    from drgs.dynamics.lives import LIVES
+    from drgs.dynamics.lifespans import LIFESPAN_PARAMETERS
 
     apart = spacing(times)
     return {
-        LIVES[0]: _CENTER_RATE * apart,
-        LIVES[1]: _WIDTH_RATE,
+        LIFESPAN_PARAMETERS[0]: _CENTER_RATE * apart,
+        LIFESPAN_PARAMETERS[1]: _WIDTH_RATE,
         # They move a Gaussian as far as the rate of the means does, one soon after its reference time, the other late.
-        LIVES[2]: lambda part: means_rate(config, part) * length / (_SOON * apart),
-        LIVES[3]: lambda part: means_rate(config, part) * length / (_LATE * apart) ** 2,
+        LIFESPAN_PARAMETERS[2]: lambda part: means_rate(config, part) * length / (_SOON * apart),
+        LIFESPAN_PARAMETERS[3]: lambda part: means_rate(config, part) * length / (_LATE * apart) ** 2,
         REFERENCE_TIMES: 0.0,
     }
 
@@ -327,7 +327,7 @@ def add_new_gaussians(rows: GaussianRows, places: NewGaussians, times: Sequence[
         gate: Logit of the gates of those that are added.
         most: How many Gaussians there may be.
     """
-    from drgs.dynamics.lives import LIVES
+    from drgs.dynamics.lifespans import LIFESPAN_PARAMETERS
 
     count = len(places.points)
     if not count:
@@ -340,7 +340,7 @@ def add_new_gaussians(rows: GaussianRows, places: NewGaussians, times: Sequence[
     new["motion"] = torch.full((count,), gate)
     moments = places.times.float()
     began = (moments, _first_widths(places, times).log().float(), places.velocities, places.accelerations)
-    new |= dict(zip(LIVES, began, strict=True))
+    new |= dict(zip(LIFESPAN_PARAMETERS, began, strict=True))
     new[REFERENCE_TIMES] = moments
     for name, x in rows.tensors.items():  # features and view-dependent colors begin at 0
         if name not in new or new[name].shape[1:] != x.shape[1:]:
@@ -354,12 +354,12 @@ def add_new_gaussians(rows: GaussianRows, places: NewGaussians, times: Sequence[
 
 
 def _unlimited(count: int, times: Sequence[float]) -> dict[str, torch.Tensor]:
-    from drgs.dynamics.lives import LASTING, LIVES
+    from drgs.dynamics.lifespans import LASTING, LIFESPAN_PARAMETERS
 
     width = torch.tensor(2 * LASTING * (times[-1] - times[0]))
     still = torch.zeros(count, 3)
     values = (torch.full((count,), (times[0] + times[-1]) / 2), width.log().repeat(count), still, still)
-    return {**dict(zip(LIVES, values, strict=True)), REFERENCE_TIMES: torch.zeros(count)}
+    return {**dict(zip(LIFESPAN_PARAMETERS, values, strict=True)), REFERENCE_TIMES: torch.zeros(count)}
 
 
 def _first_widths(places: NewGaussians, times: Sequence[float]) -> torch.Tensor:
@@ -392,9 +392,9 @@ class LifetimeTerm:
         """See `LossTerm`; None where all Gaussians are always there."""
         if REFERENCE_TIMES not in self.rows.tensors:
             return None
-        from drgs.dynamics.lives import LIVES
+        from drgs.dynamics.lifespans import LIFESPAN_PARAMETERS
 
-        parts = self.spacing * (-self.rows.tensors[LIVES[1]]).exp()
+        parts = self.spacing * (-self.rows.tensors[LIFESPAN_PARAMETERS[1]]).exp()
         # Which are long enough to be lengthened is a choice, which has no derivative.
         return self.weight * torch.where(parts.detach() < 1, parts, 0).mean()
 

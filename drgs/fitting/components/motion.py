@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from drgs.fitting.rows import GaussianRows
     from drgs.integrator import Output
 
-__all__ = ["FIELD", "WARM_UP", "MotionComponent", "Rest", "Smoothness", "is_held_open", "limited_lifetimes"]
+__all__ = ["FIELD", "WARM_UP", "MotionComponent", "Rest", "Smoothness", "is_held_open", "limited_lifespans"]
 
 FIELD = ("deformation.grid", "deformation.mlp")
 """Names of the networks of a fit to what moves."""
@@ -188,7 +188,7 @@ class MotionComponent(Component):
         if step == _reopening(config):
             with torch.no_grad():  # leaves are changed in place
                 opened = gates.clamp(min=_OPEN)
-                limited = limited_lifetimes(rows, self.times)
+                limited = limited_lifespans(rows, self.times)
                 if limited is not None:  # these drift by themselves
                     opened = torch.where(limited, gates, opened)
                 rows.overwrite(torch.arange(len(rows)), {"motion": opened})
@@ -254,7 +254,7 @@ class MotionComponent(Component):
                 bar.advance()
         seconds, everything = (sorted(spent)[_REPEATS // 2] for spent in took)
         counted = {**moving_counts(scenes[0]), "seconds": seconds, "seconds_all": everything}
-        limited = limited_lifetimes(rows, self.times)
+        limited = limited_lifespans(rows, self.times)
         return {"motion": counted | ({} if limited is None else {"living": int(limited.sum())})}
 
     @classmethod
@@ -263,7 +263,7 @@ class MotionComponent(Component):
         scene: Any = run.scene
         if not hasattr(scene, "moving"):
             return {}
-        living = {} if scene.lives is None else {"living": int(scene.living.sum())}
+        living = {} if scene.lifespans is None else {"living": int(scene.has_lifespan.sum())}
         return {"motion": moving_counts(scene) | living}
 
     @classmethod
@@ -297,12 +297,12 @@ def moving_counts(scene: DynamicGaussians) -> dict[str, Any]:
     return {"moving": moving, "share": moving / max(len(scene), 1)}
 
 
-def limited_lifetimes(rows: GaussianRows, times: Sequence[float]) -> torch.Tensor | None:
+def limited_lifespans(rows: GaussianRows, times: Sequence[float]) -> torch.Tensor | None:
     """(N,) bool, which Gaussians have a limited lifetime; None where lifetimes are not fitted."""
-    from drgs.dynamics.lives import LIVES, living
+    from drgs.dynamics.lifespans import LIFESPAN_PARAMETERS, is_limited
 
-    widths = rows.tensors.get(LIVES[1])
-    return None if widths is None else living(widths, times[-1] - times[0])
+    widths = rows.tensors.get(LIFESPAN_PARAMETERS[1])
+    return None if widths is None else is_limited(widths, times[-1] - times[0])
 
 
 @dataclasses.dataclass(frozen=True)

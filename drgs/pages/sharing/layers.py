@@ -107,12 +107,12 @@ def moments_of(moving: DynamicGaussians, times: Sequence[float], rest: Gaussians
     Returns:
         JSON that the page reads; indices of what moves in the archive's order, uint32; (T, 10, M) uint16 means, log
         scales and quaternions (wxyz) of these, as if they were there all the time, each within its own range; and
-        (9, M) float32 center and width in time (0: always there), velocity, acceleration and time of birth, which a
+        (9, M) float32 center and width in time (0: always there), velocity, acceleration and reference time, which a
         page adds.
     """
     numbers = []
-    lives, living = moving.lives, moving.living.cpu().numpy()[order]
-    moving = moving.without_lives()
+    lifespans, limited = moving.lifespans, moving.has_lifespan.cpu().numpy()[order]
+    moving = moving.without_lifespans()
     with torch.no_grad(), Bar("moments", len(times)) as bar:  # values, to be written
         for time in times:
             numbers.append(_numbers(moving.at(time))[:, order])
@@ -124,7 +124,7 @@ def moments_of(moving: DynamicGaussians, times: Sequence[float], rest: Gaussians
     extent = np.ptp(still[:3], axis=1).max()
     scale = np.array([extent] * 3 + [1.0] * 7)[:, None]
     moves = ((np.ptp(values, axis=0) / scale).max(0) > _STILL) | ((np.abs(values[0] - still) / scale).max(0) > _STILL)
-    places = np.flatnonzero(moves | living)
+    places = np.flatnonzero(moves | limited)
     values = values[:, :, places]
     low = values.min((0, 2)) if len(places) else np.zeros(10)
     high = values.max((0, 2)) if len(places) else np.zeros(10)
@@ -132,16 +132,16 @@ def moments_of(moving: DynamicGaussians, times: Sequence[float], rest: Gaussians
     codes = np.rint((values - low[:, None]) / span * 65535)
     known = {"times": [float(x) for x in times], "count": len(places), "low": low.tolist(), "high": high.tolist()}
     there = np.zeros((9, len(places)))
-    if lives is not None:
+    if lifespans is not None:
         columns = (
-            lives.centers,
-            lives.log_widths.exp(),
-            *lives.velocities.T,
-            *lives.accelerations.T,
-            lives.births,
+            lifespans.centers,
+            lifespans.log_widths.exp(),
+            *lifespans.velocities.T,
+            *lifespans.accelerations.T,
+            lifespans.reference_times,
         )
         values = np.stack([x.detach().double().cpu().numpy() for x in columns])[:, order][:, places]
-        there = np.where(living[places], values, 0.0)
+        there = np.where(limited[places], values, 0.0)
     return known, places.astype("<u4").tobytes(), codes.astype("<u2").tobytes(), there.astype("<f4").tobytes()
 
 

@@ -92,7 +92,7 @@ def scene_of_run(
     record, moving = loaded.record, loaded.moving
     times = _times(loaded, moments)
     # The page itself says when what is there for a time is there.
-    gaussians = loaded.gaussians if moving is None else moving.without_lives().at(times[0])
+    gaussians = loaded.gaussians if moving is None else moving.without_lifespans().at(times[0])
     names = fitted_views(run, record)
     views, fitted_names = ([], []) if dataset is None else (dataset.views, names)
     cameras = _cameras(views, fitted_names, ranking or _ranking_of(run, loaded))
