@@ -46,26 +46,26 @@ def opened(monkeypatch):
     """Files opened since the test began, and ("picked NAME"), in order; by Python and by OpenCV."""
     import cv2
 
-    import drgs.select
+    from drgs.selection import policies
 
     global _opened, _is_hooked
     if not _is_hooked:
         sys.addaudithook(_hook)
         _is_hooked = True
-    read, choose = cv2.imread, drgs.select.select
+    read, choose = cv2.imread, policies.choose
     seen = []
 
     def imread(path, *rest):
         seen.append(str(path))
         return read(path, *rest)
 
-    def select(*arguments, **options):
-        selection = choose(*arguments, **options)
+    def chosen(*arguments):
+        selection = choose(*arguments)
         seen.extend(f"picked {pick.name}" for pick in selection.picks)
         return selection
 
     monkeypatch.setattr(cv2, "imread", imread)
-    monkeypatch.setattr(drgs.select, "select", select)
+    monkeypatch.setattr(policies, "choose", chosen)
     _opened = seen
     yield seen
     _opened = None
@@ -347,15 +347,17 @@ def test_the_seed_draws_the_first_view(still, tmp_path):
 
 def test_selection_json_is_complete(still, tmp_path, monkeypatch):
     """Every pick with what it was chosen by and from; the run's log, config and metrics agree."""
-    import drgs.select
+    from drgs.selection import policies
 
-    sizes, choose = [], drgs.select.select
+    sizes, choose = [], policies.choose
 
-    def select(gaussians, candidates, train, *rest, **options):
-        sizes.append(({(c.width, c.height) for c in candidates}, {(c.width, c.height) for c in train}, len(train)))
-        return choose(gaussians, candidates, train, *rest, **options)
+    def chosen(policy, pool):
+        sizes.append(
+            (*({(c.width, c.height) for c in cameras} for cameras in (pool.candidates, pool.train)), len(pool.train))
+        )
+        return choose(policy, pool)
 
-    monkeypatch.setattr(drgs.select, "select", select)
+    monkeypatch.setattr(policies, "choose", chosen)
     active = plan(policy="fisher", criterion="eig", prior=Prior(1e-3), blocks=("geometry",), info_pixels=100)
     result = fit(lazily(still), tmp_path / "run", config(selection=active), progress=False)
     assert sizes == [({(10, 10)}, {(10, 10)}, 2), ({(10, 10)}, {(10, 10)}, 3)]
@@ -387,19 +389,21 @@ def test_selection_json_is_complete(still, tmp_path, monkeypatch):
 @pytest.mark.parametrize(("mask", "empty"), [("object", True), ("valid", False), ("ignore", True)])
 def test_scores_know_masks(still, tmp_path, monkeypatch, mask, empty):
     """Known views are asked within their masks, reduced as their cameras are; outside of an object is emptiness."""
-    asked, real = [], drgs.select.select
+    from drgs.selection import policies
 
-    def spied(*args, **options):
-        asked.append((args, options))
-        return real(*args, **options)
+    pools, choose = [], policies.choose
 
-    monkeypatch.setattr("drgs.select.select", spied)
+    def chosen(policy, pool):
+        pools.append(pool)
+        return choose(policy, pool)
+
+    monkeypatch.setattr(policies, "choose", chosen)
     options = plan(policy="fisher", blocks=("geometry", "backdrop"), info_pixels=SIZE * SIZE // 4, add=1)
     fit(lazily(still), tmp_path / "run", config(mask=mask, selection=options), progress=False)
-    (_, candidates, known, *_), given = asked[0]
-    assert given["empty_outside"] is empty
-    assert len(given["masks"]) == len(known) == 2
-    for camera, found in zip(known, given["masks"], strict=True):
+    pool = pools[0]
+    assert pool.empty_outside is empty
+    assert len(pool.masks) == len(pool.train) == 2
+    for camera, found in zip(pool.train, pool.masks, strict=True):
         assert camera.width * camera.height <= SIZE * SIZE // 4
         if mask == "ignore":
             assert found is None

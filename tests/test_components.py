@@ -37,7 +37,7 @@ from drgs.fitting.rows import GaussianRows
 from drgs.fitting.trainer import StepResult, Trainer
 from drgs.integrator import render
 from drgs.io.checkpoint import load_state, save_state
-from drgs.select import select
+from drgs.selection import policies
 from drgs.train import fit
 
 PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
@@ -416,13 +416,14 @@ def test_a_moving_fit_is_looked_at_as_it_moves(tmp_path, monkeypatch):
         def scene(self, fit, scene):
             return Drift(scene, wind.velocity)
 
-    active, chosen_of = SelectionConfig().replace(initial=3, add=1, every=3, pick_points="uncovered"), []
+    active = SelectionConfig().replace(initial=3, add=1, every=3, pick_points="uncovered")
+    chosen_of, real = list[object](), policies.choose
 
-    def choose(scene, *arguments, **options):
-        chosen_of.append(scene)
-        return select(scene, *arguments, **options)
+    def choose(policy, pool):
+        chosen_of.append(pool.scene)
+        return real(policy, pool)
 
-    monkeypatch.setattr("drgs.select.select", choose)
+    monkeypatch.setattr(policies, "choose", choose)
     result = fit(data, tmp_path / "run", cfg.replace(selection=active), components=[Blown], progress=False)
     frames = load_frames(data.split()[1], cfg.data.max_pixels, cfg.data.mask)
     moving = Drift(result.gaussians, wind.velocity.detach())

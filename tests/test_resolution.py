@@ -14,7 +14,6 @@ from test_active import plan
 from test_semantic_fit import MAP, semantic_trainer, taught  # noqa: F401 (a fixture)
 from test_train import SIZE, config, dataset, masked, trainer_of  # noqa: F401 (a fixture)
 
-from drgs import select
 from drgs.cameras import Camera, intrinsics, look_at
 from drgs.deform import FieldConfig
 from drgs.files import Run, load_state
@@ -22,6 +21,7 @@ from drgs.fitting import metrics, resolution, trainer
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.losses import ssim_map
 from drgs.fitting.resolution import Resolution, halved_size
+from drgs.selection import policies
 from drgs.train import FitConfig, Trainer, fit
 
 
@@ -247,16 +247,16 @@ def test_what_moves_keeps_its_times(tmp_path, seen, monkeypatch):
 
 def test_views_are_chosen_at_the_full_size(dataset, tmp_path, seen, monkeypatch):  # noqa: F811
     """Candidates and views seen so far have 32 pixels while steps have 16, also of a new photograph."""
-    asked, choose = [], select.select
+    cameras, choose = [], policies.choose
 
-    def spied(scene, candidates, cameras, *rest, **options):
-        asked.extend([*candidates, *cameras])
-        return choose(scene, candidates, cameras, *rest, **options)
+    def spied(policy, pool):
+        cameras.extend([*pool.candidates, *pool.train])
+        return choose(policy, pool)
 
-    monkeypatch.setattr(select, "select", spied)
+    monkeypatch.setattr(policies, "choose", spied)
     settings = config(max_steps=20, num_downscales=1, selection=plan())
     result = fit(dataset, tmp_path / "run", settings, progress=False)
-    assert {camera.width for camera in asked} == {SIZE}
+    assert {camera.width for camera in cameras} == {SIZE}
     assert [side for side, *_ in seen] == [SIZE // 2] * 10 + [SIZE] * 10
     picks = json.loads((result.run.path / "selection.json").read_text())["picks"]
     assert [pick["step"] for pick in picks] == [4, 8]

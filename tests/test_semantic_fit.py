@@ -34,6 +34,7 @@ from drgs.fitting.records import load_run
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.segments import segmentation_of
 from drgs.fitting.trainer import Trainer
+from drgs.selection import policies
 from drgs.tracing.weights import Weights
 from drgs.train import fit
 
@@ -403,13 +404,13 @@ def test_without_embeddings_no_label_is_read(tmp_path):
 
 def test_views_are_chosen_in_the_metric_of_the_decoder_as_it_is(taught, tmp_path, monkeypatch):
     """At every pick features count in the metric of the decoder at that step; selection.json says what was coupled."""
-    metrics_of, real = [], drgs.select.select
+    metrics_of, choose = [], policies.choose
 
-    def watched(*rest, scoring, **options):
-        metrics_of.append(scoring.semantics.matrix)
-        return real(*rest, scoring=scoring, **options)
+    def watched(policy, pool):
+        metrics_of.append(pool.scoring.semantics.matrix)
+        return choose(policy, pool)
 
-    monkeypatch.setattr(drgs.select, "select", watched)
+    monkeypatch.setattr(policies, "choose", watched)
     active = SelectionConfig().replace(policy="fisher", add=2, every=2, info_pixels=100)
     done = fit(taught, tmp_path / "run", config(**FIT, selection=active), progress=False)
     assert len(metrics_of) == 2

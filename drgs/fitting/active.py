@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import time
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -84,8 +85,8 @@ class ActiveViews:
         Raises:
             ValueError: As `Timetable.of`, and if there are no views, or no such policy.
         """
-        from drgs.gain import criterion_named
-        from drgs.select import policy_named
+        from drgs.information.criteria import criterion_named
+        from drgs.selection.policies import policy_named
 
         active = config.selection
         if active is None:
@@ -308,34 +309,38 @@ class ActiveViews:
         Returns:
             The photograph, and the record that was appended to `picks`.
         """
-        from drgs.select import select
+        from drgs.information.inputs import mask_list
+        from drgs.selection.policies import choose
+        from drgs.selection.pool import Pool
 
+        began = time.perf_counter()
         active = self.active
         left = self.timetable.left(len(self.picks), self.chosen)
         pixels = active.info_pixels or self._config.data.max_pixels
         scoring = scoring or self.scoring
         seen = [at_most(frame.camera, pixels) for frame in frames]
         with Bar("choosing a view", len(left) + len(frames)) as bar:
-            selection = select(
-                scene,
-                [at_most(self._camera(i), pixels) for i in left],
-                seen,
-                1,
-                active.policy,
+            masks = [_reduced(frame.mask, camera) for frame, camera in zip(frames, seen, strict=True)]
+            pool = Pool(
+                scene=scene,
+                candidates=[at_most(self._camera(i), pixels) for i in left],
+                train=seen,
+                k=1,
                 scoring=scoring,
                 rng=self._generator,
-                masks=[_reduced(frame.mask, camera) for frame, camera in zip(frames, seen, strict=True)],
+                masks=mask_list("select", masks, seen),
                 empty_outside=all(frame.is_object for frame in frames if frame.mask is not None),
                 progress=bar.update,
                 workers=self._workers,
             )
+            selection = choose(active.policy, pool)
         index = left[selection.picks[0].index]
         views = [{"index": i, "name": self.views[i].name, **self._where(i)} for i in left]
         record = {
             "number": len(self.picks) + 1,
             "step": step,
             **selection.picks_json(views)[0],
-            "seconds": selection.seconds,
+            "seconds": time.perf_counter() - began,
             "policy": active.policy,
             "criterion": scoring.criterion if active.policy == "fisher" else None,
             "prior": scoring.prior_of(active.policy).to_json(),
