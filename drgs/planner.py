@@ -1,4 +1,4 @@
-"""Where to look next, for a robot: photographs come one at a time, and so do questions.
+"""Where to look next, for a robot: photographs come one at a time, and the next place is chosen in between.
 
     planner = drgs.Planner()
     planner.observe(image, camera, depth)      # (H, W, 3), drgs.Camera, (H, W) or None
@@ -9,12 +9,13 @@
 
     planner.save("planner.safetensors")        # and after a crash: planner = drgs.Planner.load(...)
 
-What lasts from call to call: the model, what each view tells about it, and the candidates. What a view tells is asked
-again once what it sees has changed by more than a bound (`drgs.selection.drift`), so that a new photograph costs what
-is new. An answer within a time budget goes by what is known by then, and says how much that is.
+The model, the information of each view and the candidates are kept from call to call. The information of a view is
+computed again once its rendering has changed by more than a bound (`drgs.selection.drift`), so that a new photograph
+costs only what it changes. With a time budget, an answer uses the information that there is by then, and says how much
+of it is missing or out of date.
 
-Nothing here knows ROS, threads of its own, or maps: all methods may be called from any thread, `observe` and `fit` from
-one while another asks.
+The planner knows nothing of ROS or maps, and starts no threads. All methods may be called from any thread: `observe`
+and `fit` from one while another computes scores.
 """
 
 from __future__ import annotations
@@ -63,8 +64,8 @@ Cost = Sequence[float] | Callable[[Camera, Camera], float]
 """What it costs to go to each candidate, in the caller's unit; or a function: from where, to where."""
 
 _FAST = Scoring(settings=RenderSettings.preset("fast"))
-_RNG = torch.Generator()  # scores of informed policies draw nothing
-_LATELY = 9  # times that are remembered of how long something took: an odd number, for their median
+_RNG = torch.Generator()  # a pool must have one; policies that score by information draw nothing from it
+_DURATIONS_KEPT = 9  # latest durations whose median is what the next one takes: odd; the number is chosen, not tuned
 
 _ADVICE = "restore the file, or begin anew"
 _KIND = "planner"
@@ -105,7 +106,7 @@ _HEADER = {
 
 
 def default_config() -> FitConfig:
-    """What a planner's own model is fitted by: colors, small photographs, one renderer, seconds of steps."""
+    """Configuration of a planner's own model: colors only, small photographs, one renderer, few steps."""
     return FitConfig().replace(
         renderers=("fast",),
         semantics="ignore",
@@ -124,9 +125,9 @@ class PlannedView:
     Attributes:
         index: Place in the list of candidates.
         camera: The candidate.
-        score: What its view tells, as `drgs.select_views` scores it.
-        cost: What it costs to go there, in the caller's unit; 0 where nothing was said.
-        value: The score over `look` + cost; where nothing was said of costs, the score.
+        score: Score of its view's information, as of `drgs.select_views`.
+        cost: Cost of going there, in the caller's unit; 0 without costs.
+        value: score / (look + cost); without costs the score.
     """
 
     index: int
@@ -138,15 +139,15 @@ class PlannedView:
 
 @dataclasses.dataclass(frozen=True)
 class ViewPlan:
-    """An answer, and what it rests on.
+    """Scores and picks, and how much of the information they use is missing or out of date.
 
     Attributes:
-        picks: Picked candidates in the order of going there; fewer than were asked for where the others are not known
-            in time.
-        scores: Score of each candidate before the first pick; None of those that nothing was known of in time.
-        changed: Largest change, in [0, 1], of what a view sees since it was asked what it tells; 0: all is as of now.
-        computed: Views that were asked for this answer.
-        left_out: Known views that nothing is known of in time.
+        picks: Picked candidates in the order of going there; fewer than k where the information of the others was not
+            computed in time.
+        scores: Score of each candidate before the first pick; None where its information was not computed in time.
+        changed: Largest change, in [0, 1], of a view's rendering since its information was computed; 0: all is of now.
+        computed: Views whose information was computed for this answer.
+        left_out: Known views whose information was not computed in time.
         seconds: Wall time.
     """
 
@@ -159,12 +160,12 @@ class ViewPlan:
 
 
 class Planner:
-    """A model that grows with every photograph, and which of the places to go to would tell most about it.
+    """A model that grows with every photograph, and the choice of the next place by information about that model.
 
     Attributes:
-        max_views: Photographs that are kept. Of one more, the one goes whose loss costs least coverage.
-        info_pixels: Views are asked at no more pixels than these.
-        look: What a photograph itself costs, in the unit of costs.
+        max_views: Largest number of photographs that are kept. Of more, the one goes whose loss costs least coverage.
+        info_pixels: Largest number of pixels at which the information of a view is computed.
+        look: Cost of taking the photograph itself, in the unit of costs.
         notes: What the caller gave to `save`, in a planner that was loaded.
     """
 
@@ -182,12 +183,12 @@ class Planner:
     ) -> None:
         """
         Args:
-            config: How the planner's own model is fitted; default `drgs.planner.default_config`.
+            config: Configuration of the planner's own model; default `drgs.planner.default_config`.
             scene: A model of the caller's own, in its place; see `scene`.
-            scoring: How views are scored; default as `drgs.select_views`, drawn by preset `fast`.
+            scoring: How views are scored; default as `drgs.select_views`, rendered by preset `fast`.
             info_pixels, max_views, look: See the attributes.
-            bound: Largest change of what a view sees, in [0, 1], up to which what it tells is not asked again.
-            max_bytes: Bytes of what views tell that are kept at most.
+            bound: Largest change of a view's rendering, in [0, 1], up to which its information is not computed again.
+            max_bytes: Largest size of the information that is kept, bytes.
         Raises:
             ValueError: If a number is out of range, or the model moves.
         """
@@ -205,13 +206,13 @@ class Planner:
         self._scoring = scoring or _FAST
         self._fit = OnlineFit(config or default_config())
         self._cache = Cache(max_bytes, bound=bound)
-        self._known: list[Camera] = []  # at the size at which they are asked
-        self._here: Camera | None = None
+        self._known: list[Camera] = []  # at the size at which their information is computed
+        self._last_camera: Camera | None = None
         self._pool: list[Camera] = []
         self._cost: Cost | None = None
-        self._own: Gaussians | None = None
-        self._seen: Gaussians | None = None  # what was asked last, while nothing has changed
-        self._counted = 0
+        self._callers_scene: Gaussians | None = None
+        self._fit_scene: Gaussians | None = None  # a copy of the fit's Gaussians, as long as these do not change
+        self._num_observed = 0
         self._view_seconds, self._answer_seconds = _Duration(), _Duration()
         self._fit_lock = threading.RLock()
         self._answer_lock = threading.RLock()
@@ -223,21 +224,21 @@ class Planner:
         """The model as it is now, which further steps leave alone; None before there is any.
 
         A caller that maps by itself sets it, after every change, to Gaussians that keep their order: new ones come
-        last. Where there are fewer than before, all views are asked again. `observe` then notes where a photograph was
-        taken, and `fit` has nothing to do.
+        last. Where there are fewer than before, the information of all views is computed again. `observe` then records
+        only where a photograph was taken, and `fit` does nothing.
         """
         with self._fit_lock:
-            if self._own is not None:
-                return self._own
-            if self._seen is None and self._fit.trainer is not None:
-                self._seen = self._fit.gaussians()
-            return self._seen
+            if self._callers_scene is not None:
+                return self._callers_scene
+            if self._fit_scene is None and self._fit.trainer is not None:
+                self._fit_scene = self._fit.gaussians()
+            return self._fit_scene
 
     @scene.setter
     def scene(self, gaussians: Gaussians) -> None:
         must_be("Planner", "scene", gaussians, Gaussians, "a scene that moves has none that could be planned for")
         with self._fit_lock:
-            self._own = gaussians.detach()
+            self._callers_scene = gaussians.detach()
 
     @property
     def views(self) -> list[str]:
@@ -245,7 +246,7 @@ class Planner:
         return [camera.name for camera in self._known]
 
     def observe(self, image: np.ndarray | None, camera: Camera, depth: np.ndarray | None = None) -> int:
-        """A photograph that was taken; returns how many Gaussians it brought.
+        """Add a photograph; returns how many Gaussians were added for it.
 
         Args:
             image: (H, W, 3) uint8, or floats in [0, 1]; None if the model is the caller's own.
@@ -258,20 +259,20 @@ class Planner:
         with self._fit_lock:
             camera = dataclasses.replace(camera, name=self._name(camera.name))
             added = 0
-            if self._own is None:
+            if self._callers_scene is None:
                 added = self._fit.add(_checked_image(image, camera), camera, _checked_depth(depth, camera))
-                self._seen = None
-            self._counted += 1
-            self._here = camera
+                self._fit_scene = None
+            self._num_observed += 1
+            self._last_camera = camera
             self._known = [*self._known, at_most(camera, self.info_pixels)]
         if len(self._known) > self.max_views:
             self._drop_view()
         return added
 
     def fit(self, steps: int | None = None, seconds: float | None = None) -> int:
-        """Go on fitting the planner's model to what was observed; returns how many steps were made.
+        """Continue fitting the planner's model to its photographs; returns the number of steps done.
 
-        Another thread gets an answer between two of them.
+        Other threads can compute scores between two steps.
 
         Args:
             steps: Number of steps, at most; default 20 where no time is given either.
@@ -287,22 +288,22 @@ class Planner:
         done = 0
         while done < most and (seconds is None or time.monotonic() - begun < seconds):
             with self._fit_lock:
-                if self._own is not None or self._fit.trainer is None:
+                if self._callers_scene is not None or self._fit.trainer is None:
                     return done
                 self._fit.step()
-                self._seen = None
+                self._fit_scene = None
             done += 1
         return done
 
     def scores(
         self, candidates: Sequence[Camera], cost: Cost | None = None, *, seconds: float | None = None
     ) -> ViewPlan:
-        """What the view of each place would tell; these places are what `next` picks from, until there are others.
+        """Score the view of each candidate; `next` picks from these candidates, until there are others.
 
         Args:
             candidates: Cameras at the places where it could go.
-            cost: What it costs to go to each, >= 0; a function is called with the last place and the candidate.
-            seconds: Wall time for the answer; None: all is asked that has changed.
+            cost: Cost of going to each, >= 0; a function is called with the last place and the candidate.
+            seconds: Wall time for the answer; None: the information of all views that have changed is computed.
         Returns:
             A plan without picks.
         Raises:
@@ -317,7 +318,7 @@ class Planner:
             before = self._pool, self._cost
             self._pool, self._cost = [at_most(camera, self.info_pixels) for camera in pool], cost
             try:
-                self._costs(list(range(len(pool))), self._here)  # refuses what is no cost
+                self._costs(list(range(len(pool))), self._last_camera)  # refuses what is no cost
                 return self._plan(0, seconds)
             except BaseException:
                 self._pool, self._cost = before
@@ -326,12 +327,12 @@ class Planner:
     def next(self, k: int = 1, *, seconds: float | None = None) -> ViewPlan:
         """The k places to go to next, of those that `scores` was given.
 
-        Each is the one of most value, score over `look` + cost, once the ones before it are known; costs that are a
-        function are counted from one to the next.
+        Each has the largest value, score / (look + cost), given the ones before it; costs that are a function are those
+        of going from one to the next.
 
         Args:
             k: How many.
-            seconds: Wall time for the answer; what has changed, or was never asked, is asked as far as it lasts.
+            seconds: Wall time for the answer, as of `scores`.
         Raises:
             ValueError: If there are fewer candidates than k, or `seconds` is not a number >= 0.
         """
@@ -345,14 +346,14 @@ class Planner:
             return self._plan(k, seconds)
 
     def refine(self, camera: Camera, refine: Refine | None = None) -> Pick:
-        """A place moved to where its view tells more, within bounds; see `drgs.select.Refine`.
+        """Move a place to where its view scores higher, within bounds; see `drgs.select.Refine`.
 
         Args:
             camera: The place to begin with, e.g. that of a pick.
             refine: How far and how long; default 20 further views, in the box of all known views and candidates.
         Returns:
-            `camera` is the place, at the size at which views are asked; `score` and `start` are what it and the first
-            tell, scored beside no other candidates.
+            `camera` is the place, of at most `info_pixels` pixels; `score` and `start` are the scores of it and of the
+            first place, computed without other candidates.
         """
         must_be("Planner.refine", "camera", camera, Camera, "e.g. plan.picks[0].camera")
         with self._answer_lock:
@@ -368,13 +369,13 @@ class Planner:
     # -------------------------------------------------- kill and resume
 
     def save(self, path: str | os.PathLike, notes: Any = None) -> None:
-        """Write all that the planner knows to one file, from which `load` goes on with the same answers.
+        """Write the planner's state to one file; one that `load` makes of it gives the same answers.
 
         A process that is killed meanwhile leaves the file as it was. One process alone may write a file.
 
         Args:
             path: The file, safetensors; a planner's own is replaced, any other refused.
-            notes: Whatever else the caller goes on from, JSON: it is as old as the rest of the file.
+            notes: The caller's own state, JSON: it is saved together with the planner's, so that the two agree.
         Raises:
             ValueError: If there is something else of that name, or notes are no JSON.
             OSError: If the file cannot be written.
@@ -383,7 +384,7 @@ class Planner:
         with self._answer_lock, self._fit_lock:
             fit, fit_header, photographs = self._fit.state()
             answers, cache_header, expected = self._cache.state()
-            own, origin = _scene_tensors(self._own)
+            own, origin = _scene_tensors(self._callers_scene)
             costs = self._cost if self._cost is None or callable(self._cost) else [float(x) for x in self._cost]
             header = {
                 "version": runtime.version(),
@@ -392,9 +393,9 @@ class Planner:
                 "look": self.look,
                 "bound": self._cache.bound,
                 "max_bytes": self._cache.max_bytes,
-                "counted": self._counted,
+                "counted": self._num_observed,
                 "known": records(self._known),
-                "here": None if self._here is None else _camera_json(self._here),
+                "here": None if self._last_camera is None else _camera_json(self._last_camera),
                 "pool": records(self._pool),
                 "costs": True if callable(costs) else costs,
                 "scoring": named_by(self._scoring) or "",
@@ -411,7 +412,7 @@ class Planner:
 
     @classmethod
     def load(cls, path: str | os.PathLike, *, scoring: Scoring | None = None) -> Planner:
-        """A planner that goes on from a file of `save`.
+        """The planner that `save` wrote to a file.
 
         With one thread its answers have the bits that they would have had without the interruption, except that a
         limit of time falls elsewhere. Costs that are a function are in no file: `next` needs another `scores` first.
@@ -438,28 +439,28 @@ class Planner:
         ]
         planner._fit = OnlineFit.from_state(tensors, header["fit"], cameras("photographs"), where)
         if header["origin"] is not None:
-            planner._own = _scene_of(where, tensors, header["origin"])
+            planner._callers_scene = _scene_of(where, tensors, header["origin"])
         planner._known, planner._pool = (cameras(name, planner.info_pixels) for name in ("known", "pool"))
-        planner._here = None if header["here"] is None else _camera_of(where, header["here"])
-        planner._counted = header["counted"]
+        planner._last_camera = None if header["here"] is None else _camera_of(where, header["here"])
+        planner._num_observed = header["counted"]
         costs = header["costs"]
         planner._cost = _unknown_cost if isinstance(costs, bool) else costs
         for name, durations in (("asked_in", planner._view_seconds), ("answered_in", planner._answer_seconds)):
             for seconds in header[name]:
                 durations.note(seconds)
         expected = cameras("expected", planner.info_pixels)
-        if header["version"] == runtime.version():  # another one may ask something else, which is asked anew
+        if header["version"] == runtime.version():  # other versions may compute other information
             planner._cache.restore(tensors, header["cache"], expected, str(where))
         planner.notes = header.get("notes")
         if len(planner._known) > planner.max_views:  # saved by one thread while another had just taken a photograph
             planner._drop_view()
         return planner
 
-    # -------------------------------------------------- what is known
+    # -------------------------------------------------- views and model
 
     def _name(self, name: str) -> str:
         """The name of a photograph, or its number."""
-        name = name or f"view {self._counted}"
+        name = name or f"view {self._num_observed}"
         if name in self.views:
             raise ValueError(f"Planner.observe: names must be different, got {name!r} again; leave them empty")
         return name
@@ -474,7 +475,7 @@ class Planner:
             kept = select(scene, known, [], len(known) - 1, "coverage", information=self._coverage_of(scene))
             (gone,) = set(range(len(known))) - {pick.index for pick in kept.picks}
             self._known = [camera for i, camera in enumerate(known) if i != gone]
-            if self._own is None:
+            if self._callers_scene is None:
                 self._fit.drop(known[gone].name)
 
     def _coverage_of(self, scene: Gaussians) -> Callable[[Camera], Information]:
@@ -493,19 +494,19 @@ class Planner:
             scene = self.scene
             if scene is None:
                 raise ValueError(
-                    "Planner: there must be a model to ask, there is none yet; observe a photograph with depth, or two"
+                    "Planner: there must be a model, there is none yet; observe a photograph with depth, or two"
                 )
             return scene, list(self._known)
 
     def _expect(self, cameras: Sequence[Camera]) -> None:
-        """Before an answer: of other cameras nothing is kept, and nothing has been given."""
+        """Before an answer: the cache forgets all other cameras, and which changes it has reported."""
         self._cache.expect(cameras)
         self._cache.changes.clear()
 
     # -------------------------------------------------- answers
 
     def _plan(self, k: int, seconds: float | None) -> ViewPlan:
-        """Compute information of as many views as there is time for, and answer by what is known then."""
+        """Compute information of as many views as there is time for, and answer by what there is then."""
         begun = time.monotonic()
         scene, known = self._model_and_views()
         self._expect([*known, *self._pool])
@@ -526,7 +527,7 @@ class Planner:
         return dataclasses.replace(plan, computed=computed, seconds=now - begun)
 
     def _evaluate_changed(self, scene: Gaussians, known: list[Camera], until: float) -> int:
-        """Compute information of the views that have changed most, known ones and candidates in turn, until a time.
+        """Compute information of the views that have changed most, known views and candidates in turn, until a time.
 
         Returns:
             How many views.
@@ -555,7 +556,7 @@ class Planner:
         )
 
     def _answer(self, scene: Gaussians, known: list[Camera], k: int) -> ViewPlan:
-        """Scores and picks by what is kept."""
+        """Scores and picks by the information in the cache."""
         # Without costs all picks come of one call; with costs each is of another value than its score.
         at_once = max(k, 1) if self._cost is None else 1
         selection, places, there = self._selected(scene, list(range(len(self._pool))), known, at_once)
@@ -568,7 +569,7 @@ class Planner:
             if self._cost is None:
                 scored = [(places[pick.index], pick.score) for pick in selection.picks[:k]]
                 picks = [PlannedView(i, self._pool[i], score, 0.0, score) for i, score in scored]
-        here = self._here
+        here = self._last_camera
         while self._cost is not None and selection is not None and len(picks) < k:
             costs = self._costs(places, here)
             values = [score / (self.look + cost) for score, cost in zip(selection.scores, costs, strict=True)]
@@ -582,7 +583,10 @@ class Planner:
     def _selected(
         self, scene: Gaussians, places: list[int], known: list[Camera], k: int
     ) -> tuple[Selection | None, list[int], list[Camera]]:
-        """Scores of the candidates that something is known of, against known views likewise; both as they are left."""
+        """Scores of the candidates, given the known views, of those views alone that the cache has information of.
+
+        Returns:
+            The scores (None without such candidates), indices of these candidates, and these known views."""
         while places:
             pool = [self._pool[i] for i in places]
             try:
@@ -595,7 +599,7 @@ class Planner:
         return None, places, known
 
     def _costs(self, places: list[int], here: Camera | None) -> list[float]:
-        """What it costs to go from here to candidates."""
+        """Costs of going from a camera to candidates."""
         cost = self._cost
         if cost is None or (callable(cost) and here is None):
             return [0.0] * len(places)
@@ -615,17 +619,17 @@ class Planner:
 
 
 class _Duration:
-    """How long something usually takes, as it was lately: a kernel that had to be compiled is not what is usual.
+    """How long something usually takes: a median, which a single compilation of a kernel does not change.
 
     Attributes:
-        seconds: What it took the last times, the oldest first.
+        seconds: The latest durations, the oldest first.
     """
 
     def __init__(self) -> None:
-        self.seconds: deque[float] = deque(maxlen=_LATELY)
+        self.seconds: deque[float] = deque(maxlen=_DURATIONS_KEPT)
 
     def note(self, seconds: float) -> None:
-        """It took so long."""
+        """Add a duration."""
         self.seconds.append(seconds)
 
     @property
@@ -635,12 +639,12 @@ class _Duration:
 
 
 def _unknown_cost(here: Camera, there: Camera) -> float:
-    """What is in the place of costs that were a function when a planner was saved."""
+    """Stands for costs that were a function when a planner was saved."""
     raise ValueError("Planner.next: costs were a function, which no file holds; give it to Planner.scores again")
 
 
 def _check_seconds(where: str, seconds: float | None) -> None:
-    """Refuse what is no limit of time; NaN would be none."""
+    """Raise ValueError unless `seconds` is None or a number >= 0."""
     if seconds is not None and not (isinstance(seconds, numbers.Real) and seconds >= 0):
         raise ArgumentError(f"{where}: seconds must be a number >= 0, got {seconds!r}; leave it out for no limit")
 
@@ -669,11 +673,11 @@ def _checked_depth(depth: np.ndarray | None, camera: Camera) -> np.ndarray | Non
     return np.nan_to_num(depth.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0).clip(min=0)
 
 
-# ---------------------------------------------------------------------------------------------------- its file
+# ------------------------------------------------------------------------------------------------- file of a planner
 
 
 def _write_file(path: str | os.PathLike, tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> None:
-    """Write a planner's file; what a killed process left half written beside it is removed.
+    """Write a planner's file; half-written files of killed processes beside it are removed.
 
     Args:
         path: The file, which this process alone writes.
@@ -694,7 +698,7 @@ def _write_file(path: str | os.PathLike, tensors: dict[str, torch.Tensor], heade
         for other in path.parent.iterdir():
             if other.name.startswith(f".drgs.{path.name}.") and atomic.is_left_over(other.resolve()):
                 atomic.delete(other)
-    tensors = _apart(tensors)
+    tensors = _without_shared_memory(tensors)
     save_state(path, tensors, {"kind": _KIND, **header, "digest": _digest(tensors, header)})
 
 
@@ -729,12 +733,12 @@ def _camera_json(camera: Camera) -> dict[str, Any]:
 
 
 def _camera_of(where: Path, record: dict[str, Any], pixels: float = math.inf) -> Camera:
-    """The camera of a record that `_read_file` has looked at.
+    """The camera of a record that `_read_file` has checked.
 
     Args:
         where: The file, for messages.
-        record: What `_camera_json` made.
-        pixels: Number of pixels that its image may have.
+        record: From `_camera_json`.
+        pixels: Largest number of pixels of its image.
     Raises:
         ValueError: If there is no such camera.
     """
@@ -782,16 +786,16 @@ def _is_planner_file(path: Path) -> bool:
     return False
 
 
-def _apart(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """The same without two that share memory, which safetensors refuses."""
+def _without_shared_memory(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """The tensors on the CPU, copied where two share memory, which safetensors refuses."""
     seen: set[int] = set()
-    apart = {}
+    separate = {}
     for name, x in tensors.items():
         x = x.detach().cpu()  # a file holds values
         place = x.untyped_storage().data_ptr()
-        apart[name] = x.clone() if place in seen else x
+        separate[name] = x.clone() if place in seen else x
         seen.add(place)
-    return apart
+    return separate
 
 
 def _digest(tensors: Mapping[str, torch.Tensor], header: Mapping[str, Any]) -> str:

@@ -297,7 +297,7 @@ def test_candidates_of_scores_that_fail_are_not_installed(world):
     assert plan.scores == before.scores
     assert sorted(pick.cost for pick in plan.picks) == [1.0, 2.0, 3.0]
     empty = Planner(config())
-    with pytest.raises(ValueError, match="there must be a model to ask"):
+    with pytest.raises(ValueError, match="there must be a model, there is none"):
         empty.scores(candidates)
     with pytest.raises(ValueError, match=r"k must be a whole number in 1..0 candidates"):
         empty.next()
