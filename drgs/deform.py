@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 __all__ = ["DeformationField", "Deltas", "DynamicGaussians", "FieldConfig"]
 
 _HEADS = {"means": 3, "quats": 4, "log_scales": 3}
-_BEYOND = 1e-6  # of the span: how far outside of it a time may lie, by rounding
-_FLATTEST = 1e-3  # of the longest side of the bounds: how short another may be
+_SPAN_TOLERANCE = 1e-6  # of the span: how far outside of it a time may lie, by rounding
+_LEAST_SIDE = 1e-3  # of the longest side of the bounds: shortest other side, which coordinates are divided by; chosen
 PHI = "phi."
 
 
@@ -202,7 +202,7 @@ class DeformationField(torch.nn.Module):
         """The time as a part of the span."""
         first, last = (float(x) for x in self.grid.span)
         value = float(time.detach() if isinstance(time, torch.Tensor) else time)  # a check
-        slack = _BEYOND * (last - first)
+        slack = _SPAN_TOLERANCE * (last - first)
         if not first - slack <= value <= last + slack:
             raise ArgumentError(
                 f"DeformationField: time must be in [{first:g}, {last:g}], the span of the field, got {value:g}; ask "
@@ -453,7 +453,7 @@ def _checked_bounds(bounds: ArrayLike | torch.Tensor) -> torch.Tensor:
     middle = box.mean(0)
     size = box[1] - box[0]
     # Coordinates are divided by it: a flat scene has a side of 0, a single point three.
-    size = size.clamp_min(_FLATTEST * float(size.max()) or 1.0)
+    size = size.clamp_min(_LEAST_SIDE * float(size.max()) or 1.0)
     return torch.stack([middle - size / 2, middle + size / 2])
 
 

@@ -44,7 +44,7 @@ def test_render_says_what_exact_takes(monkeypatch, tmp_path, capsys, options, se
 
     g = drgs.Gaussians.from_arrays([[0.0, 0, 0]], [[1.0, 0, 0, 0]], [[0.3] * 3], [0.9], [[[0.5, 0.5, 0.5]]])
     save_ply(g, tmp_path / "g.ply")
-    monkeypatch.setattr(render_command, "_MANY_PIXELS", 2 * 40 * 30)
+    monkeypatch.setattr(render_command, "_FORECAST_PIXELS", 2 * 40 * 30)
     monkeypatch.setattr(render_command, "forecast", lambda *_: seconds)
     line = f"render {tmp_path / 'g.ply'} --frames 2 --width 40 -o {tmp_path / 'out'} {options}"
     assert cli.main(line.split()) == 0

@@ -33,8 +33,8 @@ __all__ = ["HEADINGS", "command_list", "config_fields", "help_page", "parsed_opt
 HEADINGS = ("Run", "Data", "Views", "Quality", "Features", "Motion", "Rendering", "Machine")
 """Headings of help, in their order."""
 
-_WIDEST = 100  # columns of help
-_INDENT = 26  # columns of an option, before its text
+_MOST_COLUMNS = 100  # columns of help, at most, in a wider terminal: longer lines read badly; chosen
+_INDENT = 26  # columns of an option's name, before its text; chosen
 _ADVICE = "correct the file"
 _PRESET = "fast"  # as a fit has it
 
@@ -344,7 +344,7 @@ def _config_of(words: Sequence[str]) -> dict[str, Any]:
 
 
 def _width() -> int:
-    return min(shutil.get_terminal_size().columns, _WIDEST)
+    return min(shutil.get_terminal_size().columns, _MOST_COLUMNS)
 
 
 def _flags(option: Option) -> str:

@@ -53,11 +53,11 @@ _PRESETS = {
     "3dgut": "as exact at each hit, gsplat's order and cut-offs",
     "mitsuba": "as fast, on Mitsuba's acceleration structure, entry order",
 }
-_GAIN = 8  # factor of difference pictures
-_PANEL = 600  # pixels of width of a picture in overview.png
+_DIFFERENCE_GAIN = 8  # factor of difference pictures: differences of a few of 255 levels become visible; chosen
+_PANEL_WIDTH = 600  # pixels of width of a picture in overview.png; chosen
 _OWN = ("demo", "eval", "report")  # commands whose files in the run may be replaced
 _TARGET = (0.0, -0.02, 0.12)  # the middle of the table, in meters
-_DISTANCE = 1.1
+_DISTANCE = 1.1  # meters from there to the cameras of the turntable, outside of the table; chosen
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -391,7 +391,7 @@ def _overview(g: Gaussians, known: list[Camera], frames: list[Frame], images: li
         "error": pictures.inferno(error / max(np.percentile(error, 99.5), 1e-6)),
         "predicted uncertainty": pictures.map_colors(np.sqrt(found[frame.name][0]))[0],
     }
-    wide = (_PANEL, round(_PANEL * frame.camera.height / frame.camera.width))
+    wide = (_PANEL_WIDTH, round(_PANEL_WIDTH * frame.camera.height / frame.camera.width))
     large = {
         text: cv2.resize(x if x.dtype == np.uint8 else pictures.to_bytes(x), wide, interpolation=cv2.INTER_CUBIC)
         for text, x in panels.items()
@@ -407,9 +407,11 @@ def _sheet(frames: list[Frame], images: dict[str, list[torch.Tensor]]) -> np.nda
         exact = images["exact"][i]
         photo = frame.image()
         parts = {f"view {frame.name}": photo, "exact": exact}
-        parts[f"|exact - photograph| x {_GAIN // 2}"] = (_GAIN // 2) * (exact.clamp(0, 1) - photo).abs()
+        parts[f"|exact - photograph| x {_DIFFERENCE_GAIN // 2}"] = (_DIFFERENCE_GAIN // 2) * (
+            exact.clamp(0, 1) - photo
+        ).abs()
         for name in ("fast", "inria", "gsplat"):
-            parts[f"|{name} - exact| x {_GAIN}"] = _GAIN * (images[name][i] - exact).abs()
+            parts[f"|{name} - exact| x {_DIFFERENCE_GAIN}"] = _DIFFERENCE_GAIN * (images[name][i] - exact).abs()
         rows.append(np.concatenate([pictures.caption(x.numpy(), text) for text, x in parts.items()], axis=1))
     return np.concatenate(rows, axis=0)
 

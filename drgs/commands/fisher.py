@@ -368,7 +368,7 @@ def _parts(blocks: dict[str, float], several: tuple[str, ...]) -> tuple[str, ...
 # ---------------------------------------------------------------------------------- maps of several rules, side by side
 
 
-_SMALL = 200  # pixels of width, below which a picture is enlarged by a whole number
+_ENLARGED_BELOW = 200  # pixels of width, below which a picture is enlarged by a whole number
 
 
 class ComparedMaps:
@@ -405,7 +405,7 @@ class ComparedMaps:
             "fisherrf": fisherrf_map(seen, camera, self.known, self.prior, self.settings).numpy(),
             **blocks,
         }
-        times = max(1, -(-_SMALL // camera.width))
+        times = max(1, -(-_ENLARGED_BELOW // camera.width))
         large = lambda x: np.repeat(np.repeat(x, times, 0), times, 1)  # noqa: E731
         when = "" if camera.time is None else f" at {camera.time:g}"
         panels = [pictures.caption(large(image), f"{camera.name or 'view'}{when}")]

@@ -23,8 +23,8 @@ __all__ = ["DATAPARSER_TRANSFORMS", "in_frame_of_data"]
 
 DATAPARSER_TRANSFORMS = "dataparser_transforms.json"
 """File of a nerfstudio run, to be put beside the splat that was exported of it."""
-_ROUNDING = 1e-3  # of a rotation that was computed in float32 and written as text
-_DIRECTIONS = 64  # by which SH are turned: four times as many as there are coefficients
+_ROTATION_ERROR = 1e-3  # largest error of R R^T that float32 and text explain: more is no rotation
+_SH_DIRECTIONS = 64  # directions by which SH are rotated, a least-squares fit: four for each of 16 coefficients
 _log = logging.getLogger(__name__)
 
 
@@ -70,7 +70,7 @@ def _similarity(where: str, matrix: Any) -> np.ndarray:
     if found.shape not in ((3, 4), (4, 4)) or not np.isfinite(found).all():
         raise ValueError(f"{where} must be 3x4 finite numbers, got shape {found.shape}; copy it again")
     R = found[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > _ROUNDING or np.linalg.det(R) < 0:
+    if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_ERROR or np.linalg.det(R) < 0:
         raise ValueError(f"{where} must hold a rotation, got another matrix; copy it again")
     return np.concatenate([found[:3], [[0.0, 0.0, 0.0, 1.0]]])
 
@@ -87,7 +87,7 @@ def _moved(g: Gaussians, rotation: np.ndarray, translation: np.ndarray, scale: f
     # SH up to a degree stay such SH when they are turned: what is seen from a direction is seen from the turned one.
     generator = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(
-        torch.randn(_DIRECTIONS, 3, dtype=torch.float64, generator=generator), dim=1
+        torch.randn(_SH_DIRECTIONS, 3, dtype=torch.float64, generator=generator), dim=1
     )
     count = g.sh.shape[1]
     turn = torch.linalg.lstsq(sh_basis(directions @ R.T, count), sh_basis(directions, count)).solution

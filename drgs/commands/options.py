@@ -70,7 +70,7 @@ __all__ = [
 Split = Literal["all", "train", "test"]
 
 SIDE = (1, 16_384)  # pixels; a mistyped size shall not ask for terabytes
-VIEWS = (1, 10_000)  # that are looked at one after the other
+VIEWS = (1, 10_000)  # views of one command; more is a typing error
 
 
 def _scene() -> Any:

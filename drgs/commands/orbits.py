@@ -29,14 +29,15 @@ if TYPE_CHECKING:
 
 __all__ = ["Wish", "capture_orbit", "dome", "scene_orbit"]
 
-_ELEVATION = 20.0
-_FOV = 45.0
-_STEEPEST = 80.0  # degrees; nearer to the pole a circle turns on the spot
-_SAMPLE = 20_000  # Gaussians that decide the distance
-_FAR = 3.0  # times the median distance from the center: beyond are floaters and backgrounds
-_INSIDE = 0.998  # share of the rest that every frame shows
-_MARGIN = 1.1
-_SOLID = 0.05  # opacity below which a Gaussian is no part of the shape
+# Chosen, not tuned.
+_DEFAULT_ELEVATION = 20.0  # degrees above the center, from which tables and objects are usually seen
+_DEFAULT_FOV = 45.0  # degrees, horizontal, about that of a normal lens
+_MOST_ELEVATION = 80.0  # degrees of elevation; nearer to the pole a circle turns on the spot
+_SAMPLED_GAUSSIANS = 20_000  # Gaussians that decide the distance, at most: more would take seconds
+_FAR_FACTOR = 3.0  # times the median distance from the center: beyond are floaters and backgrounds
+_INSIDE_SHARE = 0.998  # share of the rest that every frame shows
+_MARGIN = 1.1  # of the frame's size over that of the Gaussians in it
+_SOLID_OPACITY = 0.05  # opacity below which a Gaussian is no part of the shape
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -111,8 +112,8 @@ def scene_orbit(
         offsets = offsets + center - wish.center
         center = np.asarray(wish.center, np.float64)
     up = _unit(wish.up or UP["minus-y"])
-    elevation = _ELEVATION if wish.elevation is None else wish.elevation
-    lens = _Lens(intrinsics_from_fov(wish.fov or _FOV, width, height), width, height)
+    elevation = _DEFAULT_ELEVATION if wish.elevation is None else wish.elevation
+    lens = _Lens(intrinsics_from_fov(wish.fov or _DEFAULT_FOV, width, height), width, height)
     front = _level(np.eye(3)[np.argmin(np.abs(up))], up)  # any direction; this choice is stable
     distance = wish.distance
     if distance is None:
@@ -122,7 +123,7 @@ def scene_orbit(
             # A point is in the frame of a camera at distance D if |x| <= (D + z) tan and |y| likewise.
             slope = 0.5 * np.array([width / lens.K[0, 0], height / lens.K[1, 1]]) / _MARGIN
             needed = ((np.abs(local[:, :2]) + reach[:, None]) / slope).max(axis=1) - local[:, 2]
-            distance = max(distance, float(np.quantile(needed, _INSIDE)))
+            distance = max(distance, float(np.quantile(needed, _INSIDE_SHARE)))
     turns = _turns(frames, 360.0 if wish.span is None else wish.span, returns)
     return _around(center, up, front, turns, distance, elevation, lens)
 
@@ -171,7 +172,7 @@ def capture_orbit(
         span = 360.0
     span = span if wish.span is None else wish.span
     distance = distance if wish.distance is None else wish.distance
-    elevation = np.clip(elevation, -_STEEPEST, _STEEPEST) if wish.elevation is None else wish.elevation
+    elevation = np.clip(elevation, -_MOST_ELEVATION, _MOST_ELEVATION) if wish.elevation is None else wish.elevation
     made = _around(focus.center, up, middle, _turns(frames, span, returns), distance, float(elevation), lens)
     kind = "circle" if span >= 360 else f"swing of {span:.0f} degrees"
     place = ", ".join(f"{x:.3g}" for x in focus.center)
@@ -207,18 +208,18 @@ def _shape(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     # Values, to place cameras by.
     means = gaussians.means.detach().cpu().numpy().astype(np.float64) + gaussians.origin
     sizes = gaussians.scales.detach().cpu().numpy().astype(np.float64).max(axis=1)
-    solid = gaussians.opacities.detach().cpu().numpy() > _SOLID
+    solid = gaussians.opacities.detach().cpu().numpy() > _SOLID_OPACITY
     if solid.any():
         means, sizes = means[solid], sizes[solid]
-    step = -(-len(means) // _SAMPLE)
+    step = -(-len(means) // _SAMPLED_GAUSSIANS)
     means, sizes = means[::step], sizes[::step]
     distance = np.linalg.norm(means - np.median(means, axis=0), axis=1)
-    near = distance <= _FAR * np.median(distance)
+    near = distance <= _FAR_FACTOR * np.median(distance)
     means = means[near]
     reach = 2 * sizes[near]
     # The median says what belongs to the scene; the middle of that is what to turn around, since
     # the median lies where the detail is.
-    center = np.quantile(means, (1 - _INSIDE, _INSIDE), axis=0).mean(axis=0)
+    center = np.quantile(means, (1 - _INSIDE_SHARE, _INSIDE_SHARE), axis=0).mean(axis=0)
     return center, means - center, reach
 
 

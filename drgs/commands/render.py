@@ -62,14 +62,14 @@ __all__ = ["forecast", "render_views", "run"]
 
 _log = logging.getLogger(__name__)
 
-_MANY_PIXELS = 500_000  # of all views; below, finding out would take as long as doing it
-_LONG = 10.0  # seconds that are worth a word
+_FORECAST_PIXELS = 500_000  # pixels of all views; for fewer, a forecast takes as long as rendering
+_LONG_SECONDS = 10.0  # seconds from which on the forecast is printed; chosen
 _FORMATS = ("png", "jpg", "exr", "webm", "mp4", "ply")
 _FILMS: Mapping[str, Any] = {"webm": pictures.Video, "mp4": Mp4}
 _PICTURES = ("png", "jpg", "exr")
-_MORE = ("depth", "features", "labels", "overlay", "moving")  # options that write more files than one
-_BANDS = (0.125, 0.375, 0.625, 0.875)  # places of the bands in parts of the height: one in each quarter
-_SHARE = 1 / 32  # height of each band, in parts of the view's
+_EXTRA_PICTURES = ("depth", "features", "labels", "overlay", "moving")  # options that write more files than one
+_BAND_PLACES = (0.125, 0.375, 0.625, 0.875)  # of the height: where bands are timed, one in each quarter
+_BAND_HEIGHT = 1 / 32  # of the height: each band; an eighth of the view is rendered for the forecast
 
 
 def run(args: Render) -> None:
@@ -392,10 +392,10 @@ def _summary(report: dict, folder: Path) -> str:
 
 def _say_how_long(args: Render, gaussians: Gaussians, cameras: list[Camera], settings: RenderSettings) -> None:
     """Exact order on every ray may take minutes where the centers' order takes seconds: said beforehand."""
-    if settings.order != "ray" or sum(camera.width * camera.height for camera in cameras) < _MANY_PIXELS:
+    if settings.order != "ray" or sum(camera.width * camera.height for camera in cameras) < _FORECAST_PIXELS:
         return
     seconds = forecast(gaussians, cameras, settings)
-    if seconds > _LONG:
+    if seconds > _LONG_SECONDS:
         what = f"{args.preset}, {len(cameras)} views of {cameras[0].width}x{cameras[0].height}"
         _say(
             args,
@@ -420,7 +420,7 @@ def forecast(gaussians: Gaussians, cameras: list[Camera], settings: RenderSettin
         settings: Settings that they are rendered by.
     """
     first = cameras[0]
-    rows = max(2, round(first.height * _SHARE))
+    rows = max(2, round(first.height * _BAND_HEIGHT))
 
     def seconds(place: float, height: int) -> float:
         band = cropped(first, 0, int(place * max(first.height - height, 0)), first.width, height)
@@ -429,15 +429,15 @@ def forecast(gaussians: Gaussians, cameras: list[Camera], settings: RenderSettin
             render(gaussians, band, settings, ()).rgb.cpu().numpy()
         return time.perf_counter() - began
 
-    with Bar("how long it will take", len(_BANDS)) as bar:
+    with Bar("how long it will take", len(_BAND_PLACES)) as bar:
         seconds(0.5, rows)  # compiles the kernels
         view = row = 0.0
-        for place in _BANDS:
+        for place in _BAND_PLACES:
             # What projecting and sorting all Gaussians takes, however small the image is, and what its rows take.
             least = seconds(place, 1)
             each = max(seconds(place, rows) - least, 0.0) / (rows - 1)
-            view += max(least - each, 0.0) / len(_BANDS)
-            row += each / len(_BANDS)
+            view += max(least - each, 0.0) / len(_BAND_PLACES)
+            row += each / len(_BAND_PLACES)
             bar.advance()
     pixels = sum(camera.width * camera.height for camera in cameras)
     return view * len(cameras) + row * pixels / first.width
@@ -510,7 +510,7 @@ def single_file(args: Render) -> SingleFile | None:
         raise ValueError(
             f"render: --format must be left out with -o {path}, got {args.format!r}; drop it, or name a folder"
         )
-    for name in _MORE:
+    for name in _EXTRA_PICTURES:
         if getattr(args, name):
             raise ValueError(f"render: --{name} must have a folder to write into, -o {path} is one file; name a folder")
     if single.format in _PICTURES and pictures.file_names([single.stem]) != [single.stem]:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = ["is_page", "run", "shared_of"]
 
-_VIEW = 960, 640  # pixels of a view of what has no photographs: its shape is a screen's
+_DEFAULT_SIZE = 960, 640  # pixels of the first view of a scene without photographs: about the shape of a screen; chosen
 
 _log = logging.getLogger(__name__)
 
@@ -109,5 +109,5 @@ def _dataset(record: FitRecord) -> Dataset | None:
 
 def _all_of_it(gaussians: Gaussians) -> Camera:
     """A camera that sees all Gaussians."""
-    width, height = _VIEW
+    width, height = _DEFAULT_SIZE
     return scene_orbit(gaussians, 1, width=width, height=height)[0]

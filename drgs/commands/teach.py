@@ -40,15 +40,15 @@ _FOLDER = TEACHER_FOLDERS[0]
 _RECORD = f"{_FOLDER}/teach.json"
 _EMBEDDINGS = "text_embeddings.npy"
 _CLASSES = CLASS_FILES[0]
-_LONG = 80  # cells of a map's longer side
-_LARGEST = 4096  # cells of a side
+_LONGER_SIDE = 80  # cells of the longer side of a map, by default; chosen
+_MOST_CELLS = 4096  # cells of a side, at most: more is a typing error
 
 
 def run(args: Teach) -> None:
     """`drgs teach DATA`."""
     size = None if args.size is None else parsed_size("--size", args.size)
-    if size is not None and not all(1 <= side <= _LARGEST for side in size):
-        raise ValueError(f"--size must be 1x1 to {_LARGEST}x{_LARGEST} cells, got {args.size}; correct it")
+    if size is not None and not all(1 <= side <= _MOST_CELLS for side in size):
+        raise ValueError(f"--size must be 1x1 to {_MOST_CELLS}x{_MOST_CELLS} cells, got {args.size}; correct it")
     scales = _scales(args.scales)
     if not args.data.exists():
         raise FileNotFoundError(f"{args.data}: must be a data set, found no such file or folder; check the path")
@@ -69,7 +69,7 @@ def run(args: Teach) -> None:
         "method": "MaskCLIP: CLIP with the value path of its last attention alone",
         "model": {"folder": str(args.model), "weights": encoder.weights.name, "sha256": digest},
         "channels": encoder.channels,
-        "size": size or f"longer side {_LONG}",
+        "size": size or f"longer side {_LONGER_SIDE}",
         "scales": scales,
         "flip": args.flip,
         "classes": names,
@@ -203,7 +203,7 @@ def _photograph(view: View) -> np.ndarray:
 def _size(view: View) -> tuple[int, int]:
     """(w, h) of a view's map: its photograph's shape."""
     width, height = view.camera.width, view.camera.height
-    factor = _LONG / max(width, height)
+    factor = _LONGER_SIDE / max(width, height)
     return max(1, round(width * factor)), max(1, round(height * factor))
 
 

@@ -42,8 +42,8 @@ if TYPE_CHECKING:
 __all__ = ["run", "subject_of", "watched_files"]
 
 
-_EVERY = 2.0  # seconds between two looks at the files
-_LAST = 0.5  # seconds that what is being computed is given to end
+_POLL_SECONDS = 2.0  # seconds between two looks at the files; chosen
+_STOP_SECONDS = 0.5  # seconds that a running computation gets to end; chosen
 
 
 def run(args: View) -> None:
@@ -67,7 +67,7 @@ def run(args: View) -> None:
         with quietly():
             _watch(args, viewer, stamps)
     finally:
-        if not viewer.worker.close(_LAST):
+        if not viewer.worker.close(_STOP_SECONDS):
             interrupts.leave()
         viewer.stop()
 
@@ -75,7 +75,7 @@ def run(args: View) -> None:
 def _watch(args: View, viewer: Viewer, stamps: dict[Path, tuple[int, int, int]]) -> None:
     """Look at the files now and then, and read them again when one has changed."""
     never = threading.Event()
-    while not never.wait(_EVERY):
+    while not never.wait(_POLL_SECONDS):
         now = _stamps(watched_files(args))
         if now != stamps and not viewer.worker.has("files"):
             stamps = now

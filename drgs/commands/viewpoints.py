@@ -58,10 +58,10 @@ __all__ = [
     "timed",
 ]
 
-_PIXELS = 130_000  # of a view where there is no fit that says
-# To find out whether cameras see any of the scene at all, at most so many of each are looked at.
-_LOOKED_AT = 20_000
-_LOOKED_FROM = 50
+_DEFAULT_PIXELS = 130_000  # pixels of a view without a run, as `max_pixels` of a fit
+# At most so many are checked for whether cameras see any of the scene at all; chosen for their seconds.
+_CHECKED_GAUSSIANS = 20_000
+_CHECKED_CAMERAS = 50
 _log = logging.getLogger(__name__)
 _NOUNS = {"orbit": "an orbit", "dome": "a dome", "list": "a list of cameras"}
 
@@ -312,7 +312,7 @@ def known_views(
 def _known_views(text: str | None, args: Views, given: SceneInput, lenses: bool, pixels: int | None) -> Known:
     """The views of `known_views`, whatever they show."""
     source = Source.known(text, given)
-    pixels = pixels or (_PIXELS if given.record is None else given.record.config.data.max_pixels)
+    pixels = pixels or (_DEFAULT_PIXELS if given.record is None else given.record.config.data.max_pixels)
     where = str(Path(source.text))
     if source.kind == "list":
         cameras = [at_most(_seen(camera, lenses), pixels) for camera in source.listed()]
@@ -354,8 +354,8 @@ def held_out_views(args: Views, given: SceneInput, known: Known) -> list[Camera]
 
 def _check_seen(gaussians: Gaussians, cameras: list[Camera]) -> None:
     """Say so if most of the cameras have no Gaussian's center before them: a file may be in another frame than they."""
-    means = gaussians.means[:: max(1, len(gaussians) // _LOOKED_AT)].detach().cpu().numpy() + gaussians.origin
-    looked = evenly(cameras, _LOOKED_FROM)
+    means = gaussians.means[:: max(1, len(gaussians) // _CHECKED_GAUSSIANS)].detach().cpu().numpy() + gaussians.origin
+    looked = evenly(cameras, _CHECKED_CAMERAS)
     blind = sum(not camera.contains(camera.project(means)[0]).any() for camera in looked)
     if blind > len(looked) / 2:
         _log.warning(

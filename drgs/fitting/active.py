@@ -49,11 +49,15 @@ if TYPE_CHECKING:
 __all__ = ["SELECTION", "ActiveViews"]
 
 SELECTION = "selection.json"
-_COVERED = 0.5  # opacity of a pixel that needs no new points
-_WORTH = 0.01  # share of a view's pixels below which triangulation is not worth its seconds
-_MOST = 20  # times its share are drawn at most of a view's pixels, when few of them are open
-_SURE = 1000  # triangulated points of a start that is good enough to go on
-_FEWEST = 4  # points whose distances to each other say how wide Gaussians should be
+_COVERED = 0.5  # opacity from which on a pixel needs no new points: more of it is Gaussians than background
+_LEAST_OPEN_SHARE = (
+    0.01  # share of a view's pixels that are open, below which no new points are sought; chosen, not tuned
+)
+_MOST_DRAWN = 20  # times a view's share of the budget: most points drawn from its depth map; chosen, not tuned
+_ENOUGH_TRIANGULATED = (
+    1000  # triangulated points from which on `--restart auto` keeps the Gaussians; see docs/active-static.md
+)
+_FEWEST_POINTS = 4  # points: each Gaussian's width is of its distances to the three nearest others
 
 
 class ActiveViews:
@@ -179,7 +183,7 @@ class ActiveViews:
             is_open &= frame.mask.numpy() > _COVERED
         if (empty := frame.empty()) is not None:
             is_open &= empty.numpy() < 1 - _COVERED
-        worth = is_open.mean() >= _WORTH
+        worth = is_open.mean() >= _LEAST_OPEN_SHARE
         seen = [self.views[i] for i in self.chosen]
         dense = seen[-1].depth_path is not None
         if dense and not worth:
@@ -187,7 +191,7 @@ class ActiveViews:
         seed = self._config.seed + len(self.picks)
         with Bar("points of the new view") as bar:
             if dense:
-                wanted = min(math.ceil(self._share / is_open.mean()), _MOST * self._share)
+                wanted = min(math.ceil(self._share / is_open.mean()), _MOST_DRAWN * self._share)
                 points, colors, _ = initial_points(seen[-1:], seed, wanted, bar.stage)
                 found = 0
             else:
@@ -201,7 +205,7 @@ class ActiveViews:
         guessed = guessed[is_open[rows, columns]] if worth else guessed[:0]
         sure = np.random.default_rng(seed).permutation(np.flatnonzero(inside[:found]))
         kept = np.concatenate([sure, guessed])[: self._share]
-        if len(kept) < _FEWEST:
+        if len(kept) < _FEWEST_POINTS:
             return nothing
         return torch.from_numpy(points[kept]), torch.from_numpy(colors[kept]), dense
 
@@ -257,7 +261,7 @@ class ActiveViews:
         last = next((pick["triangulated"] for pick in reversed(self.picks) if pick.get("restarted")), None)
         with Bar("points of all views") as bar:
             began = self._count_start(bar) if last is None else last
-            if restart == "auto" and began >= _SURE:  # it goes on: nobody needs the points
+            if restart == "auto" and began >= _ENOUGH_TRIANGULATED:  # it goes on: nobody needs the points
                 found = triangulated_count(seen, self._matches, bar.stage)
                 self.picks[-1] |= {"triangulated": found, "restarted": False}
                 return None

@@ -68,12 +68,12 @@ FieldPreset = Literal["neu3d", "dnerf"]
 LivesUse = Literal["auto", "off"]
 
 # Ranges of numbers, both ends included.
-COUNT = (1, 10**9)
+COUNT = (1, 10**9)  # more is a typing error
 SEED = (0, 2**31 - 1)  # what COLMAP takes
 FRACTION = (0.0, 1.0)
-RATE = (0.0, 1e6)
+RATE = (0.0, 1e6)  # learning rates; larger ones are typing errors, and stay finite in float32
 FADING = (1e-30, 1e6)  # of rates whose logarithms are interpolated
-WEIGHT = (0.0, 1e6)
+WEIGHT = (0.0, 1e6)  # of a term of the loss, likewise
 OPACITY = (1e-6, 1 - 1e-6)  # its logit is finite in float32
 
 _FAST = RenderSettings.preset("fast")

@@ -19,7 +19,7 @@ __all__ = ["add_gaussians", "divide", "explore", "relocate"]
 
 _MAX_COPIES = 51  # of one Gaussian at a time [1]; binomials up to C(50, k) are exact enough in float64
 _MAX_OPACITY = 1 - 1e-6  # its logit is finite in float32
-_UNIT = 5.0  # the noise of [1] has a length in it: its scenes have an extent of about 5
+_REFERENCE_EXTENT = 5.0  # world units: extent of the scenes of [1], whose strength of noise has a length in it
 
 
 def divide(opacity: torch.Tensor, copies: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -97,7 +97,7 @@ def explore(rows: GaussianRows, rate: float, extent: float, strength: float, gen
     noise = torch.randn(len(rows), 3, generator=generator)[moving]
     axes = semi_axes(t["quats"][moving], t["log_scales"][moving].exp())
     shaped = (axes @ (axes.transpose(1, 2) @ noise[..., None]))[..., 0]
-    scale = strength * rate * _UNIT**2 / extent
+    scale = strength * rate * _REFERENCE_EXTENT**2 / extent
     t["means"][moving] += gate[moving, None] * scale * shaped
 
 

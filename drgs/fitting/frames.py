@@ -30,8 +30,8 @@ _log = logging.getLogger(__name__)
 _Map = Callable[[], torch.Tensor]
 _Labels = Callable[[], np.ndarray]
 
-_CHANGES_AT = 160  # pixels of the longer side at which changes from one time to the next are measured
-_FLOAT_CACHE = 2 << 30  # bytes of images kept as float32; beyond it they are kept as 8 bits
+_MOTION_SIZE = 160  # pixels of the longer side at which photographs of two times are compared; chosen, not tuned
+_FLOAT_BYTES = 2 << 30  # bytes of all photographs in float32; larger sets are kept as 8 bits, a quarter of it; chosen
 
 
 @dataclasses.dataclass
@@ -129,7 +129,7 @@ def warn_of_late_cameras(dataset: Dataset, frames: list[Frame]) -> None:
     names = {view.name: view.camera_name for view in dataset.views}
     found: dict[str, dict[float, np.ndarray]] = {name: {} for name in dataset.camera_names}
     for frame in frames:
-        scale = min(1.0, _CHANGES_AT / max(frame.camera.width, frame.camera.height))
+        scale = min(1.0, _MOTION_SIZE / max(frame.camera.width, frame.camera.height))
         size = (max(1, round(scale * side)) for side in (frame.camera.width, frame.camera.height))
         if frame.camera.time is not None and frame.name in names:
             gray = frame.image().mean(dim=2).numpy()
@@ -165,7 +165,7 @@ def _frames(views: list[View], max_pixels: int, mask: str, bar: Bar) -> list[Fra
     """`load_frames`, under a bar that it has begun."""
     views = [view.checked() for view in views]
     sizes = [reduced_size(view.camera, max_pixels) for view in views]
-    is_float = sum(12 * w * h for w, h in sizes) <= _FLOAT_CACHE
+    is_float = sum(12 * w * h for w, h in sizes) <= _FLOAT_BYTES
     frames = []
     for view, (width, height) in zip(views, sizes, strict=True):
         image, alpha = view.image_and_alpha(width, height)

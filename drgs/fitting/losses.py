@@ -31,8 +31,9 @@ __all__ = [
     "terms_of",
 ]
 
-_RADIUS = 5
-_SIGMA = 1.5
+# As Wang et al. have them: a Gaussian window of 11x11 pixels, and (K1 L)^2, (K2 L)^2 with L = 1 the range of values.
+_RADIUS = 5  # pixels
+_SIGMA = 1.5  # pixels
 _C1 = 0.01**2
 _C2 = 0.03**2
 

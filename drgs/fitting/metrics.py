@@ -73,7 +73,7 @@ OBJECT = {
 MOVING = {"psnr_moving": "as psnr, of the pixels whose label is a class that moves; of views that show one"}
 """What is measured beside `METRICS` where labels say what moves: a background that stands still hides the rest."""
 TRAIN_VIEWS = 8
-"""Training photographs, at most, that a fit looks at again at its end where it holds out none."""
+"""Training photographs, at most, that are measured at the end of a fit that holds out none; chosen for its seconds."""
 VIEW_PICTURES = ("png", "semantics.png")
 """Of a view: that of its colors and, of a run with features, that of its labels; what follows the view's file name."""
 _NO_LPIPS = "needs the package lpips: pip install 'drgs[lpips]', and the weights that docs/install.md names"
@@ -81,7 +81,7 @@ _NO_WEIGHTS = "needs the weights of a backbone: pass --lpips-weights FILE (torch
 _COVERED = 0.5  # opacity from which on more of a pixel is Gaussians than background
 _LPIPS_MIN_SIDE = 64  # pixels: the AlexNet backbone pools smaller images to nothing
 _SSIM_MIN_SIDE = 11  # pixels of a side of its window, which is not padded
-_CORRECTIONS = 5  # fits of the color correction, each to the pixels that the one before it left unsaturated
+_COLOR_FITS = 5  # fits of the color correction, each to the pixels that the one before left unsaturated; chosen
 _SATURATED = 0.5 / 255  # distance from 0 or 1 within which a value of 8 bits says nothing
 
 
@@ -132,7 +132,7 @@ def _corrected(colors: np.ndarray, wanted: np.ndarray, scale: np.ndarray, satura
     """
     usable = np.broadcast_to((scale > 0)[:, None], colors.shape)
     is_fitted = usable if saturated else usable & _unsaturated(colors) & _unsaturated(wanted)
-    for _ in range(_CORRECTIONS):
+    for _ in range(_COLOR_FITS):
         products = [colors[:, i] * colors[:, j] for i in range(3) for j in range(i, 3)]
         terms = np.stack([*products, *colors.T, np.ones(len(colors))], axis=1)
         chosen = is_fitted if saturated else is_fitted & _unsaturated(colors)

@@ -34,11 +34,12 @@ __all__ = ["OnlineFit"]
 
 _log = logging.getLogger(__name__)
 
-_FEWEST = 2  # photographs, where none has depth
-_OPEN = 0.5  # opacity below which a pixel is open
-_BEHIND = 0.1  # relative: how far behind what a depth map shows surfaces are wrong
-_SHARE = 0.25  # of the room that is left which one photograph may fill
-_GUESSED = 10_000  # random points at most
+# Chosen, not tuned.
+_FEWEST_PHOTOGRAPHS = 2  # photographs that a fit begins with, where none has a depth map
+_OPEN_OPACITY = 0.5  # opacity below which a pixel gets new Gaussians
+_BEHIND = 0.1  # relative difference of depths from which on the rendered surface is too far behind the depth map
+_BUDGET_SHARE = 0.25  # of the free part of `max_gaussians`: what one photograph may add
+_MOST_RANDOM_POINTS = 10_000  # random points at the start, at most
 
 _STATE = {"config": dict, "rng": {"state": str, "inc": str, "has_uint32": int, "uinteger": int}, "fit": (None, dict)}
 _WHOLE = re.compile("[0-9a-f]{1,32}")  # 128 bits
@@ -85,11 +86,11 @@ class OnlineFit:
         if depth is not None:
             points, colors = self._back_projected(frame, depth, np.ones(depth.shape, bool), self._room())
             return self._begin(points, colors, dense=True)
-        if len(self._waiting) < _FEWEST:
+        if len(self._waiting) < _FEWEST_PHOTOGRAPHS:
             return 0
         cameras = [one.camera.undistorted() for one in self._waiting]
         images = [lambda one=one: one.image().numpy() for one in self._waiting]
-        most = min(self.config.density.max_gaussians, _GUESSED)
+        most = min(self.config.density.max_gaussians, _MOST_RANDOM_POINTS)
         points, colors = propose_along_rays(cameras, images, [None] * len(cameras), most, self._rng)
         return self._begin(points, colors, dense=False)
 
@@ -180,7 +181,7 @@ class OnlineFit:
     def _room(self) -> int:
         """How many Gaussians a photograph may bring."""
         there = 0 if self.trainer is None else len(self.trainer.rows)
-        return int(_SHARE * max(self.config.density.max_gaussians - there, 0))
+        return int(_BUDGET_SHARE * max(self.config.density.max_gaussians - there, 0))
 
     def _add_points(self, frame: Frame, depth: np.ndarray) -> int:
         """Gaussians where a depth map shows what the others do not."""
@@ -190,9 +191,9 @@ class OnlineFit:
             out = render(self.trainer.gaussians(), seen, self.config.settings, outputs=("median_depth",))
         assert out.median_depth is not None  # it was asked for
         alpha, known = (resize_area(x.cpu().numpy(), *depth.shape[::-1]) for x in (out.alpha, out.median_depth))
-        wanted = (alpha < _OPEN) | ((depth > 0) & (depth < (1 - _BEHIND) * known))
+        wanted = (alpha < _OPEN_OPACITY) | ((depth > 0) & (depth < (1 - _BEHIND) * known))
         share = wanted.mean()
-        most = min(self._room(), int(share * _SHARE * self.config.density.max_gaussians))
+        most = min(self._room(), int(share * _BUDGET_SHARE * self.config.density.max_gaussians))
         points, colors = self._back_projected(frame, depth, wanted, most)
         if len(points):
             self.trainer.add_points(

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["FULL", "Resolution", "halved_size"]
 
 FULL = 1 / 2
-"""The fraction of the steps from which on photographs have the size of the fit."""
+"""Fraction of the steps from which on photographs have the size of the fit; chosen (docs/one-model.md has its gain)."""
 
 _LEAST = 11  # pixels of the shorter side: the window of SSIM (losses.py) is as wide
 

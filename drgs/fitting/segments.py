@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Segmentation", "check_references", "feature_colors", "segmentation_of", "teacher_labels"]
 
-_KEPT = 0.5  # of a mask, from which on a pixel counts
-_SAMPLES = 20_000  # Gaussians that the colors of features are made from
+_KEPT_MASK = 0.5  # mask, or opacity of a Gaussian, from which on a pixel or the Gaussian counts
+_MOST_SAMPLES = 20_000  # Gaussians whose features give the principal components of pictures, at most; chosen, not tuned
 
 
 class Segmentation:
@@ -109,7 +109,7 @@ class Segmentation:
             labels = None if frame.teacher is None else self._of_teacher(frame)
         if labels is None or frame.mask is None:
             return labels
-        return np.where(frame.mask.numpy() < _KEPT, 0, labels)
+        return np.where(frame.mask.numpy() < _KEPT_MASK, 0, labels)
 
     def _of_teacher(self, frame: Frame) -> np.ndarray:
         assert frame.teacher is not None  # the caller has looked
@@ -187,8 +187,8 @@ def feature_colors(gaussians: Gaussians, decoder: Decoder | None) -> FeatureColo
     """
     assert gaussians.features is not None
     with torch.no_grad():  # for pictures
-        opaque = (gaussians.opacities > _KEPT).nonzero()[:, 0]
+        opaque = (gaussians.opacities > _KEPT_MASK).nonzero()[:, 0]
         kept = opaque if len(opaque) > 3 else torch.arange(len(gaussians))
-        kept = kept[:: -(-len(kept) // _SAMPLES)]
+        kept = kept[:: -(-len(kept) // _MOST_SAMPLES)]
         sample = gaussians.features[kept].float()
         return FeatureColors.of([sample if decoder is None else decoder(sample)])

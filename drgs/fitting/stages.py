@@ -26,7 +26,7 @@ __all__ = [
     "times_of",
 ]
 
-_FEWEST = 3  # photographs of one time that show the depth of things, with one to spare
+_FEWEST_PHOTOGRAPHS = 3  # photographs of one time that show the depth of things, with one to spare
 
 
 class _Seen(Protocol):
@@ -99,7 +99,7 @@ def first_time(views: Sequence[_T]) -> list[_T]:
     """Those of the first time; all, where fewer than 3 are of it, as of one camera that walks around what moves."""
     first = min((t for view in views if (t := view.camera.time) is not None), default=None)
     found = [view for view in views if view.camera.time == first]
-    return found if len(found) >= _FEWEST else list(views)
+    return found if len(found) >= _FEWEST_PHOTOGRAPHS else list(views)
 
 
 def shows_first_time(views: Sequence[_Seen]) -> bool:

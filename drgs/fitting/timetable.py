@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 
 __all__ = ["VIEWS_TO_ADD", "Timetable", "initial_views"]
 
-_START = 0x57A7  # the stream of the view that a fit starts with, apart from all others of the same seed
-_EVERY = 200  # steps between two picks, as in [1]
-_PART = 200 / 17_000  # of the steps between two picks at times, as in [1]
+_START_STREAM = 0x57A7  # any number: the random stream of the first view differs from all others of the same seed
+_PICK_EVERY = 200  # steps between two picks, as in [1]
+_PICK_PART = 200 / 17_000  # of all steps: the distance of two picks with --schedule times, as in [1]
 
 VIEWS_TO_ADD = 10
 """As in [1], where a few views are there at the start and `SelectionConfig` does not say."""
@@ -102,7 +102,7 @@ class Timetable:
     @classmethod
     def _of_views(cls, active: SelectionConfig, views: Sequence[View], config: FitConfig) -> Timetable:
         """View by view."""
-        add, every = active.add or VIEWS_TO_ADD, active.every or _EVERY
+        add, every = active.add or VIEWS_TO_ADD, active.every or _PICK_EVERY
         if active.initial + add > len(views):
             raise ValueError(
                 f"active: --initial {active.initial} and --add {add} must be at most the {len(views)} views of "
@@ -148,8 +148,8 @@ class Timetable:
         if add > room:
             raise ValueError(f"{where} must have --add of at most the {room} {what}, got {add}; lower it")
         static = round(config.motion.static_share * config.max_steps)
-        least = math.ceil(_PART * config.max_steps)
-        every = active.every or max(1, round(_PART * config.max_steps))
+        least = math.ceil(_PICK_PART * config.max_steps)
+        every = active.every or max(1, round(_PICK_PART * config.max_steps))
         first = static + max(every, least)
         last = first + (add - 1) * every
         if last >= config.max_steps:
@@ -206,4 +206,4 @@ def initial_views(cameras: list[Camera], count: int, first: int = 0) -> list[int
 
 def _drawn(count: int, seed: int) -> int:
     """Index in range(count), drawn by a seed; the generators of policies and of points begin with the seed alone."""
-    return int(np.random.default_rng([seed, _START]).integers(count))
+    return int(np.random.default_rng([seed, _START_STREAM]).integers(count))

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 __all__ = ["StepResult", "Trainer"]
 
-_MAX_BAD_STEPS = 10
+_MAX_BAD_STEPS = 10  # steps in a row without finite gradients that end a fit, more than one bad view; chosen
 # Parts of names in a checkpoint, not of networks; components have more.
 _RESERVED = {"parameter", "adam", "rng", "queue", "policy_rng"}
 

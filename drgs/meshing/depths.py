@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 __all__ = ["DepthView", "depth_views", "footprint", "seen_distance"]
 
-_SOLID = 0.5  # alpha from which on a pixel shows a surface: the median of its depth exists
+_SURFACE_ALPHA = 0.5  # alpha from which on a pixel shows a surface: the median of its depth exists
 _LEAST_COSINE = 0.05  # between a ray and a surface; beyond 87 degrees the normal of a depth image says nothing
-_PROBE_PIXELS = 2_500  # of a picture that says how far away what a camera looks at is: it is looked at, not shown
-_OPAQUE = 0.5  # alpha from which on something is seen
-_NEARER = 0.25  # quantile of its depths: what is photographed stands before a background
-_SMALLEST = 1e-30  # of numbers that a logarithm is taken of
+_PROBE_PIXELS = 2_500  # pixels of the picture whose depths say how far away the subject is; chosen for its seconds
+_SEEN_ALPHA = 0.5  # alpha from which on a pixel of that picture shows something
+_NEAR_QUANTILE = 0.25  # quantile of its depths: the subject stands in front of a background; chosen
+_LEAST_LOG_ARGUMENT = 1e-30  # least argument of a logarithm, which stays finite in float32
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,11 @@ def depth_views(
         deviations: (N,) standard deviation of each mean in scene units; None: no `spread`.
         advance: Called after each view.
     """
-    features = None if deviations is None else deviations.clamp_min(_SMALLEST).log()[:, None].to(gaussians.means.dtype)
+    features = (
+        None
+        if deviations is None
+        else deviations.clamp_min(_LEAST_LOG_ARGUMENT).log()[:, None].to(gaussians.means.dtype)
+    )
     plain = gaussians.replace(features=features)
     output = "median_depth" if kind == "median" else "depth"
     views = []
@@ -77,12 +81,12 @@ def depth_views(
             out = render(plain, camera, settings, (output,))
         alpha = out.alpha.cpu().numpy()
         measured = getattr(out, output).cpu().numpy()
-        is_solid = (alpha > _SOLID) & (measured > 0)
+        is_solid = (alpha > _SURFACE_ALPHA) & (measured > 0)
         depth = np.where(is_solid, measured, np.inf).astype(np.float32)
         spread = None
         if out.features is not None:
             # The mean of the logarithm, over the weights of what is seen.
-            spread = np.exp(out.features[..., 0].cpu().numpy() / np.maximum(alpha, _SOLID)).astype(np.float32)
+            spread = np.exp(out.features[..., 0].cpu().numpy() / np.maximum(alpha, _SURFACE_ALPHA)).astype(np.float32)
         views.append(DepthView(camera, depth, _cosines(camera, depth), alpha, out.rgb.cpu().numpy(), spread))
         if advance:
             advance()
@@ -134,7 +138,7 @@ def seen_distance(gaussians: Gaussians) -> Callable[[Camera], float | None]:
         rows, columns = (slice(n // 4, n - n // 4) for n in (small.height, small.width))
         depth = out.depth[rows, columns].cpu().numpy()
         alpha = out.alpha[rows, columns].cpu().numpy()
-        solid = alpha > _OPAQUE
-        return float(np.quantile(depth[solid], _NEARER)) if solid.any() else None
+        solid = alpha > _SEEN_ALPHA
+        return float(np.quantile(depth[solid], _NEAR_QUANTILE)) if solid.any() else None
 
     return distance

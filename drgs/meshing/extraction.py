@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 __all__ = ["FINENESS", "TriangleMesh", "deviations_of", "mesh_of", "mesh_of_depths"]
 
 _VIEW_BYTES = 40  # of a pixel of a view: depth, weight, colors, spread, and what sampling them takes
-_COLOR = 0.05  # standard deviation of a color's noise, of what is between black and white
-_FINER = 1.26  # the cube root of 2: by which a voxel grows until there are few enough
+_COLOR_NOISE = 0.05  # standard deviation of a color's noise, of the range of colors; chosen
+_VOXEL_GROWTH = 1.26  # the cube root of 2: by which a voxel grows until there are few enough
 FINENESS = 2.0
-"""The default voxel, in widths of a pixel on the surface."""
+"""The default voxel, in widths of a pixel on the surface; chosen."""
 _FINEST = 0.125  # the smallest voxel, in widths of a pixel: neighboring rays must not pass a brick on both sides
-_GRAY = 0.5  # of a vertex that no view shows
+_UNSEEN_COLOR = 0.5  # of a vertex that no view shows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -189,7 +189,7 @@ def deviations_of(
         if advance:
             advance()
     reach = gaussians.log_scales.detach().cpu().double().exp().amax(1, keepdim=True)
-    return (_COLOR**2 / (total + _COLOR**2 / reach.square())).sum(1).sqrt()
+    return (_COLOR_NOISE**2 / (total + _COLOR_NOISE**2 / reach.square())).sum(1).sqrt()
 
 
 def _lattice(views: Sequence[DepthView], options: MeshOptions) -> tuple[float, np.ndarray]:
@@ -206,7 +206,7 @@ def _lattice(views: Sequence[DepthView], options: MeshOptions) -> tuple[float, n
     most = options.max_voxels // POINTS
     fits, bricks = voxel, bricks_of(views, voxel, options.trunc * voxel, most)
     while len(bricks) > most:
-        fits *= _FINER
+        fits *= _VOXEL_GROWTH
         bricks = bricks_of(views, fits, options.trunc * fits, most)
     if options.voxel is not None and fits > voxel:
         raise ValueError(
@@ -234,7 +234,7 @@ def _attributes(
         seen[index] += 1
         if spread is not None and view.spread is not None:
             spread[index] = np.minimum(spread[index], view.spread[row, column])
-    shown = np.where(weights[:, None] > 0, colors / np.maximum(weights, 1e-30)[:, None], _GRAY)
+    shown = np.where(weights[:, None] > 0, colors / np.maximum(weights, 1e-30)[:, None], _UNSEEN_COLOR)
     return shown.clip(0, 1).astype(np.float32), seen, spread
 
 

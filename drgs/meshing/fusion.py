@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 __all__ = ["bricks_of", "distances", "sampled", "surface"]
 
-_SNAP = 1e-4  # of a cell: a vertex nearer to a point of the lattice than that lies on it
-_STEPS = 9  # samples of each ray, from `trunc` in front of its surface to `trunc` behind
-_MOST = 1 << 20  # bricks along an axis to either side, so that three numbers fit into 64 bits
+_SNAP_DISTANCE = 1e-4  # of a cell: a vertex nearer to a lattice point than that is put on it; chosen
+_RAY_SAMPLES = 9  # samples of each ray, from `trunc` before its surface to `trunc` behind: a voxel apart at the default
+_MOST_BRICKS = 1 << 20  # bricks along an axis to either side, so that three numbers fit into 64 bits
 
 
 def bricks_of(views: Sequence[DepthView], voxel: float, trunc: float, most: int | None = None) -> np.ndarray:
@@ -51,14 +51,14 @@ def bricks_of(views: Sequence[DepthView], voxel: float, trunc: float, most: int 
         is_solid = np.isfinite(view.depth)
         directions, origins = view.camera.pixel_directions()[is_solid], view.camera.pixel_origins()[is_solid]
         depth = view.depth[is_solid].astype(np.float64)
-        for shift in np.linspace(-trunc, trunc, _STEPS):
+        for shift in np.linspace(-trunc, trunc, _RAY_SAMPLES):
             at = origins + np.maximum(depth + shift, 0.0)[:, None] * directions
             index = np.floor(at / (voxel * BRICK))
-            index = index[(np.abs(index) < _MOST).all(axis=1)].astype(np.int64) + _MOST
+            index = index[(np.abs(index) < _MOST_BRICKS).all(axis=1)].astype(np.int64) + _MOST_BRICKS
             keys_of_views.append(np.unique((index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]))
         keys = np.unique(np.concatenate([keys, *keys_of_views]))
     mask = (1 << 21) - 1
-    return np.stack([keys >> 42, (keys >> 21) & mask, keys & mask], axis=1) - _MOST
+    return np.stack([keys >> 42, (keys >> 21) & mask, keys & mask], axis=1) - _MOST_BRICKS
 
 
 def _projected(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -220,7 +220,7 @@ def _triangles(values: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.nd
     number = np.zeros(len(vertices), np.int64)
     number[used] = np.arange(len(used))
     whole = np.rint(vertices[used])
-    return np.where(np.abs(vertices[used] - whole) < _SNAP, whole, vertices[used]), number[triangles]
+    return np.where(np.abs(vertices[used] - whole) < _SNAP_DISTANCE, whole, vertices[used]), number[triangles]
 
 
 def _edges(brick: np.ndarray, local: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ from drgs.checks.records import Record, option
 __all__ = ["BRICK", "POINTS", "DepthKind", "MeshOptions"]
 
 BRICK = 16
-"""Cells along each axis of the bricks that a surface is computed in."""
+"""Cells along each axis of the bricks in which a surface is computed; chosen: 4,913 points, 20 kB of float32."""
 POINTS = (BRICK + 1) ** 3
 """Points of the lattice in a brick, those included that it shares with others."""
 DepthKind = Literal["median", "expected"]

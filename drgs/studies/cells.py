@@ -47,7 +47,7 @@ _Unit = tuple[str, tuple[int, int] | str, Start, str, int]
 
 _log = logging.getLogger(__name__)
 _ADVICE = "move the run folder away, to have it fitted again"
-_PATIENCE = 5.0  # seconds until a data set that another process makes is asked for again
+_RETRY_SECONDS = 5.0  # seconds between two looks for a data set that another process makes; chosen
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,7 +155,7 @@ class Study:
                 if not is_announced:
                     _log.warning("waiting: %s", busy)
                 is_announced = True
-                time.sleep(_PATIENCE)
+                time.sleep(_RETRY_SECONDS)
 
     def dataset(self, cell: Cell) -> Dataset:
         """The views of a cell, none of them opened.

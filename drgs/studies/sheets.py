@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["comparison_sheet"]
 
-_WIDTH = 300  # pixels of a column, about
+_WIDTH = 300  # pixels of a column, about; chosen, as the numbers below
 _ZOOM = 0.5  # of the width and the height of a view: the part that is enlarged
 _GAP = 6  # pixels between pictures
 _FRAME = (255, 200, 0)  # RGB of the frame around the part that is enlarged

@@ -53,13 +53,13 @@ Unit = tuple[str, tuple[int, int], tuple[str, ...]]
 FEWEST_UNITS = 6
 """Units from which on there is a verdict: five that all agree do so by chance in one of 16 studies (two-sided)."""
 
-_DRAWS = 10_000  # of the bootstrap: the ends of an interval are then known to 0.5 % of its draws
+_BOOTSTRAP_DRAWS = 10_000  # of the bootstrap: the ends of an interval are then known to 0.5 % of its draws
 # Count -> share of 95 % intervals that hold the true mean: of scenes with one unit, or of units of one scene; of scenes
 # with 3 to 5 units that differ as much as their units do, from 8 on half as much.
-_HELD = {2: 0.50, 3: 0.75, 4: 0.79, 5: 0.83, 6: 0.86, 8: 0.88, 10: 0.89, 12: 0.90, 15: 0.92}
-_HELD_SCENES = {2: 0.71, 3: 0.82, 4: 0.86, 5: 0.90, 7: 0.91, 8: 0.95}
+_COVERAGE = {2: 0.50, 3: 0.75, 4: 0.79, 5: 0.83, 6: 0.86, 8: 0.88, 10: 0.89, 12: 0.90, 15: 0.92}
+_COVERAGE_SCENES = {2: 0.71, 3: 0.82, 4: 0.86, 5: 0.90, 7: 0.91, 8: 0.95}
 # 5 % of false alarms on both sides together, and 4 of 5 studies that find the difference
-_LEVEL = 0.975
+_QUANTILE = 0.975
 _POWER = 0.8
 
 
@@ -133,7 +133,7 @@ def differences(rows: Sequence[Mapping[str, Any]], metric: str, policy: str, ref
     return {unit: value - theirs[unit] for unit, value in ours.items() if unit in theirs}
 
 
-def estimate(values: Mapping[Unit, float], draws: int = _DRAWS, share: float = 0.95) -> Effect:
+def estimate(values: Mapping[Unit, float], draws: int = _BOOTSTRAP_DRAWS, share: float = 0.95) -> Effect:
     """Mean over scenes of the means over their units, and how certain it is.
 
     Args:
@@ -173,9 +173,9 @@ def coverage(scenes: int, units: int) -> float:
     """
     if scenes == 1 or units < 2 * scenes:
         count = units if scenes == 1 else scenes
-        table = _HELD
+        table = _COVERAGE
     else:
-        count, table = scenes, _HELD_SCENES
+        count, table = scenes, _COVERAGE_SCENES
     return table[max(key for key in table if key <= count)]
 
 
@@ -186,7 +186,7 @@ def _detectable(means: Sequence[float]) -> float | None:
         return None
     error = float(np.std(means, ddof=1)) / math.sqrt(len(means))
     # Quantiles of Student's t distribution.
-    return float(stdtrit(degrees, _LEVEL) + stdtrit(degrees, _POWER)) * error
+    return float(stdtrit(degrees, _QUANTILE) + stdtrit(degrees, _POWER)) * error
 
 
 # ------------------------------------------------------------------------------------------------------------- the race

@@ -375,7 +375,7 @@ def _unit_names(units: Sequence[Unit]) -> dict[Unit, str]:
 # ------------------------------------------------------------------------------------------------------------- the plot
 
 _COLUMNS = 4  # panels side by side: as wide as a page
-_PANEL = 3.4  # inches of a side of a panel
+_PANEL_INCHES = 3.4  # inches of a side of a panel; chosen
 
 
 def draw_curves(study: Study, rows: Sequence[Mapping[str, Any]], metric: Metric, path: Path) -> bool:
@@ -404,7 +404,9 @@ def draw_curves(study: Study, rows: Sequence[Mapping[str, Any]], metric: Metric,
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     columns = min(_COLUMNS, len(scenes))
     lines = -(-len(scenes) // columns)
-    figure, axes = plt.subplots(lines, columns, figsize=(_PANEL * columns, _PANEL * lines), dpi=100, squeeze=False)
+    figure, axes = plt.subplots(
+        lines, columns, figsize=(_PANEL_INCHES * columns, _PANEL_INCHES * lines), dpi=100, squeeze=False
+    )
     for axis in axes.flat[len(scenes) :]:
         axis.set_axis_off()
     colors = plt.get_cmap("tab10" if len(study.policies) <= 10 else "tab20")

@@ -44,20 +44,21 @@ NETWORK = "exposure"
 """Name of the gains in a checkpoint."""
 
 _DARK, _BRIGHT = 8 / 255, 250 / 255  # beyond these a tone curve, or saturation, hides the gain
-_MARGIN = 1.5  # pixels from the border, so that a patch of 3x3 is inside
-_MASKED = 0.99  # mask, and alpha, that the whole patch must have
-_MOST = 1_000_000  # observations that are looked at, photographs times points
-_HUBER = 1.345  # of the noise: 95 % efficient where it is normal
-_TUKEY = 4.0  # of the noise, beyond which a color is of something else
-_CONVEX, _STEPS = 6, 15  # steps with Huber's weights, which forget the start, and of all
+_BORDER = 1.5  # pixels from the border, so that a patch of 3x3 is inside
+_LEAST_MASK = 0.99  # mask, and alpha, that the whole patch must have
+_MOST_OBSERVATIONS = 1_000_000  # photographs times points that are compared: bounds seconds and memory; chosen
+_HUBER = 1.345  # times the noise: 95 % efficient where it is normal
+_TUKEY = 4.0  # times the noise, beyond which a color is of something else
+# Reweighted steps with Huber's weights, whose result does not depend on the start, and in all; chosen.
+_HUBER_STEPS, _ROBUST_STEPS = 6, 15
 _LEAST_NOISE = 0.01  # of a log color: a byte's rounding at mid-gray
-_SUPPORT = 8  # points that two photographs must share to say something of each other
-_RATE = 1e-3  # of learned log gains
-_CLEAR = 0.1  # stops: three times what two sets of points of one capture differ by in what they say
+_SHARED_POINTS = 8  # points that two photographs must share for their gains to be compared; chosen, not tuned
+_RATE = 1e-3  # learning rate of natural log gains: a factor of e in 1,000 steps; chosen
+_CLEAR_STOPS = 0.1  # stops: three times what two sets of points of one capture differ by in what they say
 _TRIAL = {"max_steps": 200, "max_gaussians": 8_000, "num_downscales": 0}  # of a short fit that tries gains
 _TRIAL_PIXELS = 12_000  # of its photographs; two such fits take 10 to 20 s on one core
 _TRIAL_EVERY = 5  # photographs of which it holds one out
-_LOWERED = 0.05  # of the error of held-out halves; on captures of one exposure it is up to 0.02, by chance
+_LEAST_LOWERED = 0.05  # of the error of held-out halves, at least; captures of one exposure have up to 0.02, by chance
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,12 +94,12 @@ class ExposureEstimate:
     @property
     def is_clear(self) -> bool:
         """Whether the gains differ by more than points can be wrong about: in one channel at least."""
-        return any(x**2 - e**2 > _CLEAR**2 for x, e in zip(self.spread, self.noise, strict=True))
+        return any(x**2 - e**2 > _CLEAR_STOPS**2 for x, e in zip(self.spread, self.noise, strict=True))
 
     @property
     def is_sound(self) -> bool:
         """Whether the gains are clear and lower the error of what is held out."""
-        return self.is_clear and self.lowered > _LOWERED
+        return self.is_clear and self.lowered > _LEAST_LOWERED
 
     def confirmed(self) -> ExposureEstimate:
         """With gain 1 for photographs whose own does not lower the error of what is held out of them."""
@@ -173,7 +174,7 @@ def estimate_exposure(
         shown: (V, P) bool, which photographs were found to show which points; None: nobody knows, and every photograph
             into which a point is projected may.
     """
-    most = max(1, _MOST // max(1, len(frames)))
+    most = max(1, _MOST_OBSERVATIONS // max(1, len(frames)))
     if len(points) > most:
         kept = np.sort(np.random.default_rng(seed).choice(len(points), most, replace=False))
         points, shown = points[kept], None if shown is None else shown[:, kept]
@@ -292,7 +293,7 @@ def _robust(logs: np.ndarray, there: np.ndarray) -> tuple[np.ndarray, np.ndarray
     label = _components(there)
     gains = np.zeros((len(logs), 3))
     errors = np.zeros((len(logs), 3))
-    for step in range(_STEPS if there.any() else 0):
+    for step in range(_ROBUST_STEPS if there.any() else 0):
         residual = np.zeros(logs.shape)
         inverses = []
         for channel in range(3):
@@ -305,7 +306,7 @@ def _robust(logs: np.ndarray, there: np.ndarray) -> tuple[np.ndarray, np.ndarray
         size = np.sqrt(np.square(residual).sum(axis=2) / np.maximum(count, 1))  # 0 where nothing is seen
         noise = max(1.4826 * float(np.median(size[seen])), _LEAST_NOISE)
         errors = np.stack([noise * np.sqrt(np.maximum(np.diag(x), 0)) for x in inverses], axis=1)  # 0 but for rounding
-        if step < _CONVEX:
+        if step < _HUBER_STEPS:
             robust = seen * np.minimum(1, _HUBER * noise / np.maximum(size, 1e-12))  # a residual may be 0
         else:
             robust = seen * np.square(np.maximum(0, 1 - np.square(size / (_TUKEY * noise))))
@@ -349,14 +350,14 @@ def _observed(frames: list[Frame], points: np.ndarray) -> tuple[np.ndarray, np.n
     for row, frame in enumerate(frames):
         image = frame.image().numpy()
         pixels, depth = frame.camera.project(points)
-        inside = frame.camera.contains(pixels, depth, _MARGIN)
+        inside = frame.camera.contains(pixels, depth, _BORDER)
         across[row] = pixels[:, 0]
         index = np.flatnonzero(inside)
         columns, rows = pixels[index].astype(int).T
         empty = frame.empty()
         for shown in (frame.mask, None if empty is None else 1 - empty):
             if shown is not None:
-                kept = cv2.erode(shown.numpy(), square)[rows, columns] > _MASKED
+                kept = cv2.erode(shown.numpy(), square)[rows, columns] > _LEAST_MASK
                 index, columns, rows = index[kept], columns[kept], rows[kept]
         lowest, highest = (x(image, square)[rows, columns] for x in (cv2.erode, cv2.dilate))
         good = (lowest > _DARK) & (highest < _BRIGHT)
@@ -387,7 +388,7 @@ def _components(there: np.ndarray) -> np.ndarray:
     from scipy.sparse.csgraph import connected_components
 
     shown = np.asarray(there.any(axis=2), np.float32)
-    return connected_components(shown @ shown.T >= _SUPPORT, directed=False)[1]
+    return connected_components(shown @ shown.T >= _SHARED_POINTS, directed=False)[1]
 
 
 def _three(values: np.ndarray) -> tuple[float, float, float]:

@@ -27,8 +27,10 @@ if TYPE_CHECKING:
 
 __all__ = ["LensChoice", "LensComponent", "lens_choice", "lost_share"]
 
-_LOST = 0.2  # of the rays of photographs; ordinary lenses lose a twentieth, a fisheye of 180 degrees most
-_PIXELS = 10_000  # of a photograph, whose share is counted
+_MOST_LOST = (
+    0.2  # share of the rays that undistorting may crop; ordinary lenses lose 0.05, a fisheye of 180 degrees most
+)
+_COUNTED_PIXELS = 10_000  # pixels of a camera by which the share is counted: right within 1 %
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +49,7 @@ class LensChoice:
 
     def words(self) -> str:
         """One line for who fits; empty where there is nothing to say."""
-        if self.lost <= _LOST:
+        if self.lost <= _MOST_LOST:
             return ""
         if self.undistort == "off":
             return f"undistorting would lose {self.lost:.0%} of the photographs: they are fitted through their lenses"
@@ -74,7 +76,7 @@ def lens_choice(config: FitConfig, views: Sequence[View], otherwise: str | None 
         counted[key] = counted.get(key, 0) + 1
         cameras[key] = camera
     lost = sum(count * lost_share(cameras[key]) for key, count in counted.items()) / max(len(views), 1)
-    if lost <= _LOST:
+    if lost <= _MOST_LOST:
         return LensChoice("on", lost)
     if planar_of(config.renderers, config.settings):
         return LensChoice("on", lost, "use --for drgs, or another renderer along rays")
@@ -130,14 +132,14 @@ def _looks_behind(camera: Camera) -> bool:
     """Whether any ray of a camera is at more than 90 degrees to its axis."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*cannot be inverted")
-        return bool((at_most(camera, _PIXELS).local_directions()[..., 2] < 0).any())
+        return bool((at_most(camera, _COUNTED_PIXELS).local_directions()[..., 2] < 0).any())
 
 
 def lost_share(camera: Camera) -> float:
     """Share of a photograph's rays that its undistorted image does not show."""
     if not camera.is_distorted:
         return 0.0
-    small = at_most(dataclasses.replace(camera, w2c=np.eye(4), shutter="global", w2c_end=None), _PIXELS)
+    small = at_most(dataclasses.replace(camera, w2c=np.eye(4), shutter="global", w2c_end=None), _COUNTED_PIXELS)
     with warnings.catch_warnings():
         # Where a lens has no inverse is said when its photographs are read.
         warnings.filterwarnings("ignore", message=".*cannot be inverted")

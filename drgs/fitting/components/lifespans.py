@@ -73,21 +73,22 @@ REFERENCE_TIMES = "births"
 MOST_ADDED = 0.5
 """Share of the Gaussians that there may be: how many are added at most, so that what stands still keeps as many."""
 
-# Units of times are the median time between a photograph and the next one.
+# Units of times are the median time between a photograph and the next one. The numbers are chosen, not
+# tuned; docs/dynamic.md has what lifetimes gain as a whole.
 _OPACITY = 0.3  # of a new Gaussian, as of those at points of depth maps: its place is known, too
-_FAINT = (
-    0.1  # opacity below which a Gaussian gives way to a new one: that of all at the start, which nothing has raised
-)
-_WIDTH = 2.0  # times: width of a new lifetime that other times confirm, which then reaches its neighbors
-_BRIEF = 0.4  # times: of one that they do not confirm, which hardly reaches them
-_GAP = 0.75  # of a longer time without photographs beside it, which the lifetime has to bridge
-_CONFIRMED = 0.4  # part of the photographs of other times that must agree with where it is then
-_CENTER_RATE = 0.02  # times: learning rate of a lifetime's center, a width of `_WIDTH` in 100 steps
+# Opacity below which a Gaussian gives way to a new one: all have it at the start, and nothing has raised it.
+_FAINT_OPACITY = 0.1
+_CONFIRMED_WIDTH = 2.0  # times: width of a new lifetime that other times confirm, which then reaches its neighbors
+_UNCONFIRMED_WIDTH = 0.4  # times: of one that they do not confirm, which hardly reaches them
+_GAP_SHARE = 0.75  # of a longer time without photographs beside it, which the lifetime has to bridge
+_CONFIRMED_SHARE = 0.4  # part of the photographs of other times that must agree with where it is then
+_CENTER_RATE = 0.02  # times: learning rate of a lifetime's center, a width of `_CONFIRMED_WIDTH` in 100 steps
 _WIDTH_RATE = 0.01  # learning rate of the logarithm of its width, a factor of e in 100 steps
-_SHUT = -2.0  # logit of the gate of a new Gaussian: 0.12, so that the field does not move it, and may later
-_SOON, _LATE = 2.0, 8.0  # times after which velocities, and accelerations, move a Gaussian as the rate of means does
-_SOLID = 0.5  # opacity below which a ray ends in nothing, and value of a mask below which a pixel does not count
-_NOTHING = 1e9  # distance, world units, to where a ray ends in nothing: farther than anything, and finite
+_CLOSED_LOGIT = -2.0  # logit of the gate of a new Gaussian: 0.12, so that the field does not move it, and may later
+# Times after which velocities, and accelerations, have moved a Gaussian as far as its mean moves in a step.
+_VELOCITY_TIMES, _ACCELERATION_TIMES = 2.0, 8.0
+_SOLID = 0.5  # opacity below which a ray meets no surface, and value of a mask below which a pixel does not count
+_NO_SURFACE = 1e9  # distance in world units of a ray that meets no surface: farther than any surface, and finite
 
 
 @dataclasses.dataclass(frozen=True)
@@ -190,7 +191,7 @@ class LifespansComponent(Component):
             fit.photographs(), fit.scene(), fit.config.settings, fit.extent, most, fit.generator, fit.shown
         )
         self._use(fit)
-        add_new_gaussians(fit.rows, new, self.times, _SHUT, fit.config.density.max_gaussians)
+        add_new_gaussians(fit.rows, new, self.times, _CLOSED_LOGIT, fit.config.density.max_gaussians)
         return [
             {
                 "event": "births",
@@ -311,8 +312,8 @@ def lifespan_rates(config: FitConfig, times: Sequence[float], length: float) -> 
         LIFESPAN_PARAMETERS[0]: _CENTER_RATE * apart,
         LIFESPAN_PARAMETERS[1]: _WIDTH_RATE,
         # They move a Gaussian as far as the rate of the means does, one soon after its reference time, the other late.
-        LIFESPAN_PARAMETERS[2]: lambda part: means_rate(config, part) * length / (_SOON * apart),
-        LIFESPAN_PARAMETERS[3]: lambda part: means_rate(config, part) * length / (_LATE * apart) ** 2,
+        LIFESPAN_PARAMETERS[2]: lambda part: means_rate(config, part) * length / (_VELOCITY_TIMES * apart),
+        LIFESPAN_PARAMETERS[3]: lambda part: means_rate(config, part) * length / (_ACCELERATION_TIMES * apart) ** 2,
         REFERENCE_TIMES: 0.0,
     }
 
@@ -346,7 +347,7 @@ def add_new_gaussians(rows: GaussianRows, places: NewGaussians, times: Sequence[
         if name not in new or new[name].shape[1:] != x.shape[1:]:
             new[name] = x.new_zeros(count, *x.shape[1:])
     # What hardly shows gives way. (A choice, which has no gradient.)
-    faint = (rows.tensors["logit_opacities"].detach().sigmoid() < _FAINT).nonzero()[:, 0]
+    faint = (rows.tensors["logit_opacities"].detach().sigmoid() < _FAINT_OPACITY).nonzero()[:, 0]
     room = max(0, min(count, most - len(rows)))
     taken = faint[: count - room]
     rows.overwrite(taken, {name: x[room : room + len(taken)] for name, x in new.items()})
@@ -372,8 +373,8 @@ def _first_widths(places: NewGaussians, times: Sequence[float]) -> torch.Tensor:
     apart = torch.cat([torch.zeros(1, dtype=torch.float64), known.diff(), torch.zeros(1, dtype=torch.float64)])
     gap = torch.maximum(apart[at], apart[at + 1])
     step = torch.full_like(gap, spacing(times))
-    long = torch.maximum(_WIDTH * step, _GAP * gap)
-    return torch.where(places.confirmed > _CONFIRMED, long, _BRIEF * step)
+    long = torch.maximum(_CONFIRMED_WIDTH * step, _GAP_SHARE * gap)
+    return torch.where(places.confirmed > _CONFIRMED_SHARE, long, _UNCONFIRMED_WIDTH * step)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -752,7 +753,7 @@ def _agreement(
         size = np.array([camera.width, camera.height])
         where = torch.from_numpy(2 * pixels / size - 1).float().reshape(*depth.shape, 2)
         inside = torch.from_numpy(ahead > 0).reshape(depth.shape) & (where.abs() < 1).all(-1)
-        maps = torch.cat([other.maps, other.distance.clamp(max=_NOTHING)[None]])[None]
+        maps = torch.cat([other.maps, other.distance.clamp(max=_NO_SURFACE)[None]])[None]
         sampled = grid_sample(maps, where.nan_to_num(2.0).clamp(-2, 2)[None], align_corners=False)[0]
         away = (place - other.center).norm(dim=-1)
         inside &= sampled[4] > search.occluded * away  # else something stands before it

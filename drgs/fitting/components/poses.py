@@ -15,8 +15,8 @@ the complement of the 7 tangents of this group: held exactly in u, for motions o
 
 **Reach.** A few photographs can be fitted better by cameras that are far off and Gaussians that suit them. So no camera
 may go further than the data set's own residual says it can be wrong: what its pose moves the Gaussians in its picture
-by, root mean square, is at most `_REACH` times the median reprojection error, but for what the gauge then adds. Where
-the data set brings none, it is `_UNKNOWN` pixels.
+by, root mean square, is at most `_REACH_FACTOR` times the median reprojection error, but for what the gauge then adds.
+Where the data set brings none, it is `_UNKNOWN_REACH` pixels.
 """
 
 from __future__ import annotations
@@ -67,17 +67,18 @@ POSE_NETWORK = "poses"
 CAMERAS = "refined_cameras.json"
 """File of a run with the cameras of its training photographs, as refined."""
 
-_CLEAR = 0.5  # pixels of the fit: median reprojection error from which on refining pays (docs/one-model.md)
+# Where nothing measured is named: chosen, not tuned.
+_CLEAR_PIXELS = 0.5  # pixels of the fit: median reprojection error from which on refining pays (docs/one-model.md)
 _BEGIN, _END = 0.15, 0.9  # fractions of the fit between which poses are fitted: geometry first, and last alone
-_RATE = 5e-3  # of z at the begin, in changes of values (root mean square) a step; falls to 0
+_RATE = 5e-3  # learning rate of z at the start: root mean square change of the picture's colors in a step; falls to 0
 _DAMPING = 1e-2  # of the mean eigenvalue of H, so that W exists where a picture says nothing about a direction
-_PIXELS = 4096  # of the picture that H is of, a preconditioner
-_REACH = 3.0  # times the reprojection error: bundle adjustment has hidden some of a pose's error in its points
-_NEAR = 0.25  # of the median depth: what is nearer may be a floater, whose shift would stand for the picture's
-_LEAST = 1e-4  # of H: a picture of nothing has no information, and its first step would be without measure
-_UNKNOWN = 2.0  # pixels of the fit, where a data set says nothing about its poses
-_AGAINST = 12  # steps at most of a camera that is refined against one photograph
-_TURN = 0.5  # radians of such a step at most: what is farther is no longer linear
+_INFORMATION_PIXELS = 4096  # pixels of the picture whose H preconditions a pose: no more accuracy is needed
+_REACH_FACTOR = 3.0  # times the reprojection error: bundle adjustment has hidden some of a pose's error in its points
+_NEAR_SHARE = 0.25  # of the median depth: what is nearer may be a floater, whose shift would stand for the picture's
+_LEAST_INFORMATION = 1e-4  # of H, at least: an empty picture has none, and its first step would be unbounded
+_UNKNOWN_REACH = 2.0  # pixels of the fit, where a data set says nothing about its poses
+_REFINING_STEPS = 12  # steps at most of a camera that is refined against one photograph
+_MOST_TURN = 0.5  # radians of such a step, at most: farther away the linear model of the rotation is wrong
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,12 +106,12 @@ class PoseEvidence:
     @property
     def reach(self) -> float:
         """How far a refined pose may move what its picture shows, root mean square in pixels of the fit."""
-        return _UNKNOWN if self.pixels is None else _REACH * self.pixels
+        return _UNKNOWN_REACH if self.pixels is None else _REACH_FACTOR * self.pixels
 
     @property
     def is_clear(self) -> bool:
         """Whether poses are worth refining."""
-        return self.pixels is not None and self.pixels > _CLEAR
+        return self.pixels is not None and self.pixels > _CLEAR_PIXELS
 
     def words(self) -> str:
         """What was found, in words."""
@@ -189,10 +190,10 @@ class Poses(torch.nn.Module):
         means = gaussians.means[far:].detach().cpu().double()
         opacities = gaussians.logit_opacities[far:].detach().cpu().double().sigmoid()
         tangents = {"camera": self._twist_of[row].T.contiguous()}
-        small = at_most(camera, _PIXELS)
+        small = at_most(camera, _INFORMATION_PIXELS)
         changes = render_jvp(gaussians, small, tangents, self._settings, outputs=()).rgb.double().reshape(6, -1)
         information = changes @ changes.T / changes.shape[1]
-        damping = _DAMPING * information.trace() / 6 + _LEAST
+        damping = _DAMPING * information.trace() / 6 + _LEAST_INFORMATION
         lower = torch.linalg.cholesky(information + damping * torch.eye(6, dtype=torch.float64))
         self.whitening[row] = torch.linalg.inv(lower).T
         moved, weights = _moved(means, opacities, camera, self._extent)
@@ -332,13 +333,13 @@ def refined_against(scene: Scene, frame: Frame, settings: RenderSettings) -> Cam
     twist_of = _twist_of_u(torch.tensor(camera.c2w[:3, 3]), 1.0)
     damping = 1e-3
     error, left = _difference(scene, frame, camera, settings)
-    for _ in range(_AGAINST):
+    for _ in range(_REFINING_STEPS):
         changes = render_jvp(scene, camera, {"camera": twist_of.T.contiguous()}, settings, outputs=()).rgb.double()
         rows = _inside(changes, frame).reshape(6, -1)
         information = rows @ rows.T
         scaled = information + damping * information.diagonal().diag() + 1e-12 * torch.eye(6, dtype=torch.float64)
         u = torch.linalg.solve(scaled, rows @ left)
-        if float(u[:3].norm()) > _TURN:
+        if float(u[:3].norm()) > _MOST_TURN:
             damping *= 10
             continue
         w2c = torch.tensor(camera.w2c) @ motion(-(twist_of @ u))
@@ -394,7 +395,7 @@ def _moved(
     pixels = inside[:, :2] / depth[:, None] * K.diagonal()[:2] + K[:2, 2]
     sides = torch.tensor([camera.width, camera.height])
     seen = (inside[:, 2] > 0) & ((pixels > 0) & (pixels < sides)).all(1)
-    seen &= depth >= _NEAR * depth[seen].median() if seen.any() else seen
+    seen &= depth >= _NEAR_SHARE * depth[seen].median() if seen.any() else seen
     seen[-1] = True  # an off-center principal point may have put it outside
     inside = inside[seen]
     x, y, depth = inside.unbind(1)

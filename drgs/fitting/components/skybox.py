@@ -62,30 +62,37 @@ __all__ = [
 _log = logging.getLogger("drgs.train")
 
 RADIUS = 100.0
-"""Distance of the nearest of them from the middle of the cameras, in extents of the scene."""
+"""Distance of the nearest of them from the middle of the cameras, in extents of the scene: over a camera's way of one
+extent they move by half a degree. Chosen, not tuned."""
 
 SHARE = 0.1
-"""Their part of the budget of Gaussians."""
+"""Their share of `max_gaussians`; chosen, not tuned."""
 
-_FARTHEST = 2.0  # distance of the farthest, in those of the nearest
-_OPACITY = 0.9
-_WIDTH = 0.75  # of their scales, in the mean distance of neighbors: some percent of the light pass between them
+_FARTHEST_RATIO = 2.0  # distance of the farthest over that of the nearest: neighbors keep their order in depth; chosen
+_OPACITY = 0.9  # at the start: nothing is behind them; below 1, so that its logit has a gradient; chosen
+_SCALE_RATIO = (
+    0.75  # standard deviation over the mean distance of neighbors: some percent of the light pass between them
+)
 _MARGIN = 0.05  # of the longer side of a picture, beyond its border: directions that held-out views may look in
-_DRAWN = 4_000  # directions over the whole sphere, of which the part that photographs look in is counted; at first
-_DRAWN_AT_MOST = 1 << 20
-_POINTS_AT_ONCE = 1 << 18  # of which it is asked whether photographs look at them
+_DIRECTIONS_FIRST = (
+    4_000  # directions over the sphere whose share in photographs is counted; four times as many until enough are
+)
+_MOST_DIRECTIONS = 1 << 20  # of these: 25 a square degree; chosen
+_POINTS_AT_ONCE = 1 << 18  # directions that are projected at once: 6 MB of float64 points
 _COLORS_AT_ONCE = 1 << 25  # bytes of the colors of all photographs at some points; a median takes several times that
-_COUNTED = 200  # of them that photographs must look in, for the count to be right within some percent
-_LEAST_COUNTED = 20  # where a lens is so narrow that even the most drawn do not do
-_MEASURED = 8  # photographs, at most, in which it is looked for at the end
-_OPEN = 0.5  # transmittance of the others from which on the shell is what a pixel shows
-_LOOKED = 800  # directions whose colors are compared
-_VIEWS = 3  # photographs that must look in a direction, so that a median is of more than two
+_ENOUGH_DIRECTIONS = 200  # directions in photographs for which their share is right within some percent
+_FEWEST_DIRECTIONS = (
+    20  # the same, where even the most directions do not suffice; bounds the number that are drawn then
+)
+_MEASURED_VIEWS = 8  # photographs, at most, whose share of skybox is measured at the end; chosen for its seconds
+_OPEN_TRANSMITTANCE = 0.5  # transmittance of the other Gaussians from which on a pixel shows mostly the shell
+_COMPARED_DIRECTIONS = 800  # directions in which colors are compared: the share is right within 2 %
+_FEWEST_VIEWS = 3  # photographs that must look in a direction, so that a median is of more than two
 _BLUR = 0.012  # radius of the mean that is compared, in widths of a picture: the parallax that is left, and details
-_SAME = 0.03  # median distance of colors from their median that what is far has at most
+_SAME_COLOR = 0.03  # of the range of colors: largest median deviation from the median color of what is far; chosen
 # Share of directions beyond chance: 0.48 of `statue`, which gains 3 dB by a shell; 0.21, 0.07 and 0.00 of `rooftop` (13
 # photographs, few points), `fern` and `banana`, which lose 1.4, gain nothing and lose 5.
-_CLEAR = 0.25
+_CLEAR_SHARE = 0.25
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,18 +121,20 @@ class Skybox:
         """
         middle = np.stack([frame.camera.center for frame in frames]).mean(axis=0)
         radius = RADIUS * extent
-        drawn = _DRAWN
+        drawn = _DIRECTIONS_FIRST
         # A narrow lens looks in few directions of the whole sphere: more are drawn until there are enough to count.
-        while (looked_at := len(_looked_at(frames, middle, radius, drawn))) < _COUNTED and drawn < _DRAWN_AT_MOST:
+        while (
+            looked_at := len(_looked_at(frames, middle, radius, drawn))
+        ) < _ENOUGH_DIRECTIONS and drawn < _MOST_DIRECTIONS:
             drawn *= 4
-        whole = max(1, count * drawn // max(looked_at, _LEAST_COUNTED))
+        whole = max(1, count * drawn // max(looked_at, _FEWEST_DIRECTIONS))
         directions = _looked_at(frames, middle, radius, whole)
         if len(directions) > count:  # evenly fewer: the lattice runs from pole to pole
             directions = directions[np.linspace(0, len(directions) - 1, count).round().astype(int)]
-        distances = radius * np.exp(np.random.default_rng(seed).uniform(0, math.log(_FARTHEST), len(directions)))
+        distances = radius * np.exp(np.random.default_rng(seed).uniform(0, math.log(_FARTHEST_RATIO), len(directions)))
         means = middle + distances[:, None] * directions
         spacing = math.sqrt(4 * math.pi / whole)
-        return cls(means, _colors(frames, means), distances * spacing * _WIDTH)
+        return cls(means, _colors(frames, means), distances * spacing * _SCALE_RATIO)
 
     def __len__(self) -> int:
         return len(self.means)
@@ -167,14 +176,14 @@ class FarEvidence:
     @property
     def is_clear(self) -> bool:
         """Whether there is clearly something far away."""
-        return self.share > _CLEAR
+        return self.share > _CLEAR_SHARE
 
     def words(self) -> str:
         """What was found, in one line."""
         return (
             f"photographs agree on what is far away in {100 * self.share:.1f} % of their directions (clear above "
-            f"{100 * _CLEAR:g} %; {100 * self.seen:.0f} % are seen three times, {100 * self.agreeing:.0f} % of these "
-            f"agree, by chance {100 * self.chance:.0f} %)"
+            f"{100 * _CLEAR_SHARE:g} %; {100 * self.seen:.0f} % are seen three times, {100 * self.agreeing:.0f} % of "
+            f"these agree, by chance {100 * self.chance:.0f} %)"
         )
 
     def to_json(self) -> dict[str, float]:
@@ -211,10 +220,10 @@ def far_evidence(frames: list[Frame], extent: float, seed: int = 0) -> FarEviden
         extent: Extent of the scene.
         seed: Seed of the shuffling that shows what chance is.
     """
-    points = Skybox.around(frames, extent, _LOOKED, seed).means
+    points = Skybox.around(frames, extent, _COMPARED_DIRECTIONS, seed).means
     colors = _colors_seen(frames, points, _BLUR)
     there = ~np.isnan(colors[..., 0])
-    many = there.sum(axis=0) >= _VIEWS
+    many = there.sum(axis=0) >= _FEWEST_VIEWS
     if not many.any():
         return FarEvidence(0.0, 0.0, 0.0)
     shuffled = np.full_like(colors, np.nan)
@@ -222,7 +231,7 @@ def far_evidence(frames: list[Frame], extent: float, seed: int = 0) -> FarEviden
     for row in range(len(frames)):
         index = np.flatnonzero(there[row])
         shuffled[row, index] = colors[row, rng.permutation(index)]
-    agreeing, chance = (float((_deviation(x[:, many]) < _SAME).mean()) for x in (colors, shuffled))
+    agreeing, chance = (float((_deviation(x[:, many]) < _SAME_COLOR).mean()) for x in (colors, shuffled))
     return FarEvidence(float(many.sum() / there.any(axis=0).sum()), agreeing, chance)
 
 
@@ -240,7 +249,7 @@ def visible_share(gaussians: Gaussians, far: int, frames: list[Frame], settings:
         for frame in frames:
             alpha = render(others, frame.camera, settings, outputs=()).alpha.cpu()
             mask = torch.ones_like(alpha) if frame.mask is None else frame.mask
-            shown += float(((1 - alpha > _OPEN) * mask).sum())
+            shown += float(((1 - alpha > _OPEN_TRANSMITTANCE) * mask).sum())
             total += float(mask.sum())
             bar.advance()
     return shown / max(total, 1.0)
@@ -424,6 +433,6 @@ class SkyboxComponent(Component):
         if not count:
             return {}
         frames = fit.photographs()
-        frames = frames[:: -(-len(frames) // _MEASURED)]
+        frames = frames[:: -(-len(frames) // _MEASURED_VIEWS)]
         share = visible_share(fit.gaussians(), count, frames, fit.config.settings)
         return {"skybox": {"gaussians": count, "visible": share}}

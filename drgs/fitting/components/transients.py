@@ -43,22 +43,31 @@ __all__ = ["TENSOR", "TransientsComponent", "line_of", "masked_share", "transien
 TENSOR = "transient."
 """What names of masks in a checkpoint begin with; the number of the photograph follows."""
 
-_LOOKS = (3 / 8, 1 / 2, 5 / 8, 3 / 4, 7 / 8)  # of the steps: before the first, everything counts
-_VISITS = 4  # steps that a photograph must have had on average; fewer leave residuals of what is not fitted yet
-_FEWEST = 4  # photographs: one, and three that it is compared with
-_PIXELS = 6_000  # of the pictures that are compared: 20,000 find the same in twice the time
+# Where nothing measured is named: chosen, not tuned.
+_COMPARED_AT = (
+    3 / 8,
+    1 / 2,
+    5 / 8,
+    3 / 4,
+    7 / 8,
+)  # parts of the steps at which masks are made anew; until the first, all pixels count
+_LEAST_VISITS = 4  # steps that a photograph must have had on average; fewer leave residuals of what is not fitted yet
+_FEWEST_PHOTOGRAPHS = 4  # photographs of a fit: one, and three that it is compared with
+_COMPARED_PIXELS = 6_000  # pixels of a picture that is compared: 20,000 give the same masks in twice the time
 _BLUR = 0.02  # radius of the mean that is compared, in widths of the picture
 _NEIGHBORS = 8  # photographs that each one is compared with, the nearest
-_AGREEING = 3  # of them that must see the same place
-_SAME = 0.1  # relative difference of two distances to one surface
+_FEWEST_NEIGHBORS = 3  # of them that must see the same place
+_SAME_DISTANCE = 0.1  # relative difference of two distances to one surface
 _SOLID = 0.5  # opacity below which a ray ends in nothing
-_DARK = 0.05  # below it the ratio of two colors is noise
-_SPREADS = 2.0  # times the neighbors' own spread that a difference must exceed
-_CLEAR, _EDGE = 0.1, 0.05  # of the remaining difference: where a mask is begun, and how far it is grown
-_GROWTH = 0.08  # the farthest that it is grown, in widths of the picture
-_SHARE = 0.025  # of a photograph that clearly differs: what decides. Clean captures: at most 0.017
-_MASKED = 0.01  # the same, from which on a photograph has a mask once that is decided; less are specks
-_ABOVE = 4.0  # times the median over photographs, which wrong poses and mirrors raise in all of them
+_DARK = 0.05  # of the range of colors, below which the ratio of two is noise
+_SPREADS = 2.0  # times the spread of the neighbors' own colors, which a difference must exceed
+_CLEAR, _EDGE = 0.1, 0.05  # of the range of colors: what exceeds the spread where a mask begins, and where it ends
+_GROWTH = 0.08  # widths of the picture: how far a mask grows from where it begins, at most
+_DECISIVE_SHARE = (
+    0.025  # of a photograph's pixels that clearly differ, above which masks are used. Clean captures: at most 0.017
+)
+_MASKED_SHARE = 0.01  # the same, from which on a photograph has a mask once that is decided; less are specks
+_TIMES_MEDIAN = 4.0  # times the median over photographs, which wrong poses and mirrors raise in all of them
 
 
 class TransientsComponent(Component):
@@ -100,9 +109,14 @@ class TransientsComponent(Component):
 
     def is_due(self, use: TransientUse, done: int, max_steps: int, photographs: int) -> bool:
         """Whether to look before step `done`; `use` as `LossConfig.transients` says."""
-        if use == "keep" or self.present is False or photographs < _FEWEST or done < _VISITS * photographs:
+        if (
+            use == "keep"
+            or self.present is False
+            or photographs < _FEWEST_PHOTOGRAPHS
+            or done < _LEAST_VISITS * photographs
+        ):
             return False
-        return done in {round(part * max_steps) for part in _LOOKS}
+        return done in {round(part * max_steps) for part in _COMPARED_AT}
 
     def look(self, use: TransientUse, frames: list[Frame], gaussians: Gaussians, settings: RenderSettings) -> dict:
         """Decide, where that is open, whether there is something to be left out, and renew the masks of all frames.
@@ -118,7 +132,7 @@ class TransientsComponent(Component):
         masks, shares = transient_masks(frames, gaussians, settings)
         worst, median = max(shares), float(np.median(shares))
         if self.present is None:
-            self.present = use == "mask" or worst > max(_SHARE, _ABOVE * median)
+            self.present = use == "mask" or worst > max(_DECISIVE_SHARE, _TIMES_MEDIAN * median)
         if self.present:
             for frame, mask in zip(frames, masks, strict=True):
                 frame.transient = mask if mask.any() else None
@@ -127,7 +141,7 @@ class TransientsComponent(Component):
             "found": self.present,
             "worst": worst,
             "median": median,
-            "photographs": sum(share > _SHARE for share in shares),
+            "photographs": sum(share > _DECISIVE_SHARE for share in shares),
             "of": len(frames),
             **masked_share(frames),
         }
@@ -182,9 +196,9 @@ def masked_share(frames: list[Frame]) -> dict:
 def line_of(event: Mapping[str, Any]) -> str:
     """What was found, in one line, of an event of `TransientsComponent.look`."""
     return (
-        f"{event['photographs']} of {event['of']} photographs show over {100 * _SHARE:g} % of what their neighbors do "
-        f"not, up to {100 * event['worst']:.1f} % (median {100 * event['median']:.1f} %): left out of the loss, "
-        f"{100 * event['share']:.1f} % of all pixels; --transients keep fits it"
+        f"{event['photographs']} of {event['of']} photographs show over {100 * _DECISIVE_SHARE:g} % of what their "
+        f"neighbors do not, up to {100 * event['worst']:.1f} % (median {100 * event['median']:.1f} %): left out of the "
+        f"loss, {100 * event['share']:.1f} % of all pixels; --transients keep fits it"
     )
 
 
@@ -231,7 +245,7 @@ def transient_masks(
             clear = excess > _CLEAR
             shares.append(float(clear.float().mean()))
             # One pixel more: the blur has drawn what is beside it into the difference at its border.
-            grown = _grown(clear, excess > _EDGE, 1) if shares[-1] > _MASKED else torch.zeros_like(clear)
+            grown = _grown(clear, excess > _EDGE, 1) if shares[-1] > _MASKED_SHARE else torch.zeros_like(clear)
             height, width = frame.pixels.shape[:2]
             masks.append(interpolate(grown.float()[None, None], (height, width), mode="nearest")[0, 0] > 0)
             bar.advance()
@@ -240,7 +254,7 @@ def transient_masks(
 
 def _compared(frame: Frame, gaussians: Gaussians, settings: RenderSettings) -> _Compared:
     """A photograph beside its rendering."""
-    width, height = reduced_size(frame.camera, _PIXELS)
+    width, height = reduced_size(frame.camera, _COMPARED_PIXELS)
     camera = frame.camera.resized(width, height)
     with torch.no_grad():  # looked at
         out = render(colors_only(gaussians, camera.time), camera, settings, outputs=("depth",))
@@ -279,7 +293,7 @@ def _excess(one: _Compared, neighbors: list[_Compared]) -> torch.Tensor:
         maps = torch.cat([other.residual, other.distance[None], other.valid[None].float()])[None]
         sampled = grid_sample(maps, where.nan_to_num(2.0)[None], align_corners=False)[0]
         same = front & (where.abs() < 1).all(-1) & (sampled[4] > 0.5)
-        same &= (sampled[3] - distance).abs() < _SAME * distance
+        same &= (sampled[3] - distance).abs() < _SAME_DISTANCE * distance
         seen.append(torch.where(same, sampled[:3], torch.nan))
     stack = torch.stack(seen)
     median = stack.nanmedian(0).values
@@ -287,7 +301,7 @@ def _excess(one: _Compared, neighbors: list[_Compared]) -> torch.Tensor:
     count = (~stack[:, 0].isnan()).sum(0)
     # What the others' residual explains is no object of this one; nor is what this one's own rendering shows already.
     difference = torch.minimum((one.residual - median).abs().mean(0), one.residual.abs().mean(0))
-    judged = one.valid & (count >= _AGREEING)
+    judged = one.valid & (count >= _FEWEST_NEIGHBORS)
     return torch.where(judged, difference - _SPREADS * spread, 0.0)
 
 

@@ -25,7 +25,7 @@ _WIDTH = 5.2  # inches: about a phone's width, where text keeps its size; wider 
 _STYLE: Any = {"svg.fonttype": "none", "font.size": 8.5, "font.family": "sans-serif", "axes.spines.top": False}
 _STYLE |= {"axes.spines.right": False, "axes.grid": True, "grid.color": "#e4e4e4", "grid.linewidth": 0.6}
 _BLUE, _RED, _GREEN, _GRAY = "#1f6fb4", "#c43c39", "#2b8a4b", "#9a9a9a"
-_MOST_BARS = 40  # picks that are drawn, the last ones
+_MOST_BARS = 40  # latest picks that are drawn: more bars are too thin to read
 
 
 def is_available() -> bool:

@@ -32,13 +32,13 @@ if TYPE_CHECKING:
 __all__ = ["Picture", "jpeg", "maps", "previews", "spread", "stills", "uncertain", "view_pictures"]
 
 _QUALITY = 88  # of JPEG; a page of thirty pictures then has about two megabytes
-_WIDEST = 1200  # pixels; more than a page is wide
-_PREVIEWS = 12  # pictures of how the fit went, evenly spaced: a slider of more is no smoother
-_MAP_WIDTH = 480  # pixels, about
-_LARGEST = 1 << 28  # bytes of a PNG in a run folder that is opened
+_WIDEST = 1200  # pixels of width, at most; no page is wider
+_MOST_PREVIEWS = 12  # pictures of how the fit went, evenly spaced: a slider of more is no smoother
+_MAP_WIDTH = 480  # pixels of width of a map of information, about: it takes seconds; chosen
+_MOST_BYTES = 1 << 28  # bytes of a PNG of a run folder, at most: no rendering has more
 _MAPPED: tuple[Block, ...] = ("geometry", "backdrop")
-_KNOWN = 24  # views whose information is added up; of more, these stand for all
-_STILLS = 12  # times of a sequence that one camera is shown at, evenly spaced
+_MOST_KNOWN = 24  # known views whose information is summed, spread evenly over more; chosen for its seconds
+_MOST_STILLS = 12  # times at which one camera of a sequence is shown, evenly spaced; chosen
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +81,7 @@ def previews(account: Account) -> list[Picture]:
     for path in account.run.renders.glob("preview_*.png"):
         if (number := re.fullmatch(r"preview_(\d+)", path.stem)) and int(number[1]) <= account.step:
             found.append((int(number[1]), path))
-    shown = [(step, _read(path)) for step, path in spread(sorted(found), _PREVIEWS)]
+    shown = [(step, _read(path)) for step, path in spread(sorted(found), _MOST_PREVIEWS)]
     return [jpeg(image, f"step {step:,}", 800) for step, image in shown if image is not None]
 
 
@@ -103,7 +103,7 @@ def _read(path: Path) -> np.ndarray | None:
     """An 8-bit picture; None where there is none that can be read."""
     import cv2
 
-    if not path.is_file() or path.stat().st_size > _LARGEST:
+    if not path.is_file() or path.stat().st_size > _MOST_BYTES:
         return None
     image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR)
     return None if image is None else np.ascontiguousarray(image[..., ::-1])
@@ -141,7 +141,7 @@ def uncertain(
     """
     if not known or not shown:
         return {}
-    counted = spread(known, _KNOWN)
+    counted = spread(known, _MOST_KNOWN)
     result = dict[str, tuple[np.ndarray, np.ndarray]]()
     scoring = Scoring(settings=settings, blocks=_MAPPED, nuisances=nuisances)
     blocks = SceneBlocks.of(scene, scoring, [*known, *shown.values()], "report")
@@ -171,8 +171,8 @@ def _enlarged(values: np.ndarray) -> np.ndarray:
 def stills(scene: Scene, camera: Camera, times: Sequence[float], settings: RenderSettings) -> list[Picture]:
     """One camera at several times, evenly over all."""
     found = []
-    with Bar("stills of the sequence", min(len(times), _STILLS)) as bar:
-        for time in spread(times, _STILLS):
+    with Bar("stills of the sequence", min(len(times), _MOST_STILLS)) as bar:
+        for time in spread(times, _MOST_STILLS):
             now = dataclasses.replace(camera, time=time)
             with torch.no_grad():  # a picture
                 image = render(colors_only(scene, time), now, settings, outputs=()).rgb.cpu().numpy()

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["FILE", "write_report"]
 
 FILE = "report.html"
-_VIEWS = 4  # views that are shown with pictures
+_SHOWN_VIEWS = 4  # views that are shown with pictures; chosen for the size of the page
 
 _log = logging.getLogger(__name__)
 
@@ -108,7 +108,7 @@ def _typical(account: Account) -> list[str]:
     """Names of a few measured views, from the worst to the best."""
     rows = [] if account.metrics is None else account.metrics["views"]
     ranked = sorted(rows, key=lambda row: row["psnr"] if row.get("psnr") is not None else float("inf"))
-    return [row["name"] for row in pictures.spread(ranked, _VIEWS)]
+    return [row["name"] for row in pictures.spread(ranked, _SHOWN_VIEWS)]
 
 
 def _stills(account: Account, loaded: LoadedRun, cast: _Cast) -> tuple[list[pictures.Picture], str]:

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 __all__ = ["classes_layer", "moments_of", "uncertainty_layer", "uncertainty_of"]
 
-_LEVELS = 256
-_DECADES = 3.0  # of the scale of uncertainty at most, as in the report's maps
-_STILL = 1e-3  # what moves less, as a part of the scene's extent (or of a turn, or of a log scale), stands still
+_NUM_COLORS = 256  # entries of the table of colors: a Gaussian's is one byte
+_MOST_DECADES = 3.0  # range of the scale of uncertainty, at most, as in the report's maps; chosen
+_STILL_CHANGE = 1e-3  # least change that is stored, of the scene's extent, a quaternion or a log scale; chosen
 
 
 def classes_layer(
@@ -84,16 +84,16 @@ def uncertainty_layer(values: np.ndarray) -> tuple[dict[str, Any], bytes]:
     """
     values = np.log10(values)
     least, high = np.percentile(values, [1, 99])
-    low = max(least, high - _DECADES)
+    low = max(least, high - _MOST_DECADES)
     high = max(high, low + 1e-3)  # of one value, too, the scale has a length to divide by
     shares = (np.clip(values, low, high) - low) / (high - low)
     known = {
         "low": float(10.0**low),
         "high": float(10.0**high),
         "text": "standard deviation of a center for noise of 1, in scene units",
-        "colors": inferno(np.linspace(0, 1, _LEVELS)[None])[0].tolist(),
+        "colors": inferno(np.linspace(0, 1, _NUM_COLORS)[None])[0].tolist(),
     }
-    return known, np.rint((_LEVELS - 1) * shares).astype(np.uint8).tobytes()
+    return known, np.rint((_NUM_COLORS - 1) * shares).astype(np.uint8).tobytes()
 
 
 def moments_of(moving: DynamicGaussians, times: Sequence[float], rest: Gaussians, order: np.ndarray) -> tuple:
@@ -123,7 +123,9 @@ def moments_of(moving: DynamicGaussians, times: Sequence[float], rest: Gaussians
     still = _numbers(rest)[:, order]
     extent = np.ptp(still[:3], axis=1).max()
     scale = np.array([extent] * 3 + [1.0] * 7)[:, None]
-    moves = ((np.ptp(values, axis=0) / scale).max(0) > _STILL) | ((np.abs(values[0] - still) / scale).max(0) > _STILL)
+    moves = ((np.ptp(values, axis=0) / scale).max(0) > _STILL_CHANGE) | (
+        (np.abs(values[0] - still) / scale).max(0) > _STILL_CHANGE
+    )
     places = np.flatnonzero(moves | limited)
     values = values[:, :, places]
     low = values.min((0, 2)) if len(places) else np.zeros(10)

@@ -24,8 +24,8 @@ PACKAGED = Path(__file__).parent / "npm"
 """Where a wheel has the files of the packages, in a folder for each."""
 
 _log = logging.getLogger("drgs.pages.sharing.npm")  # by this name where it is loaded by itself, too
-_TIMEOUT = 60.0  # seconds without an answer
-_LARGEST = 64 << 20  # bytes of an archive
+_TIMEOUT = 60.0  # seconds without an answer from the registry; chosen
+_MOST_BYTES = 64 << 20  # bytes of an archive, many times what the packages have: more is not one of them
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,7 +127,7 @@ def _fetched(package: Package) -> bytes:
     _log.info("fetching %s, once, for the pages of drgs share", package.address)
     try:
         with urllib.request.urlopen(package.address, timeout=_TIMEOUT) as answer:
-            return answer.read(_LARGEST)
+            return answer.read(_MOST_BYTES)
     except (urllib.error.URLError, TimeoutError) as error:
         reason = getattr(error, "reason", error)
         raise OSError(

@@ -34,11 +34,13 @@ FILE = "scene.html"
 """The page in a run folder."""
 
 MOMENTS = 12
-"""Times at which a scene that moves is stored, where nobody says."""
+"""Times at which a moving scene is stored, by default; the size of the page grows with it. Chosen, not tuned."""
 
 _UP = np.array((0.0, -1.0, 0.0))  # as COLMAP's worlds stand, where no photographs say
-_COUNTED = 24  # photographs whose information is added up; of more, these stand for all, as in the report
-_INFO_PIXELS = 30_000  # of each of them
+_MOST_PHOTOGRAPHS = (
+    24  # photographs whose information is summed, spread evenly over more; chosen for its seconds, as in the report
+)
+_INFORMATION_PIXELS = 30_000  # pixels of each of these photographs, at most; chosen for its seconds
 
 _log = logging.getLogger(__name__)
 
@@ -198,10 +200,10 @@ def _uncertainty(loaded: LoadedRun, fitted: list[Camera]) -> np.ndarray | None:
     if not fitted:
         return None
     config = loaded.record.config
-    cameras = [at_most(camera, min(_INFO_PIXELS, config.data.max_pixels)) for camera in fitted]
+    cameras = [at_most(camera, min(_INFORMATION_PIXELS, config.data.max_pixels)) for camera in fitted]
     scene = loaded.gaussians.replace(features=None) if loaded.moving is None else loaded.moving
     nuisances = Nuisances(eliminate=loaded.record.estimated)
-    return uncertainty_of(scene, spread(cameras, _COUNTED), config.settings, nuisances)
+    return uncertainty_of(scene, spread(cameras, _MOST_PHOTOGRAPHS), config.settings, nuisances)
 
 
 def _ahead(gaussians: Gaussians, camera: Camera) -> np.ndarray:

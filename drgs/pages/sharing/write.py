@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Shared", "write_page"]
 
-_NEAR = 0.01  # scene units: the near plane of gsplat
-_BEYOND = 10.0  # times the distance of the farthest Gaussian: the far plane
+_NEAR_PLANE = 0.01  # scene units: the near plane of gsplat
+_FAR_FACTOR = 10.0  # far plane over the distance of the farthest Gaussian: a reader may step back as far; chosen
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -86,8 +86,8 @@ def write_page(shared: Shared, path: str | os.PathLike) -> dict[str, int]:
     reach = float(np.linalg.norm(shared.target - begin.center))
     scene: dict[str, Any] = {
         "background": list(shared.background),
-        "near": _NEAR,
-        "far": _BEYOND * max(float(distances.max()), reach),
+        "near": _NEAR_PLANE,
+        "far": _FAR_FACTOR * max(float(distances.max()), reach),
         "reach": reach,
         "target": (shared.target - origin).tolist(),
         "upright": columns(upright_matrix(shared.up)),
