@@ -44,7 +44,7 @@ import torch_rays  # noqa: E402
 import drgs  # noqa: E402
 from drgs.cameras import Camera  # noqa: E402
 from drgs.cameras.sizes import at_most  # noqa: E402
-from drgs.commands.orbits import Wish, scene_orbit  # noqa: E402
+from drgs.commands.orbits import OrbitShape, scene_orbit  # noqa: E402
 from drgs.data import load as load_data  # noqa: E402
 from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.files import load_ply  # noqa: E402
@@ -95,7 +95,7 @@ def real_scenes(runs: Path) -> dict[str, tuple]:
     for name, path in SPLATS.items():
         if (DATA / "splats" / path).exists():
             g = load_ply(DATA / "splats" / path)
-            scenes[name] = g, scene_orbit(g, 50, width=163, height=122, wish=Wish(elevation=10.0))
+            scenes[name] = g, scene_orbit(g, 50, width=163, height=122, fixed=OrbitShape(elevation=10.0))
     for name in FITS:
         if not (DATA / name).exists():
             continue
@@ -124,7 +124,7 @@ def wolf(count: int, width: int, height: int) -> tuple | None:
     if not path.exists():
         return None
     g = load_ply(path)
-    camera = scene_orbit(g, 8, width=width, height=height, wish=Wish(fov=70, elevation=10.0))[0]
+    camera = scene_orbit(g, 8, width=width, height=height, fixed=OrbitShape(fov=70, elevation=10.0))[0]
     return heaviest(g, camera, count)
 
 

@@ -27,7 +27,7 @@ from studies import ROOT
 import drgs
 from drgs.cameras import intrinsics_from_fov
 from drgs.cameras.sizes import at_most
-from drgs.commands.orbits import Wish, scene_orbit
+from drgs.commands.orbits import OrbitShape, scene_orbit
 from drgs.commands.viewpoints import evenly
 from drgs.data import load
 from drgs.files import Run, atomic_write
@@ -81,7 +81,7 @@ def wolf(fov: float, width: int = 160) -> tuple:
     """(Gaussians, cameras, background)."""
     g = drgs.load_ply(studies.DATA / "splats" / "wolf" / "wolf.ply")
     size = {"width": width, "height": width * 3 // 4}
-    return g, scene_orbit(g, VIEWS, wish=Wish(fov=fov), **size), (0.0, 0.0, 0.0)
+    return g, scene_orbit(g, VIEWS, fixed=OrbitShape(fov=fov), **size), (0.0, 0.0, 0.0)
 
 
 def office(fov: float, path: Path) -> tuple:

@@ -29,7 +29,7 @@ from where import add_row, ran, read_rows  # noqa: E402
 from drgs.cameras import Camera  # noqa: E402
 from drgs.commands.options import Select  # noqa: E402
 from drgs.commands.scene_input import SceneInput  # noqa: E402
-from drgs.commands.viewpoints import known_views, other_views  # noqa: E402
+from drgs.commands.viewpoints import known_views, views_to_compare  # noqa: E402
 from drgs.select import Refine, Scoring, select  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.studies.tables import fill_between, paragraph  # noqa: E402
@@ -51,7 +51,9 @@ def measure(path: Path) -> None:
     scoring = Scoring(settings=given.over_background(RenderSettings.preset("fast")))
 
     def dome(count: int) -> list[Camera]:
-        return other_views("--candidates", "dome", dataclasses.replace(args, count=count), given, known, fresh=True)[0]
+        return views_to_compare(
+            "--candidates", "dome", dataclasses.replace(args, count=count), given, known, fresh=True
+        )[0]
 
     ways: dict[str, tuple[Camera, float]] = {}
     for name, count, refine in (

@@ -18,7 +18,7 @@ from torch_rasterizer import DEFECTS
 import drgs
 from drgs import cli
 from drgs.cameras import Camera
-from drgs.commands.orbits import Wish, scene_orbit
+from drgs.commands.orbits import OrbitShape, scene_orbit
 from drgs.data.camera_lists import save_cameras_json
 from drgs.ellipsoids import Gaussians
 from drgs.files import load_ply, save_ply
@@ -160,7 +160,7 @@ def test_a_real_scene(data_dir, name):
     if not path.exists():
         pytest.skip(f"no wolf: {path}")
     g = load_ply(path)
-    camera = scene_orbit(g, 8, width=48, height=40, wish=Wish(fov=70, elevation=10.0))[0]
+    camera = scene_orbit(g, 8, width=48, height=40, fixed=OrbitShape(fov=70, elevation=10.0))[0]
     weight = drgs.render(g, camera, outputs=("visibility",)).visibility
     index = torch.topk(weight, 250).indices
     g = Gaussians(**{field: getattr(g, field)[index] for field in PARAMETERS})

@@ -7,7 +7,7 @@ import pytest
 
 import drgs
 from drgs.cameras import Camera, intrinsics_from_fov, look_at
-from drgs.commands.orbits import Wish, capture_orbit, scene_orbit
+from drgs.commands.orbits import OrbitShape, capture_orbit, scene_orbit
 from drgs.data.camera_layout import Focus, path, upright
 from drgs.meshing.depths import seen_distance
 
@@ -173,21 +173,23 @@ def test_path_crosses_no_wall():
 def test_wishes(rng):
     """What a user fixes holds, the rest is the photographs'; without a common point a center must be given."""
     photos = ring(rng, 20, 200)
-    made, _ = capture_orbit(photos, 9, **SIZE, wish=Wish(center=(0, 0, 0), distance=2.5, elevation=10, span=90, fov=70))
+    made, _ = capture_orbit(
+        photos, 9, **SIZE, fixed=OrbitShape(center=(0, 0, 0), distance=2.5, elevation=10, span=90, fov=70)
+    )
     for camera in made:
         assert np.linalg.norm(camera.center) == pytest.approx(2.5)
         assert camera.center[2] == pytest.approx(2.5 * np.sin(np.radians(10)), abs=0.1)
         assert camera.c2w[:3, 2] @ -camera.center == pytest.approx(2.5)
     assert made[0].K[0, 0] == pytest.approx(intrinsics_from_fov(70, 40, 30)[0, 0])
-    turned = azimuths(capture_orbit(photos, 9, **SIZE, wish=Wish(span=60))[0])
+    turned = azimuths(capture_orbit(photos, 9, **SIZE, fixed=OrbitShape(span=60))[0])
     assert np.all(np.abs(turned - 110) < 32)
     assert np.ptp(turned) > 50
-    made, _ = capture_orbit(photos, 4, **SIZE, wish=Wish(up=(1, 0, 0)))
+    made, _ = capture_orbit(photos, 4, **SIZE, fixed=OrbitShape(up=(1, 0, 0)))
     assert all(-camera.c2w[0, 1] > 0.3 for camera in made)
     drive = [photo((0, i, 1), (0, i + 9, 1)) for i in range(12)]
     with pytest.raises(ValueError, match="must have center=X,Y,Z in --orbit here"):
-        capture_orbit(drive, 5, **SIZE, wish=Wish(distance=2.0))
-    made, _ = capture_orbit(drive, 5, **SIZE, wish=Wish(center=(0, 20, 1), distance=5.0))
+        capture_orbit(drive, 5, **SIZE, fixed=OrbitShape(distance=2.0))
+    made, _ = capture_orbit(drive, 5, **SIZE, fixed=OrbitShape(center=(0, 20, 1), distance=5.0))
     assert all(np.linalg.norm(camera.center - (0, 20, 1)) == pytest.approx(5) for camera in made)
 
 
@@ -204,10 +206,10 @@ def test_floaters_do_not_move_the_camera_away(rng):
     """A bare PLY: one Gaussian in ten far away, large and faint or small and opaque, changes the distance little."""
     means, scales, opacities = rng.normal(size=(400, 3)), np.full((400, 3), 0.05), np.full(400, 0.8)
 
-    def seen_from(wish=None):
+    def seen_from(fixed=None):
         quats = np.tile([1.0, 0, 0, 0], (400, 1))
         g = drgs.Gaussians.from_arrays(means, quats, scales, opacities, np.ones((400, 1, 3)))
-        return np.array([camera.center for camera in scene_orbit(g, 6, **SIZE, wish=wish)])
+        return np.array([camera.center for camera in scene_orbit(g, 6, **SIZE, fixed=fixed)])
 
     clean = seen_from()
     means[:20] *= 30
@@ -215,7 +217,7 @@ def test_floaters_do_not_move_the_camera_away(rng):
     scales[:20], opacities[:20] = 20.0, 0.06
     dirty = seen_from()
     assert np.linalg.norm(dirty[0] - dirty[3]) == pytest.approx(np.linalg.norm(clean[0] - clean[3]), rel=0.25)
-    fixed = seen_from(Wish(center=(1, 0, 0), distance=3.0, span=90))
+    fixed = seen_from(OrbitShape(center=(1, 0, 0), distance=3.0, span=90))
     np.testing.assert_allclose(np.linalg.norm(fixed - (1, 0, 0), axis=1), 3)
 
 
@@ -233,4 +235,4 @@ def test_floaters_do_not_move_the_camera_away(rng):
 def test_options_out_of_range(fields, message):
     """One sentence with the option's name."""
     with pytest.raises(ValueError, match=message):
-        Wish(**fields)
+        OrbitShape(**fields)

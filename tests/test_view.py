@@ -220,9 +220,9 @@ def test_layers_are_what_there_is(run):  # noqa: F811
     assert all(x.shape == (30, 40, 3) and x.dtype == np.uint8 for x in pictures.values())
     out = drgs.render(given.gaussians, camera, FAST)
     assert np.abs(pictures["rgb"] - (255 * out.rgb.clamp(0, 1)).round().numpy()).max() <= 1
-    from drgs.commands.painters import painters
+    from drgs.commands.semantic_pictures import picture_functions
 
-    for name, painter in painters(("features", "labels", "overlay"), given, Path("x")).items():
+    for name, painter in picture_functions(("features", "labels", "overlay"), given, Path("x")).items():
         assert np.array_equal(pictures[name], painter(out)), name
     brightness, alpha = pictures["missing"].sum(2).astype(float), out.alpha.numpy()
     ranks = [np.argsort(np.argsort(x.ravel())) for x in (brightness, 1 - alpha)]

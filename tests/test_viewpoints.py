@@ -11,7 +11,7 @@ from drgs import cli
 from drgs.cameras import orbit
 from drgs.commands.options import Crossval, Fisher, Render, Select, Tradeoff
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewpoints import Source, drawn_views, known_views, other_views, seen_views
+from drgs.commands.viewpoints import Source, known_views, views_to_compare, views_to_render, views_to_sample
 from drgs.data.camera_lists import save_cameras_json
 from drgs.files import Run, save_ply
 from drgs.fitting.records import is_run
@@ -122,11 +122,11 @@ def test_split_is_the_runs(place, scene, text, expected):
     text = str(place / text)
     for command in (Render, Crossval, Tradeoff):
         args, shown = given(place, command, scene=scene, split="test", cameras=text)
-        cameras, _ = drawn_views(args, text, shown, 9)
+        cameras, _ = views_to_render(args, text, shown, 9)
         assert "".join(camera.name for camera in cameras) == expected
     args, shown = given(place, Fisher, scene=scene, split="test")
     known = known_views(str(place / "list.json"), args, shown)
-    cameras, source = other_views("--cameras", text, args, shown, known, fresh=True)
+    cameras, source = views_to_compare("--cameras", text, args, shown, known, fresh=True)
     assert "".join(camera.name for camera in cameras) == expected
     assert source == f"{text} (test)"
 
@@ -134,9 +134,9 @@ def test_split_is_the_runs(place, scene, text, expected):
 def test_cameras_are_a_runs_own_or_an_orbit(place):
     """Without --cameras, crossval and tradeoff look from a run's photographs, evenly; at a PLY, from an orbit."""
     args, shown = given(place, Tradeoff, limit=3)
-    assert [camera.name for camera in seen_views(args, shown)[0]] == ["0", "3", "6"]
+    assert [camera.name for camera in views_to_sample(args, shown)[0]] == ["0", "3", "6"]
     args, shown = given(place, Tradeoff, scene="ply", limit=3)
-    cameras, source = seen_views(args, shown)
+    cameras, source = views_to_sample(args, shown)
     assert (len(cameras), source) == (3, "orbit, up minus-y")
 
 
@@ -176,7 +176,7 @@ def test_a_run_whose_data_set_was_moved_says_so(place, tmp_path, capsys):
     path.write_text(json.dumps(json.loads(path.read_text()) | {"data": str(tmp_path / "moved")}))
     gone = r"run: the data set of the run must be at .*moved, found none; move it back, or name cameras with --"
     with pytest.raises(FileNotFoundError, match=gone + "cameras"):
-        seen_views(*given(tmp_path, Tradeoff))
+        views_to_sample(*given(tmp_path, Tradeoff))
     with pytest.raises(FileNotFoundError, match=gone + "train"):
         known_views(None, *given(tmp_path, Select))
     assert cli.main(["eval", str(tmp_path / "run")]) == 2
@@ -189,7 +189,7 @@ def test_cameras_are_taken_of_a_data_set_whose_maps_are_bad(place, tmp_path):
     (tmp_path / "data/rgb_feature_langseg").mkdir()
     (tmp_path / "data/rgb_feature_langseg/another_fmap_CxHxW.pt").write_bytes(b"damaged")
     args, shown = given(place, Tradeoff, cameras=str(tmp_path / "data"), limit=2)
-    assert len(seen_views(args, shown)[0]) == 2
+    assert len(views_to_sample(args, shown)[0]) == 2
 
 
 def test_refined_poses_are_a_runs_however_its_photographs_are_named(place, tmp_path):

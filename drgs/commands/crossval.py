@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 from drgs import runtime
 from drgs.cameras.sizes import at_most
-from drgs.commands.orbits import Wish
+from drgs.commands.orbits import OrbitShape
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewpoints import seen_views
+from drgs.commands.viewpoints import views_to_sample
 from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.io.journal import SCHEMA
@@ -26,7 +26,7 @@ __all__ = ["run"]
 
 def run(args: Crossval) -> int:
     """`drgs crossval SCENE`: 1 if a gradient is wrong, or, with --strict, if anything is not as the preset has it."""
-    Wish.of(args)  # refuses what cannot be, before anything is read
+    OrbitShape.of(args)  # refuses what cannot be, before anything is read
     inputs = [args.scene, args.cameras or "", args.rasterizer]
     if args.export is None:
         lock_folder(args.output, "crossval", ["report.html", "crossval.json"], inputs)
@@ -38,7 +38,7 @@ def run(args: Crossval) -> int:
     g, fields = given.colors, given.fields
     along_rays = _along_rays(args)
     # A model of the image plane has no lens, and what is written for another machine is pinholes.
-    cameras, source = seen_views(args, given, lenses=along_rays and args.export is None)
+    cameras, source = views_to_sample(args, given, lenses=along_rays and args.export is None)
     cameras = [at_most(camera, args.max_pixels) for camera in cameras]
     if args.export is not None:
         rasterizers.export(args.export, g, cameras, given.background, args.seed)

@@ -25,9 +25,9 @@ import numpy as np
 import torch
 
 from drgs import fisher
-from drgs.commands.orbits import Wish
+from drgs.commands.orbits import OrbitShape
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewpoints import check_lenses, evenly, known_views, other_views, timed
+from drgs.commands.viewpoints import check_lenses, evenly, known_views, views_to_compare, with_times
 from drgs.data.camera_lists import camera_to_json
 from drgs.display import pictures, tables
 from drgs.display.progress import Bar
@@ -60,7 +60,7 @@ KINDS = ("variance", "share")  # of maps
 
 def run(args: Fisher) -> None:
     """`drgs fisher SCENE`."""
-    Wish.of(args)  # refuses what cannot be, before anything is read, as settings do
+    OrbitShape.of(args)  # refuses what cannot be, before anything is read, as settings do
     settings = args.settings()
     prior = args.scoring.prior or MAP_PRIOR
     inputs = [args.scene, args.train or "", args.cameras or ""]
@@ -76,11 +76,11 @@ def run(args: Fisher) -> None:
             )
         text = args.cameras
     known = known_views(text, args, given, given.keeps_lenses(args.undistort), args.info_pixels)
-    known = dataclasses.replace(known, cameras=timed(known.cameras, args, given))
+    known = dataclasses.replace(known, cameras=with_times(known.cameras, args, given))
     views, source = known.cameras, known.source
     if args.cameras is not None:
-        views, source = other_views("--cameras", args.cameras, args, given, known, fresh=False)
-    views = evenly(timed(views, args, given), args.limit)
+        views, source = views_to_compare("--cameras", args.cameras, args, given, known, fresh=False)
+    views = evenly(with_times(views, args, given), args.limit)
     check_lenses("fisher", settings, [*known.cameras, *views])
     scoring = given.scoring(args.scoring, settings)
     with Bar("information", len(known.cameras) + len(views), not args.quiet) as bar:

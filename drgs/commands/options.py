@@ -31,12 +31,12 @@ if TYPE_CHECKING:
 __all__ = [
     "COMMANDS",
     "SIDE",
-    "Around",
+    "Orbits",
     "Capture",
     "Cite",
-    "Clustered",
+    "Workers",
     "Common",
-    "Comparing",
+    "ComparedViews",
     "Convert",
     "Crossval",
     "Data",
@@ -45,23 +45,23 @@ __all__ = [
     "Fisher",
     "Fit",
     "Info",
-    "Informed",
+    "Information",
     "Lenses",
     "Mesh",
-    "Moments",
+    "SceneTimes",
     "Query",
     "Render",
     "Report",
     "Reproduce",
     "Scene",
-    "Seen",
+    "SampledViews",
     "Select",
     "Settings",
     "Sfm",
     "Share",
     "Stress",
     "Teach",
-    "Timed",
+    "TimedData",
     "Tradeoff",
     "View",
     "Views",
@@ -155,7 +155,7 @@ class Data:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Timed(Data):
+class TimedData(Data):
     """Options of commands that load data sets of one time or of several."""
 
     heading: ClassVar[str] = "Data"
@@ -167,7 +167,7 @@ class Timed(Data):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Views(Timed):
+class Views(TimedData):
     """Options of commands that take some of the views of a data set."""
 
     heading: ClassVar[str] = "Data"
@@ -198,7 +198,7 @@ class Lenses:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Around:
+class Orbits:
     """Options of commands that can make cameras around a scene."""
 
     heading: ClassVar[str] = "Views"
@@ -213,7 +213,7 @@ class Around:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Seen(Settings, Around, Views):
+class SampledViews(Settings, Orbits, Views):
     """Options of commands that look at a scene from a few cameras."""
 
     scene: Path = _scene()
@@ -229,7 +229,7 @@ class Seen(Settings, Around, Views):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Informed(Settings):
+class Information(Settings):
     """Options of commands that compute Fisher information."""
 
     scoring: Scoring = part(Scoring(), only=("method", "blocks", "prior", "probes", "nuisances"))
@@ -237,7 +237,7 @@ class Informed(Settings):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Comparing(Informed, Around, Views, Lenses):
+class ComparedViews(Information, Orbits, Views, Lenses):
     """Options of commands that compare views with known ones."""
 
     scene: Path = _scene()
@@ -257,7 +257,7 @@ class Comparing(Informed, Around, Views, Lenses):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Clustered(Common):
+class Workers(Common):
     """Options of commands that can let other processes compute."""
 
     heading: ClassVar[str] = "Machine"
@@ -287,7 +287,7 @@ class Clustered(Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Moments:
+class SceneTimes:
     """Options of commands that draw a scene that moves."""
 
     time: str | None = option(
@@ -314,7 +314,7 @@ class Info(Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Render(Settings, Around, Views, Moments, Lenses):
+class Render(Settings, Orbits, Views, SceneTimes, Lenses):
     """Render a file of Gaussians, or a finished run, to pictures or a video."""
 
     scene: Path = _scene()
@@ -377,7 +377,7 @@ class Render(Settings, Around, Views, Moments, Lenses):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class View(Informed, Around, Views):
+class View(Information, Orbits, Views):
     """Look at a run or a file of Gaussians in the browser, also during a fit."""
 
     scene: Path = option(
@@ -412,7 +412,7 @@ class View(Informed, Around, Views):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Fit(Clustered, Data):
+class Fit(Workers, Data):
     """Fit Gaussians to photographs with known cameras."""
 
     data: Path = option(
@@ -542,7 +542,7 @@ class Share(Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Select(Comparing, Clustered):
+class Select(ComparedViews, Workers):
     """Rank cameras by what their views would add to a run, or to a file of Gaussians."""
 
     candidates: str = option(
@@ -578,7 +578,7 @@ class Select(Comparing, Clustered):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Fisher(Comparing):
+class Fisher(ComparedViews):
     """Write the Fisher information of training views about every Gaussian, and maps of the remaining uncertainty."""
 
     cameras: str | None = option(
@@ -597,7 +597,7 @@ class Fisher(Comparing):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Query(Settings, Around, Views, Lenses):
+class Query(Settings, Orbits, Views, Lenses):
     """Find objects by text: write masks of views, and a PLY of the Gaussians of the objects, or of all others."""
 
     scene: Path = option(help="A run that was fitted with semantics, or a 3DGS PLY with features.", positional=True)
@@ -676,7 +676,7 @@ class Mesh(Settings, Views, Lenses):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Crossval(Seen):
+class Crossval(SampledViews):
     """Compare a rasterizer's image and gradients with a reference and name differences, by parameter group."""
 
     rasterizer: str = option(
@@ -698,7 +698,7 @@ class Crossval(Seen):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Tradeoff(Seen):
+class Tradeoff(SampledViews):
     """Measure time and errors (image, gradient, information) of every accuracy setting on a scene."""
 
     max_error: tuple[float, ...] = option(
@@ -788,7 +788,7 @@ class Sfm(Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Teach(Common, Timed):
+class Teach(Common, TimedData):
     """Add a teacher's feature maps, by a local CLIP model, and text embeddings to a data set."""
 
     data: Path = option(
@@ -860,7 +860,7 @@ class Scene(Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Reproduce(Clustered):
+class Reproduce(Workers):
     """Compare policies of view selection on synthetic scenes or on your data, as arXiv 2512.22771 does."""
 
     what: ExperimentName = option(

@@ -1,6 +1,6 @@
-"""Turntables: cameras that go around what there is to see, where the photographs say that one can stand.
+"""Orbits: cameras around the subject of the photographs, where these show that a camera can stand, or around Gaussians.
 
-Three kinds of capture, told apart by their cameras alone:
+Three kinds of capture, which are distinguished by their cameras alone:
 
 - The optical axes meet, or all cameras look the same way: frames go around the point looked at, on a full circle if
   the cameras surround it, else back and forth within the span that they cover.
@@ -24,10 +24,10 @@ from drgs.data.camera_layout import Focus, path, upright
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from drgs.commands.options import Around
+    from drgs.commands.options import Orbits
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["Wish", "capture_orbit", "dome", "scene_orbit"]
+__all__ = ["OrbitShape", "capture_orbit", "dome", "scene_orbit"]
 
 # Chosen, not tuned.
 _DEFAULT_ELEVATION = 20.0  # degrees above the center, from which tables and objects are usually seen
@@ -41,8 +41,8 @@ _SOLID_OPACITY = 0.05  # opacity below which a Gaussian is no part of the shape
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Wish:
-    """What a user fixes of an orbit; None leaves it to the cameras or the Gaussians.
+class OrbitShape:
+    """What of an orbit's shape is fixed; None leaves it to the cameras or the Gaussians.
 
     Attributes:
         up: (3,) world direction.
@@ -76,8 +76,8 @@ class Wish:
                 raise ValueError(f"{option} must be in [{low}, {high}] degrees, got {value}; correct it")
 
     @classmethod
-    def of(cls, args: Around) -> Wish:
-        """What `--orbit` of a command says.
+    def of(cls, args: Orbits) -> OrbitShape:
+        """The shape that `--orbit` of a command fixes.
 
         Raises:
             ValueError: If it names what there is not, or a value is out of range.
@@ -86,12 +86,18 @@ class Wish:
 
     @property
     def moves(self) -> bool:
-        """Whether it says where frames stand or what they look at, more than through which lens."""
+        """Whether it fixes where frames are or what they look at, and not only their lens."""
         return any(value is not None for value in (self.up, self.center, self.distance, self.elevation, self.span))
 
 
 def scene_orbit(
-    gaussians: Gaussians, frames: int, *, width: int, height: int, wish: Wish | None = None, returns: bool = False
+    gaussians: Gaussians,
+    frames: int,
+    *,
+    width: int,
+    height: int,
+    fixed: OrbitShape | None = None,
+    returns: bool = False,
 ) -> list[Camera]:
     """An orbit around the middle of the Gaussians, outliers aside, as close as all frames show them.
 
@@ -99,23 +105,23 @@ def scene_orbit(
         gaussians: Gaussians to turn around, at least one.
         frames: Number of cameras.
         width, height: Pixels.
-        wish: What is fixed; else up is -y, as COLMAP's worlds stand, the elevation 20 and the field of view 45 degrees.
+        fixed: What is fixed; else up is -y, as in COLMAP's worlds, the elevation 20 and the field of view 45 degrees.
         returns: Whether an orbit of less than a full circle goes back and forth; else evenly from end to end.
     Raises:
         ValueError: If there is no Gaussian.
     """
     if not len(gaussians):
         raise ValueError("orbit: there must be at least one Gaussian, got none; use --cameras")
-    wish = wish or Wish()
+    fixed = fixed or OrbitShape()
     center, offsets, reach = _shape(gaussians)
-    if wish.center is not None:
-        offsets = offsets + center - wish.center
-        center = np.asarray(wish.center, np.float64)
-    up = _unit(wish.up or UP["minus-y"])
-    elevation = _DEFAULT_ELEVATION if wish.elevation is None else wish.elevation
-    lens = _Lens(intrinsics_from_fov(wish.fov or _DEFAULT_FOV, width, height), width, height)
+    if fixed.center is not None:
+        offsets = offsets + center - fixed.center
+        center = np.asarray(fixed.center, np.float64)
+    up = _unit(fixed.up or UP["minus-y"])
+    elevation = _DEFAULT_ELEVATION if fixed.elevation is None else fixed.elevation
+    lens = _Lens(intrinsics_from_fov(fixed.fov or _DEFAULT_FOV, width, height), width, height)
     front = _level(np.eye(3)[np.argmin(np.abs(up))], up)  # any direction; this choice is stable
-    distance = wish.distance
+    distance = fixed.distance
     if distance is None:
         distance = 0.0
         for camera in _around(center, up, front, _turns(min(frames, 24), 360.0, False), 1.0, elevation, lens):
@@ -124,7 +130,7 @@ def scene_orbit(
             slope = 0.5 * np.array([width / lens.K[0, 0], height / lens.K[1, 1]]) / _MARGIN
             needed = ((np.abs(local[:, :2]) + reach[:, None]) / slope).max(axis=1) - local[:, 2]
             distance = max(distance, float(np.quantile(needed, _INSIDE_SHARE)))
-    turns = _turns(frames, 360.0 if wish.span is None else wish.span, returns)
+    turns = _turns(frames, 360.0 if fixed.span is None else fixed.span, returns)
     return _around(center, up, front, turns, distance, elevation, lens)
 
 
@@ -134,45 +140,45 @@ def capture_orbit(
     *,
     width: int,
     height: int,
-    wish: Wish | None = None,
+    fixed: OrbitShape | None = None,
     distance_of: Callable[[Camera], float | None] | None = None,
     returns: bool = False,
     beyond: bool = False,
 ) -> tuple[list[Camera], str]:
-    """Frames where the photographs were taken from: around what they look at, or along their path.
+    """Frames near where the photographs were taken: around what they look at, or along their path.
 
     Args:
         cameras: The photographs'.
         frames, width, height, returns: The same as in `scene_orbit`.
-        wish: What is fixed; else center, distance, elevation, up, span and lens are the photographs'.
+        fixed: What is fixed; else center, distance, elevation, up, span and lens are the photographs'.
         distance_of: How far away what a camera looks at is (`seen_distance`), or None if it sees nothing. Asked where
             the axes are parallel, so that they meet nowhere.
         beyond: Whether to go all the way round where the axes meet, past what the cameras cover, and to follow no path.
     Returns:
-        The cameras and what they do in words; none where the photographs say nothing (there are fewer than two, or
+        The cameras and what they do in words; none where the photographs determine none (there are fewer than two, or
         they look apart and lie apart, or `beyond` they look at no common point).
     Raises:
         ValueError: If something is fixed that needs a center, and the photographs look at no common point.
     """
-    wish = wish or Wish()
-    lens = _Lens.like(cameras, width, height, wish.fov) if cameras else None
-    focus = Focus.of(cameras, wish.center, distance_of)
+    fixed = fixed or OrbitShape()
+    lens = _Lens.like(cameras, width, height, fixed.fov) if cameras else None
+    focus = Focus.of(cameras, fixed.center, distance_of)
     if focus is None:
         poses = [] if beyond else path(cameras, frames)
-        if poses and wish.moves:
+        if poses and fixed.moves:
             raise ValueError(
                 "orbit: up, distance, elevation and span must have center=X,Y,Z in --orbit here, the photographs look "
                 "at no common point; add it, or drop them to follow the photographs' path"
             )
         made = [lens.camera(w2c, index) for index, w2c in enumerate(poses)]
         return made, f"along the path of the photographs, {frames} frames" if made else ""
-    up = _unit(wish.up) if wish.up is not None else upright(cameras)
+    up = _unit(fixed.up) if fixed.up is not None else upright(cameras)
     middle, span, distance, elevation = focus.stand(up)
     if beyond and focus.is_met:
         span = 360.0
-    span = span if wish.span is None else wish.span
-    distance = distance if wish.distance is None else wish.distance
-    elevation = np.clip(elevation, -_MOST_ELEVATION, _MOST_ELEVATION) if wish.elevation is None else wish.elevation
+    span = span if fixed.span is None else fixed.span
+    distance = distance if fixed.distance is None else fixed.distance
+    elevation = np.clip(elevation, -_MOST_ELEVATION, _MOST_ELEVATION) if fixed.elevation is None else fixed.elevation
     made = _around(focus.center, up, middle, _turns(frames, span, returns), distance, float(elevation), lens)
     kind = "circle" if span >= 360 else f"swing of {span:.0f} degrees"
     place = ", ".join(f"{x:.3g}" for x in focus.center)
@@ -204,7 +210,7 @@ def dome(circle: list[Camera], count: int) -> list[Camera]:
 
 
 def _shape(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The middle (3,) of what there is to see, the Gaussians' offsets (P,3) from it and their reach (P,)."""
+    """The middle (3,) of the Gaussians without outliers, their offsets (P,3) from it and their reach (P,)."""
     # Values, to place cameras by.
     means = gaussians.means.detach().cpu().numpy().astype(np.float64) + gaussians.origin
     sizes = gaussians.scales.detach().cpu().numpy().astype(np.float64).max(axis=1)
@@ -233,7 +239,7 @@ class _Lens:
 
     @classmethod
     def like(cls, cameras: list[Camera], width: int, height: int, fov: float | None) -> _Lens:
-        """Shows what the middle one of the photographs' lenses shows, and more where the shape differs."""
+        """A pinhole with the median field of view of the photographs, and more where the frame's shape differs."""
         if fov is None:
             wide = np.median([camera.width / camera.K[0, 0] for camera in cameras])
             high = np.median([camera.height / camera.K[1, 1] for camera in cameras])

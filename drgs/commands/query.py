@@ -11,10 +11,10 @@ import torch
 
 from drgs.cameras.sizes import at_most
 from drgs.codecs.ply import save_ply
-from drgs.commands.orbits import Wish
-from drgs.commands.painters import OPAQUE
+from drgs.commands.orbits import OrbitShape
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewpoints import check_lenses, seen_views
+from drgs.commands.semantic_pictures import OPAQUE
+from drgs.commands.viewpoints import check_lenses, views_to_sample
 from drgs.data.camera_lists import camera_to_json
 from drgs.data.checks import read_npy
 from drgs.display import pictures
@@ -39,7 +39,7 @@ __all__ = ["read_embeddings", "run"]
 
 def run(args: Query) -> None:
     """`drgs query SCENE`."""
-    Wish.of(args)  # refuses what cannot be, before anything is read, as settings do
+    OrbitShape.of(args)  # refuses what cannot be, before anything is read, as settings do
     settings = args.settings()
     if bool(args.classes) == (args.text_embedding is not None):
         got = "both" if args.classes else "neither"
@@ -58,7 +58,7 @@ def run(args: Query) -> None:
     kept = g.take(~selected if args.remove else selected)
     largest = float(score.max()) if len(g) else 0.0
     _refuse_nothing(len(g), count, largest, query, args.remove, _too_short(given))
-    cameras, source = seen_views(args, given, given.keeps_lenses(args.undistort))
+    cameras, source = views_to_sample(args, given, given.keeps_lenses(args.undistort))
     check_lenses("query", settings, cameras)
     pixels = args.max_pixels or (given.record.config.data.max_pixels if given.record else None)
     if pixels is not None:

@@ -35,10 +35,10 @@ from drgs.commands.films import (
     up_of,
     write_plys,
 )
-from drgs.commands.orbits import Wish
-from drgs.commands.painters import PAINTINGS, painters
+from drgs.commands.orbits import OrbitShape
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewpoints import captured_cameras, check_lenses, drawn_views
+from drgs.commands.semantic_pictures import PICTURE_KINDS, picture_functions
+from drgs.commands.viewpoints import captured_cameras, check_lenses, views_to_render
 from drgs.data.camera_layout import middle_camera
 from drgs.data.camera_lists import camera_to_json, save_cameras_json
 from drgs.display import pictures
@@ -53,7 +53,7 @@ from drgs.runtime import memory
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.commands.options import Render
-    from drgs.commands.painters import Painter
+    from drgs.commands.semantic_pictures import PictureFunction
     from drgs.ellipsoids import Gaussians, Scene
     from drgs.settings import RenderSettings
 
@@ -85,12 +85,12 @@ def run(args: Render) -> None:
     movie = "flight" if args.path is not None else "turntable" if views == "orbit" else "video"
     if single is not None:
         movie = single.stem
-    kinds = [kind for kind in PAINTINGS if getattr(args, kind)]
+    kinds = [kind for kind in PICTURE_KINDS if getattr(args, kind)]
     movies = [_movie_of(movie, kind, end) for end in _FILMS if end in formats for kind in ("", *kinds)]
     fixed = ["render.json", "cameras.json", *movies] if single is None else [single.name]
     output = lock_folder(args.output, "render", fixed, inputs=[args.scene, views, *([args.path] if args.path else [])])
     given = SceneInput.of(args)
-    paint = painters(kinds, given, args.scene)
+    paint = picture_functions(kinds, given, args.scene)
     gaussians = given.gaussians if paint else given.colors
     settings = given.over_background(settings)
     cameras, source = _cameras_of(args, views, film, given, settings)
@@ -127,7 +127,7 @@ def run(args: Render) -> None:
 
 def _check(args: Render, settings: RenderSettings, formats: tuple[str, ...]) -> None:
     """Raise ValueError for options that contradict each other, before anything is read."""
-    Wish.of(args)
+    OrbitShape.of(args)
     check_flight_options(args)
     if args.moving and "ply" not in formats:
         raise ValueError("render: --moving must have ply among --format, which only it means; add it or drop --moving")
@@ -188,12 +188,12 @@ def _cameras_of(
         shape = photographs[0].height / photographs[0].width if photographs else 0.75
         cameras, source = flight_cameras(args, film, given, shape)
     else:
-        cameras, source = drawn_views(args, views, given, film.frames, (args.width, args.height), returns=True)
+        cameras, source = views_to_render(args, views, given, film.frames, (args.width, args.height), returns=True)
         cameras = [middle_camera(cameras)] if _is_one_place(args) else named_view(cameras, args.view, source)
     placed = photographs or cameras
     cameras = at_times(cameras[: args.limit], args.time, film.frames, given, is_film=is_flight)
     if args.panorama:
-        up, across = up_of(placed, Wish.of(args).up), panorama_size(args)
+        up, across = up_of(placed, OrbitShape.of(args).up), panorama_size(args)
         cameras = [level_panorama(camera, up, *across) for camera in cameras]
     else:
         cameras = [_resized(camera, args.width, args.height) for camera in cameras]
@@ -216,7 +216,7 @@ def render_views(
     depth: bool = False,
     fps: float = 24.0,
     video: str = "video",
-    paint: Mapping[str, Painter] = types.MappingProxyType({}),
+    paint: Mapping[str, PictureFunction] = types.MappingProxyType({}),
     advance: Callable[[], None] | None = None,
 ) -> dict:
     """Render cameras to files, each of which appears once it is complete.

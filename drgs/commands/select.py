@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from drgs.commands.orbits import Wish
+from drgs.commands.orbits import OrbitShape
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewpoints import check_lenses, known_views, other_views, timed
+from drgs.commands.viewpoints import check_lenses, known_views, views_to_compare, with_times
 from drgs.data.camera_lists import camera_to_json
 from drgs.display import tables
 from drgs.display.progress import Bar
@@ -37,7 +37,7 @@ _SHORT = {
 
 def run(args: Select) -> None:
     """`drgs select SCENE --candidates ...`."""
-    Wish.of(args)  # refuses what cannot be, before anything is read, as settings do
+    OrbitShape.of(args)  # refuses what cannot be, before anything is read, as settings do
     settings = args.settings()
     refine = _refine(args)
     check_file(args.output, "select", [args.scene, args.train or "", args.candidates])
@@ -47,9 +47,9 @@ def run(args: Select) -> None:
     settings = given.over_background(settings)
     scoring = given.scoring(args.scoring, settings)
     known = known_views(args.train, args, given, given.keeps_lenses(args.undistort), args.info_pixels)
-    candidates, source = other_views("--candidates", args.candidates, args, given, known, fresh=True)
-    candidates = timed(candidates, args, given)
-    train = timed(known.cameras, args, given)
+    candidates, source = views_to_compare("--candidates", args.candidates, args, given, known, fresh=True)
+    candidates = with_times(candidates, args, given)
+    train = with_times(known.cameras, args, given)
     check_lenses("select", settings, [*train, *candidates])
     views = len(known.cameras) + len(candidates)
     with args.cluster() as workers, Bar("information", views, not args.quiet) as bar:

@@ -30,9 +30,9 @@ from typing import TYPE_CHECKING, Any
 
 from drgs import runtime
 from drgs.cameras.sizes import at_most
-from drgs.commands.orbits import Wish
+from drgs.commands.orbits import OrbitShape
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewpoints import seen_views
+from drgs.commands.viewpoints import views_to_sample
 from drgs.data.camera_lists import camera_to_json
 from drgs.display import tables
 from drgs.display.progress import Bar
@@ -67,14 +67,14 @@ def run(args: Tradeoff) -> None:
     if not args.max_error or not all(0 < x < math.inf for x in args.max_error):
         got = " ".join(f"{x:g}" for x in args.max_error) or "none"
         raise ValueError(f"--max-error must be finite numbers > 0, got {got}; correct it")
-    Wish.of(args)  # refuses what cannot be, before anything is read
+    OrbitShape.of(args)  # refuses what cannot be, before anything is read
     names = ["tradeoff.json", "tradeoff.md", "tradeoff.png"]
     lock_folder(args.output, "tradeoff", names, inputs=[args.scene, args.cameras or ""])
     given = SceneInput.of(args)
     gaussians, fields = given.colors, given.fields
     if not len(gaussians):
         raise ValueError(f"{args.scene}: must hold at least one Gaussian, holds none; give another scene")
-    cameras, source = seen_views(args, given)
+    cameras, source = views_to_sample(args, given)
     reduced = [at_most(camera, args.max_pixels) for camera in cameras]
     turns = (args.repeats + 1) * (1 + sum(x.by == "view" for x in TRADEOFF_VARIANTS))
     with Bar("tradeoff", turns, not args.quiet) as bar:

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.commands.orbits import Wish, capture_orbit, scene_orbit
-from drgs.commands.painters import PAINTINGS, painters
+from drgs.commands.orbits import OrbitShape, capture_orbit, scene_orbit
 from drgs.commands.scene_input import SELECTION, SceneInput, ranking_of
+from drgs.commands.semantic_pictures import PICTURE_KINDS, picture_functions
 from drgs.commands.values import UP
 from drgs.commands.viewpoints import Known, Source, known_views
 from drgs.data import View as DataView
@@ -36,7 +36,7 @@ from drgs.viewing.subject import FirstView, Subject
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.commands.options import View
-    from drgs.commands.painters import Painter
+    from drgs.commands.semantic_pictures import PictureFunction
     from drgs.viewing.server import Viewer
 
 __all__ = ["run", "subject_of", "watched_files"]
@@ -51,7 +51,7 @@ def run(args: View) -> None:
     if importlib.util.find_spec("viser") is None:
         raise ValueError("view: viser must be installed, is not; pip install 'drgs[view]'")
     args.settings()  # refuses what cannot be, before anything is read
-    Wish.of(args)
+    OrbitShape.of(args)
     from drgs.viewing.server import Viewer
 
     # A browser may be closed while something is on its way to it: that is no news.
@@ -174,17 +174,17 @@ def _times(given: SceneInput) -> tuple[float, ...]:
     return tuple(dict.fromkeys(float(x) for x in given.moving.field.grid.span))
 
 
-def _paint(args: View, given: SceneInput) -> dict[str, Painter]:
+def _paint(args: View, given: SceneInput) -> dict[str, PictureFunction]:
     """What draws features and labels, as far as there are any."""
-    painters_of_kinds: dict[str, Painter] = {}
+    functions: dict[str, PictureFunction] = {}
     if given.gaussians.features is None:
-        return painters_of_kinds
-    for kind in PAINTINGS:
+        return functions
+    for kind in PICTURE_KINDS:
         try:
-            painters_of_kinds |= painters([kind], given, args.scene)
+            functions |= picture_functions([kind], given, args.scene)
         except ValueError:  # no decoder, no classes: not offered
             continue
-    return painters_of_kinds
+    return functions
 
 
 def _known(args: View, given: SceneInput, notes: list[str]) -> Known | None:
@@ -244,14 +244,14 @@ def _first(args: View, gaussians: Gaussians, captured: list[Camera]) -> FirstVie
     """Where the photographs were taken, towards what they look at; of a bare PLY, so that all of it is seen."""
     if not len(gaussians):
         raise ValueError(f"{args.scene}: there must be at least one Gaussian, got none; fit longer, or name another")
-    wish = Wish.of(args)
+    fixed = OrbitShape.of(args)
     distance_of = seen_distance(gaussians)
     captured = sorted(captured, key=lambda camera: camera.name)  # an active run has them as they were picked
     width, height = _FIRST_SIZE
-    orbit, _ = capture_orbit(captured, 1, width=width, height=height, wish=wish, distance_of=distance_of)
-    camera = (orbit or captured[:1] or scene_orbit(gaussians, 1, width=width, height=height, wish=wish))[0]
-    up = np.array(wish.up or (upright(captured) if captured else UP["minus-y"]), np.float64)
-    focus = Focus.of(captured, wish.center, distance_of) if orbit else None
+    orbit, _ = capture_orbit(captured, 1, width=width, height=height, fixed=fixed, distance_of=distance_of)
+    camera = (orbit or captured[:1] or scene_orbit(gaussians, 1, width=width, height=height, fixed=fixed))[0]
+    up = np.array(fixed.up or (upright(captured) if captured else UP["minus-y"]), np.float64)
+    focus = Focus.of(captured, fixed.center, distance_of) if orbit else None
     pose = pose_of(camera, gaussians.origin)
     axis = camera.c2w[:3, 2]
     if focus is not None:

@@ -24,7 +24,7 @@ from drgs.cameras.sizes import at_most, resized_alike
 from drgs.codecs.folders import cameras_of_model
 from drgs.commands.nerfstudio_frame import DATAPARSER_TRANSFORMS
 from drgs.commands.options import SIDE
-from drgs.commands.orbits import Wish, capture_orbit, dome, scene_orbit
+from drgs.commands.orbits import OrbitShape, capture_orbit, dome, scene_orbit
 from drgs.commands.values import UP
 from drgs.data.camera_lists import is_camera_list, load_cameras_json
 from drgs.fitting.config import FitConfig
@@ -48,14 +48,14 @@ __all__ = [
     "Source",
     "captured_cameras",
     "check_lenses",
-    "drawn_views",
+    "views_to_render",
     "evenly",
     "frame_size",
     "held_out_views",
     "known_views",
-    "other_views",
-    "seen_views",
-    "timed",
+    "views_to_compare",
+    "views_to_sample",
+    "with_times",
 ]
 
 _DEFAULT_PIXELS = 130_000  # pixels of a view without a run, as `max_pixels` of a fit
@@ -68,13 +68,13 @@ _NOUNS = {"orbit": "an orbit", "dome": "a dome", "list": "a list of cameras"}
 
 @dataclasses.dataclass(frozen=True)
 class Source:
-    """What an option says about where views come from.
+    """Where views come from, as an option says it.
 
     Attributes:
         option: Name of the option, for messages.
         text: Value of the option.
         kind: `orbit`, `dome`, `list` (of cameras, in JSON), `run` or `data`.
-        given: What the command looks at: the record of a run is read once.
+        given: The command's scene, so that the record of its run is read once.
     """
 
     option: str
@@ -83,15 +83,15 @@ class Source:
     given: SceneInput | None = None
 
     @classmethod
-    def of(cls, option: str, text: str, made: tuple[str, ...] = (), given: SceneInput | None = None) -> Source:
+    def of(cls, option: str, text: str, generated: tuple[str, ...] = (), given: SceneInput | None = None) -> Source:
         """The meaning of a text.
 
         Args:
             option, text: Name and value of the option.
-            made: Those of `orbit` and `dome` that it may be.
-            given: What the command looks at.
+            generated: Those of `orbit` and `dome` that the option may be.
+            given: The command's scene.
         """
-        if text in made:
+        if text in generated:
             return cls(option, text, text)
         path = cameras_of_model(Path(text)) or Path(text)
         text = str(path)
@@ -99,7 +99,7 @@ class Source:
 
     @classmethod
     def known(cls, text: str | None, given: SceneInput) -> Source:
-        """What `--train` names, else the run that is looked at."""
+        """The views of `--train`, else those of the command's run."""
         return cls("--train", str(given.run.path), "run", given) if text is None else cls.of("--train", text, (), given)
 
     @functools.cached_property
@@ -128,7 +128,7 @@ class Source:
 
     def dataset(self, args: Views, given: SceneInput, lazy: bool = True) -> Dataset:
         """The data set, or that of a run, without points, maps and labels; of videos, the frames and test cameras that
-        `args` names, else those of the run that is named, else of the run that is looked at.
+        `args` names, else those of the run that is named, else of the command's run.
 
         Raises:
             FileNotFoundError, ValueError: If there is none, or a run's is no longer where it was.
@@ -152,8 +152,8 @@ class Source:
         return record.with_refined_poses(dataset)
 
     def split(self, dataset: Dataset, part: str, given: SceneInput) -> list[View]:
-        """The views of `--split`, by the rule of the run that is named, else of the run that is looked at, else of
-        every 8th view.
+        """The views of `--split`, by the rule of the run that is named, else of the command's run, else every
+        8th view.
 
         Raises:
             ValueError: If there is none.
@@ -168,10 +168,10 @@ class Source:
         return views
 
 
-# ------------------------------------------------------------------------------- views that are drawn
+# ------------------------------------------------------------------------------- views that are rendered
 
 
-def drawn_views(
+def views_to_render(
     args: Render | Crossval | Query | Tradeoff,
     text: str,
     given: SceneInput,
@@ -184,7 +184,7 @@ def drawn_views(
     Args:
         args: Options of the command, of which `split` and those of orbits apply.
         text: What `--cameras` says.
-        given: What an orbit goes around, like the photographs of the run if it is one.
+        given: The command's scene, around which an orbit goes, like the photographs of its run if there is one.
         frames, size: Number of views of an orbit and their (width, height); where one is None, 640 wide and of the
             photographs' shape, else 4:3.
         returns: Whether an orbit that is no full circle goes back and forth.
@@ -195,48 +195,50 @@ def drawn_views(
     source = Source.of("--cameras", text, ("orbit",), given)
     source.check_split(args.split)
     if source.kind == "orbit":
-        return _drawn_orbit(args, given, frames, size, returns)
+        return _orbit_to_render(args, given, frames, size, returns)
     if source.kind == "list":
         return source.listed(), str(Path(text))
     views = source.split(source.dataset(args, given, lazy=False), args.split, given)
-    return [_named(view) for view in views], f"{Path(text)} ({args.split})"
+    return [_with_name(view) for view in views], f"{Path(text)} ({args.split})"
 
 
-def seen_views(args: Crossval | Query | Tradeoff, given: SceneInput, lenses: bool = False) -> tuple[list[Camera], str]:
-    """At most `--limit` cameras of `--cameras`, as large as they are drawn; and where they come from in words.
+def views_to_sample(
+    args: Crossval | Query | Tradeoff, given: SceneInput, lenses: bool = False
+) -> tuple[list[Camera], str]:
+    """At most `--limit` cameras of `--cameras`, at the size that is rendered; and where they come from, in words.
 
     Args:
         args: Options of the command.
-        given: What it looks at.
+        given: The command's scene.
         lenses: Cameras keep their lenses; else all are pinholes.
     Raises:
-        FileNotFoundError, ValueError: As `drawn_views`.
+        FileNotFoundError, ValueError: As `views_to_render`.
     """
     text = args.cameras or ("orbit" if given.run is None else str(given.run.path))
-    cameras, source = drawn_views(args, text, given, args.limit)
-    return [_seen(camera, lenses) for camera in evenly(cameras, args.limit)], source
+    cameras, source = views_to_render(args, text, given, args.limit)
+    return [_with_lens(camera, lenses) for camera in evenly(cameras, args.limit)], source
 
 
-def _drawn_orbit(
+def _orbit_to_render(
     args: Render | Crossval | Query | Tradeoff,
     given: SceneInput,
     frames: int,
     size: tuple[int | None, int | None],
     returns: bool,
 ) -> tuple[list[Camera], str]:
-    """An orbit as the photographs of the run were taken, else around the Gaussians; and what it does in words."""
+    """An orbit like the photographs of the run were taken, else around the Gaussians; and its description."""
     captured = captured_cameras(given)
     shape = captured[0].height / captured[0].width if captured else 0.75
     width, height = frame_size(*size, shape)
-    wish = Wish.of(args)
-    how = {"width": width, "height": height, "wish": wish, "returns": returns}
+    fixed = OrbitShape.of(args)
+    how = {"width": width, "height": height, "fixed": fixed, "returns": returns}
     cameras, source = capture_orbit(captured, frames, distance_of=seen_distance(given.gaussians), **how)
     if cameras:
         _say(args, source)
         return cameras, source
-    if wish.up is None:
+    if fixed.up is None:
         _say(args, "orbit with minus-y up, as COLMAP's worlds stand; turn it with --orbit up=z")
-    up = next(name for name, direction in UP.items() if direction == (wish.up or UP["minus-y"]))
+    up = next(name for name, direction in UP.items() if direction == (fixed.up or UP["minus-y"]))
     return scene_orbit(given.gaussians, frames, **how), f"orbit, up {up}"
 
 
@@ -265,12 +267,12 @@ def frame_size(width: int | None, height: int | None, shape: float) -> tuple[int
 
 @dataclasses.dataclass(frozen=True)
 class Known:
-    """Views that count as known.
+    """Views whose information is known already.
 
     Attributes:
         cameras: Reduced; pinholes, unless lenses are kept.
-        source: Words that say where they come from.
-        pixels: These views, and those that are compared with them, are reduced to at most so many.
+        source: Where they come from, in words.
+        pixels: Largest number of pixels of these views and of those that are compared with them.
         data: The data set that they are of, or None.
         sizes: Stated size -> size of the image file, as far as known.
         lenses: Cameras that are compared with them keep their lenses as these do.
@@ -292,9 +294,9 @@ def known_views(
     Args:
         text: A data set (all its views), a run (those it was fitted to), a cameras.json, or None.
         args: How data sets are read.
-        given: What the command looks at, whose run is taken where `text` is None.
+        given: The command's scene, whose run is taken where `text` is None.
         lenses: Cameras keep their lenses, these and those that are compared with them.
-        pixels: They are reduced to at most so many; None: to those of the fit.
+        pixels: Largest number of pixels of a view; None: that of the fit.
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If a file of Gaussians comes without `--train`, or a run's data set no longer has its views.
@@ -305,17 +307,17 @@ def known_views(
         )
     known = _known_views(text, args, given, lenses, pixels)
     if text is not None:
-        _check_seen(given.gaussians, known.cameras)
+        _warn_of_unseen(given.gaussians, known.cameras)
     return known
 
 
 def _known_views(text: str | None, args: Views, given: SceneInput, lenses: bool, pixels: int | None) -> Known:
-    """The views of `known_views`, whatever they show."""
+    """The views of `known_views`; not checked for whether they show the scene."""
     source = Source.known(text, given)
     pixels = pixels or (_DEFAULT_PIXELS if given.record is None else given.record.config.data.max_pixels)
     where = str(Path(source.text))
     if source.kind == "list":
-        cameras = [at_most(_seen(camera, lenses), pixels) for camera in source.listed()]
+        cameras = [at_most(_with_lens(camera, lenses), pixels) for camera in source.listed()]
         return Known(cameras, where, pixels, lenses=lenses)
     views = source.dataset(args, given).views
     if source.kind == "data":
@@ -341,7 +343,7 @@ def held_out_views(args: Views, given: SceneInput, known: Known) -> list[Camera]
 
     Args:
         args: How data sets are read.
-        given: What is looked at: a run.
+        given: The command's scene, a run.
         known: The views that it was fitted to.
     Raises:
         FileNotFoundError, ValueError: If its data set has gone, or there is none.
@@ -352,8 +354,8 @@ def held_out_views(args: Views, given: SceneInput, known: Known) -> list[Camera]
     return [_camera(view, known.sizes, known.pixels, known.lenses) for view in views]
 
 
-def _check_seen(gaussians: Gaussians, cameras: list[Camera]) -> None:
-    """Say so if most of the cameras have no Gaussian's center before them: a file may be in another frame than they."""
+def _warn_of_unseen(gaussians: Gaussians, cameras: list[Camera]) -> None:
+    """Warn if most of the cameras see no Gaussian's center: the file may be in another coordinate frame."""
     means = gaussians.means[:: max(1, len(gaussians) // _CHECKED_GAUSSIANS)].detach().cpu().numpy() + gaussians.origin
     looked = evenly(cameras, _CHECKED_CAMERAS)
     blind = sum(not camera.contains(camera.project(means)[0]).any() for camera in looked)
@@ -367,16 +369,16 @@ def _check_seen(gaussians: Gaussians, cameras: list[Camera]) -> None:
         )
 
 
-def other_views(
+def views_to_compare(
     option: str, text: str, args: Select | Fisher, given: SceneInput, known: Known, fresh: bool
 ) -> tuple[list[Camera], str]:
-    """Cameras to be compared with known views, reduced alike, and where they come from in words.
+    """Cameras to be compared with known views, reduced like these, and where they come from, in words.
 
     Args:
         option: Name of the option, for messages.
         text: Value of the option.
         args: Options of the command, of which `split`, `count` and those of orbits apply.
-        given: What is turned around.
+        given: The command's scene.
         known: Views that are left out if `fresh`; the first one's lens serves orbits and domes.
         fresh: Leave out known views of the same data set.
     Raises:
@@ -386,15 +388,15 @@ def other_views(
     source = Source.of(option, text, ("orbit", "dome"), given)
     source.check_split(args.split)
     if source.kind == "orbit":
-        return _compared_orbit(Wish.of(args), given, known, args.count), f"orbit of {args.count}"
+        return _compared_orbit(OrbitShape.of(args), given, known, args.count), f"orbit of {args.count}"
     if source.kind == "dome":
-        wish = Wish.of(args)
-        if wish.span is not None:
+        fixed = OrbitShape.of(args)
+        if fixed.span is not None:
             raise ValueError(f"--orbit span must have {option} orbit, a dome goes all the way round; drop it")
-        circle = dataclasses.replace(wish, elevation=0.0, span=360.0)
+        circle = dataclasses.replace(fixed, elevation=0.0, span=360.0)
         return dome(_compared_orbit(circle, given, known, 24), args.count), f"dome of {args.count}"
     if source.kind == "list":
-        return [at_most(_seen(camera, known.lenses), known.pixels) for camera in source.listed()], text
+        return [at_most(_with_lens(camera, known.lenses), known.pixels) for camera in source.listed()], text
     views = source.split(source.dataset(args, given), args.split, given)
     same = (source.record.data if source.kind == "run" else Path(text)).resolve() == known.data
     used = {camera.name for camera in known.cameras} if same and fresh else set()
@@ -408,7 +410,7 @@ def other_views(
     return [_camera(view, sizes, known.pixels, known.lenses) for view in left], f"{text} ({args.split})"
 
 
-def timed(cameras: list[Camera], args: Select | Fisher, given: SceneInput) -> list[Camera]:
+def with_times(cameras: list[Camera], args: Select | Fisher, given: SceneInput) -> list[Camera]:
     """Cameras with the time of `--time` where they state none, if the scene moves.
 
     Raises:
@@ -426,14 +428,14 @@ def timed(cameras: list[Camera], args: Select | Fisher, given: SceneInput) -> li
     return found
 
 
-def _compared_orbit(wish: Wish, given: SceneInput, known: Known, count: int) -> list[Camera]:
-    """Around what the known views look at, else around the Gaussians, with the first known view's lens.
+def _compared_orbit(fixed: OrbitShape, given: SceneInput, known: Known, count: int) -> list[Camera]:
+    """An orbit around what the known views look at, else around the Gaussians, with the first known view's lens.
 
-    All the way round: what known views do not cover is what candidates are for.
+    It is a full circle, as candidates are to cover what known views do not.
     """
     lens = known.cameras[0]
     fov = min(2 * math.degrees(math.atan(0.5 * lens.width / lens.K[0, 0])), 170.0)
-    how = {"width": lens.width, "height": lens.height, "wish": dataclasses.replace(wish, fov=fov)}
+    how = {"width": lens.width, "height": lens.height, "fixed": dataclasses.replace(fixed, fov=fov)}
     walked = sorted(known.cameras, key=lambda camera: camera.name)  # an active run has them as they were picked
     cameras, _ = capture_orbit(walked, count, distance_of=seen_distance(given.gaussians), beyond=True, **how)
     if not cameras:
@@ -444,15 +446,15 @@ def _compared_orbit(wish: Wish, given: SceneInput, known: Known, count: int) -> 
 
 def _camera(view: View, sizes: dict[tuple[int, int], tuple[int, int]], pixels: int, lenses: bool) -> Camera:
     """A view's camera: of the size that its image probably has, then reduced; a pinhole unless lenses are kept."""
-    return at_most(resized_alike(_seen(_named(view), lenses), sizes), pixels)
+    return at_most(resized_alike(_with_lens(_with_name(view), lenses), sizes), pixels)
 
 
-def _seen(camera: Camera, lenses: bool) -> Camera:
-    """The camera that is looked through: itself where lenses are kept, else the pinhole in its place."""
+def _with_lens(camera: Camera, lenses: bool) -> Camera:
+    """The camera itself where lenses are kept, else the pinhole in its place."""
     return camera if lenses else camera.undistorted()
 
 
-def _named(view: View) -> Camera:
+def _with_name(view: View) -> Camera:
     """A view's camera under the view's name."""
     return view.camera if view.camera.name == view.name else dataclasses.replace(view.camera, name=view.name)
 
@@ -468,7 +470,7 @@ def evenly(views: list, limit: int) -> list:
 
 
 def check_lenses(command: str, settings: RenderSettings, cameras: Iterable[Camera]) -> None:
-    """Raise ValueError if settings that draw pinholes alone meet a camera with a lens."""
+    """Raise ValueError if a camera has a lens and the settings render pinholes alone."""
     bent = sum(camera.is_distorted for camera in cameras) if settings.planar else 0
     if bent:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Pictures of what Gaussians mean, of one rendered view: their features, their labels, and labels over the colors."""
+"""Pictures of the semantics of one rendered view: features, labels, and labels over the colors."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ if TYPE_CHECKING:
 
     from drgs.integrator import Output
 
-__all__ = ["OPAQUE", "PAINTINGS", "Painter", "painters"]
+__all__ = ["OPAQUE", "PICTURE_KINDS", "PictureFunction", "picture_functions"]
 
-PAINTINGS = ("features", "labels", "overlay")
+PICTURE_KINDS = ("features", "labels", "overlay")
 OPAQUE = 0.5
-"""A pixel is something where at least this much of the light stops."""
+"""Opacity from which on a pixel has a label: more of it is Gaussians than background."""
 
-Painter = Callable[["Output"], np.ndarray]
-"""From what `drgs.render` gives, features included, to (H, W, 3) uint8."""
+PictureFunction = Callable[["Output"], np.ndarray]
+"""Output of `drgs.render`, features included -> (H, W, 3) uint8."""
 
 
-def painters(kinds: Iterable[str], given: SceneInput, scene: Path) -> dict[str, Painter]:
-    """What draws each kind of picture.
+def picture_functions(kinds: Iterable[str], given: SceneInput, scene: Path) -> dict[str, PictureFunction]:
+    """The function that makes each kind of picture.
 
     Args:
-        kinds: Names in `PAINTINGS`.
+        kinds: Names in `PICTURE_KINDS`.
         given: The Gaussians, with the decoder and the classes of their run.
         scene: The file or run that they are from, for messages.
     Raises:
@@ -50,7 +50,7 @@ def painters(kinds: Iterable[str], given: SceneInput, scene: Path) -> dict[str, 
     from drgs.features.segmentation import classify
     from drgs.fitting.segments import feature_colors
 
-    made: dict[str, Painter] = {}
+    made: dict[str, PictureFunction] = {}
     if "features" in kinds:
         colors = feature_colors(given.gaussians, decoder)
         made["features"] = lambda out: colors.picture(_shown(out), decoder)
