@@ -84,7 +84,7 @@ _LOG_EVERY = 20  # steps whose loss and PSNR are averaged in one event of the lo
 
 @dataclasses.dataclass(frozen=True)
 class FitResult:
-    """What `fit` leaves behind.
+    """Result of `fit`.
 
     Attributes:
         gaussians: The Gaussians, also in `run.point_cloud`; those of a scene that moves are at rest.
@@ -165,8 +165,8 @@ def _prepared(
     pace: Pace | None,
     begin: Path | None,
 ) -> tuple[Setup, ActiveViews | None]:
-    """What is known of a fit before photographs are decoded, and its views if they are chosen on the way; refuses what
-    does not go together.
+    """The setup of a fit before photographs are decoded, and the plan of an active fit; raises where options contradict
+    each other.
     """
     train, test = dataset.split(config.data.test_every, config.data.test_offset, config.data.test_cameras)
     if train:
@@ -177,8 +177,8 @@ def _prepared(
     if selection and (other := next((name for name in ("begin", "pace") if given[name] is not None), None)):
         raise ValueError(f"fit: {other} must be None where views are chosen on the way; leave it out")
     times = fitted_times(config, train, test)
-    ways = frozenset(name for name, value in given.items() if value is not None)
-    setup = Setup(dataset, config, train, test, train, times, components_of(components), ways)
+    modes = frozenset(name for name, value in given.items() if value is not None)
+    setup = Setup(dataset, config, train, test, train, times, components_of(components), modes)
     check_conflicts(setup)
     plan = ActiveViews(train, config, bool(times), workers) if selection else None
     if selection and selection.measure and not test:
@@ -270,7 +270,7 @@ def _finished(loop: _Loop) -> FitResult:
 
 
 def _checkpoint(run: Run, plan: ActiveViews | None) -> tuple[dict[str, torch.Tensor], dict] | tuple[None, None]:
-    """The last checkpoint of the same fit, if there is one; the plan goes on from the views that it has."""
+    """The last checkpoint of the same fit, if there is one; the plan continues with its views."""
     tensors, header = last_checkpoint(run)
     if tensors is None or header is None:
         return None, None
@@ -287,7 +287,7 @@ def _checkpoint(run: Run, plan: ActiveViews | None) -> tuple[dict[str, torch.Ten
 
 
 def _check_pictures(run: Run, setup: Setup, trainer: Trainer) -> None:
-    """Refuse, before the first step, a folder where pictures that drgs did not draw are in the way."""
+    """Raise ValueError, before the first step, if pictures would replace files that drgs did not write."""
     steps = trainer.config.max_steps
     every = _preview_every(steps)
     names = [_preview_name(step) for step in range(every, steps + 1, every)]

@@ -165,7 +165,7 @@ def test_photographs_look_as_before_when_another_joins(uneven):
     def shown(frame):
         with torch.no_grad():
             out = drgs.render(trainer.gaussians(), frame.camera, FAST)
-            return trainer.shown(out, frame).rgb
+            return trainer.as_photograph(out, frame).rgb
 
     before = [shown(frame) for frame in frames]
     new = dataclasses.replace(frames[0], name="new")

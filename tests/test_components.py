@@ -145,7 +145,7 @@ class Corrected(Component):
     def __init__(self) -> None:
         self.networks = [Network("affine", Affine(), lambda part: 1e-2 * (1 - part))]
 
-    def shown(self, out, frame):
+    def as_photograph(self, out, frame):
         return dataclasses.replace(out, rgb=self.networks[0].module(out.rgb))
 
 

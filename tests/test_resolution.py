@@ -85,7 +85,7 @@ def test_means_are_kept(rng, size):
     the types stay."""
     mask = torch.from_numpy((rng.random(size[::-1]) > 0.3).astype(np.float32))
     frame = photograph(*size, rng, mask=mask, is_object=True, alpha=mask)
-    small = Resolution(2, 12).seen(0, frame, 0)
+    small = Resolution(2, 12).resized(0, frame, 0)
     assert small.pixels.shape == (size[1] // 4, size[0] // 4, 3)
     assert torch.allclose(small.pixels.mean((0, 1)), frame.pixels.mean((0, 1)), rtol=0, atol=2e-6)
     assert float(small.mask.mean()) == pytest.approx(float(mask.mean()), abs=2e-6)
@@ -93,7 +93,7 @@ def test_means_are_kept(rng, size):
     assert 0 <= float(small.mask.min()) < float(small.mask.max()) <= 1
     assert small.is_object
     eight = dataclasses.replace(frame, pixels=(frame.pixels * 255).round().to(torch.uint8))
-    bytes_seen = Resolution(2, 12).seen(0, eight, 0)
+    bytes_seen = Resolution(2, 12).resized(0, eight, 0)
     assert bytes_seen.pixels.dtype == torch.uint8
     assert torch.allclose(bytes_seen.image(), small.pixels, rtol=0, atol=1.01 / 255)
     assert torch.allclose(bytes_seen.image().mean((0, 1)), small.pixels.mean((0, 1)), rtol=0, atol=0.5 / 255)
@@ -105,7 +105,7 @@ def test_the_camera_shows_the_same_at_the_same_place(rng):
     points = rng.normal(size=(50, 3))
     before, depth = frame.camera.project(points)
     for step in (0, 3):
-        camera = Resolution(2, 12).seen(0, frame, step).camera
+        camera = Resolution(2, 12).resized(0, frame, step).camera
         after, same = camera.project(points)
         assert np.allclose(after / (camera.width, camera.height), before / (101, 75), rtol=1e-12, atol=1e-12)
         assert np.array_equal(same, depth)
@@ -116,24 +116,24 @@ def test_a_pixel_is_transient_where_any_of_its_own_is(rng):
     transient = torch.zeros(64, 96, dtype=torch.bool)
     transient[7, 12] = True
     schedule, frame = Resolution(1, 12), photograph(96, 64, rng, transient=transient)
-    assert schedule.seen(0, frame, 0).transient.nonzero().tolist() == [[3, 6]]
+    assert schedule.resized(0, frame, 0).transient.nonzero().tolist() == [[3, 6]]
     frame.transient = ~transient
-    assert schedule.seen(0, frame, 1).transient.all()
+    assert schedule.resized(0, frame, 1).transient.all()
     frame.transient = None
-    assert schedule.seen(0, frame, 2).transient is None
+    assert schedule.resized(0, frame, 2).transient is None
 
 
 def test_pictures_are_made_once_a_size_and_then_dropped(rng):
     """The same tensor at every visit; none of a size that is over, and at its own size the photograph itself."""
     schedule, frames = Resolution(2, 12), [photograph(96, 64, rng) for _ in range(3)]
-    first = [schedule.seen(i, frame, 0).pixels for i, frame in enumerate(frames)]
-    assert all(schedule.seen(i, frame, 2).pixels is first[i] for i, frame in enumerate(frames))
+    first = [schedule.resized(i, frame, 0).pixels for i, frame in enumerate(frames)]
+    assert all(schedule.resized(i, frame, 2).pixels is first[i] for i, frame in enumerate(frames))
     assert not torch.equal(first[0], first[1])
-    assert schedule.seen(1, frames[1], 3).pixels.shape == (32, 48, 3)
+    assert schedule.resized(1, frames[1], 3).pixels.shape == (32, 48, 3)
     assert list(schedule._kept) == [1]
-    assert schedule.seen(1, frames[1], 6) is frames[1]
+    assert schedule.resized(1, frames[1], 6) is frames[1]
     assert not schedule._kept
-    assert Resolution(0, 12).seen(0, frames[0], 0) is frames[0]
+    assert Resolution(0, 12).resized(0, frames[0], 0) is frames[0]
 
 
 def test_steps_alone_see_small_pictures(dataset, tmp_path, seen):  # noqa: F811

@@ -95,7 +95,7 @@ def test_kinds_of_sources(place):
     """A word is an orbit or a dome only where the option makes them; a list of cameras is told by what is in it."""
     kinds = {"run": "run", "data": "data", "list.json": "list", "data/transforms.json": "data", "gone": "data"}
     for text, kind in kinds.items():
-        assert Source.of("--cameras", str(place / text), made=("orbit",)).kind == kind
+        assert Source.of("--cameras", str(place / text), generated=("orbit",)).kind == kind
     assert [Source.of("--cameras", "dome", made=made).kind for made in ((), ("orbit",), ("dome",))] == [
         "data",
         "data",
@@ -108,7 +108,7 @@ def test_only_data_sets_have_a_split(place, kind):
     """One message, whatever the command."""
     text = str(place / kind) if "." in kind else kind
     for option in ("--cameras", "--candidates"):
-        source = Source.of(option, text, made=("orbit", "dome"))
+        source = Source.of(option, text, generated=("orbit", "dome"))
         source.check_split("all")
         with pytest.raises(ValueError, match=f"^--split test must have {option} DATA, an? .* has no split; drop it$"):
             source.check_split("test")

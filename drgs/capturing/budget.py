@@ -1,4 +1,4 @@
-"""What a budget of time is spent on: sizes and steps, from measurements on this machine before anything long begins.
+"""Sizes and steps that a budget of time allows, from short measurements on this machine.
 
 Poses are planned first: features of two of the photographs are found and matched, and from what that takes follows how
 large photographs may be looked at. What is left belongs to the fit: some steps of it are timed, in growing sizes, with
@@ -50,7 +50,7 @@ __all__ = [
 ]
 
 FEWEST_STEPS = 100
-"""Steps that a fit has, however little time is left: with fewer there is nothing to look at."""
+"""Least number of steps of a fit, however little time is left: fewer give no usable picture. Chosen."""
 
 # How the number of steps follows the clock (`Pacer`).
 _STEPS_BETWEEN_LOOKS = 20  # steps between two looks at the clock: often enough to end within a few seconds
@@ -103,7 +103,7 @@ _SIZES = (  # each takes about three times as long as the one before
 
 @dataclasses.dataclass(frozen=True)
 class PosePlan:
-    """How large photographs are looked at for their poses.
+    """Size of the photographs for structure from motion.
 
     Attributes:
         max_image_size: Pixels of the longer side.
@@ -141,7 +141,7 @@ class FitPlan:
         )
 
     def line(self, left: float, used: float) -> str:
-        """The plan in words, and what it takes where the budget is not enough for it.
+        """The plan in one line, with the seconds that it needs where the budget is too small.
 
         Args:
             left, used: Seconds of the budget that are left, less than 0 where it is used up, and that have been used.
@@ -158,7 +158,7 @@ class FitPlan:
 
 
 class Pacer:
-    """How many steps a fit is to have so that the last one is done in time; what `drgs.train.fit` takes as `pace`.
+    """Number of steps with which a fit ends in time; the argument `pace` of `drgs.train.fit`.
 
     While Gaussians still grow in number, later steps take longer than those seen so far: steps are only taken away
     then, where even these are too slow. After that their number follows the clock in both directions, up to 4 times
@@ -167,7 +167,7 @@ class Pacer:
     Args:
         end: Time at which the last step is to be done, as `clock` counts.
         planned: Steps that were planned.
-        clock: Seconds of a clock that never goes back.
+        clock: Seconds of a monotonic clock.
     """
 
     def __init__(self, end: float, planned: int, clock: Callable[[], float] = time.monotonic) -> None:
@@ -219,7 +219,7 @@ def seconds_of_budget(text: str) -> float:
 def plan_poses(
     folder: Path, names: Sequence[str], budget: float, decode: Callable[[Path], np.ndarray] = read_image
 ) -> PosePlan:
-    """How large photographs may be looked at, from what two of them take.
+    """Size of the photographs for structure from motion, from the seconds that two of them take.
 
     Args:
         folder, names: The photographs, at least two.
@@ -278,7 +278,7 @@ def _timed_pair(images: Sequence[np.ndarray]) -> tuple[float, float]:
 
 
 def planned_poses(plan: PosePlan, count: int, left: float, budget: float) -> str:
-    """The plan in words, and what it takes where the budget is not enough for it.
+    """The plan in one line, with the seconds that it needs where the budget is too small.
 
     Args:
         plan: How large photographs are looked at.
@@ -365,7 +365,7 @@ class Stopwatch:
     """Times steps of a fit on this machine."""
 
     def now(self) -> float:
-        """Seconds of a clock that never goes back."""
+        """Seconds of a monotonic clock."""
         return time.monotonic()
 
     def step(self, train: list[View], dataset: Dataset, config: FitConfig, is_first: bool) -> float:
@@ -400,7 +400,7 @@ def _seconds_a_step(train: list[View], dataset: Dataset, config: FitConfig, is_f
 
 @contextlib.contextmanager
 def _unlogged() -> Iterator[None]:
-    """Keep what a fit says at its start off the terminal: this one is no fit to hear of."""
+    """Hide the log lines of a fit that is only timed."""
     log = logging.getLogger("drgs.train")
     level = log.level
     log.setLevel(logging.WARNING)

@@ -38,7 +38,7 @@ _KEPT_SHARE = 1 / 8  # of the memory that is free: the fit needs the rest
 
 @dataclasses.dataclass(frozen=True)
 class CaptureOptions:
-    """What a capture is asked for; `drgs capture` has the options of these names.
+    """Options of a capture; `drgs capture` has them under these names.
 
     Attributes:
         paths: Photographs, videos, folders of both, or one data set with poses; none to go on with those before.
@@ -89,7 +89,7 @@ class Clock:
 
 
 class Photographs:
-    """Decoded photographs, each decoded once as long as there is room for it; not to be written to."""
+    """Cache of decoded photographs, bounded in bytes; read-only."""
 
     def __init__(self) -> None:
         free = memory.available()
@@ -168,7 +168,7 @@ class Capture:
 
     @property
     def is_added(self) -> bool:
-        """Whether they join others."""
+        """Whether these photographs are added to those of an earlier batch."""
         return len(self.record.batches) > 1
 
     @property
@@ -179,27 +179,27 @@ class Capture:
         return self._dataset
 
     def poses_changed(self) -> None:
-        """The files of the data set are others than they were."""
+        """Forget the data set, whose files have changed."""
         self._dataset = None
 
     def refined_dataset(self) -> Dataset:
-        """The data set with the poses that the fit has found, beside `dataset`, which stays as it is."""
+        """A copy of `dataset` with the poses as the fit has refined them."""
         views = [dataclasses.replace(view) for view in self.dataset.views]
         return fit_record(self.run).with_refined_poses(dataclasses.replace(self.dataset, views=views))
 
     def plan(self, step: str, plan: Any) -> None:
-        """Record what a step is planned to spend."""
+        """Record the plan of a step."""
         self.batch.plan[step] = dataclasses.asdict(plan)
         self.record.write()
 
     def _sharing(self, dataset: Dataset) -> Dataset:
-        """A data set whose views keep what they decode for the next one who asks."""
+        """A data set whose views share the cache of decoded photographs."""
         for view in dataset.views:
             view.decode = self.photographs.decode
         return dataset
 
     def _config_of_run(self) -> FitConfig | None:
-        """How the run in the folder is fitted, or was when further photographs joined; None where there is none."""
+        """Configuration of the run in the folder, or when further photographs were added; None without a run."""
         if is_run(self.options.output):
             return config_of(self.run)
         before = self.batch.plan.get("before")

@@ -1,4 +1,4 @@
-"""What photographs, poses and held-out views say about a shoot, and what to do at the next one.
+"""Problems of a shoot that photographs, poses and held-out views show, and advice for the next one.
 
 Every rule compares photographs with those next to them by name, which is the order in which a phone takes them: how
 sharp, how far apart, how much turned. Lengths are in units of the median distance of what a photograph shows, since
@@ -268,7 +268,7 @@ def of_views(dataset: Dataset, train: Sequence[str], psnr: Mapping[str, float]) 
 
 
 def _apart(view: View, others: Sequence[View]) -> float:
-    """How far the nearest of other cameras is: degrees between axes, and distance in those of their spread."""
+    """Distance of the nearest other camera: degrees between axes, and distance in units of their spread."""
     if not others:
         return 0.0
     centers = np.stack([other.camera.center for other in others])

@@ -37,7 +37,7 @@ _REPORT_SHARE = 0.1  # of the time left, for held-out views and pages, where no 
 
 
 def fit_photographs(capture: Capture) -> Outcome:
-    """Gaussians: new ones, or, of photographs that join others, those that there are and more.
+    """Fit Gaussians: new ones or, when photographs were added, those of the run and more.
 
     Raises:
         ValueError: If there is nothing that the fit could begin with.
@@ -76,7 +76,7 @@ def fit_photographs(capture: Capture) -> Outcome:
 def _within_budget(
     capture: Capture, config: FitConfig, end: float, resume: bool, begins: bool
 ) -> tuple[FitConfig, Pacer]:
-    """The configuration with sizes that the time allows, and what keeps the fit within it."""
+    """The configuration with sizes that the time allows, and the pacer that ends the fit in time."""
     clock, plan = capture.clock, None
     if not resume:
         plan = plan_fit(capture.dataset, config, clock.left, config.density.max_gaussians if begins else 1)
@@ -102,7 +102,7 @@ def _quality(capture: Capture, result: FitResult, max_pixels: int) -> str:
 
 
 def _make_room(capture: Capture) -> Path:
-    """The checkpoint of the fit so far, beside the run, whose files give way to those of the next fit."""
+    """Move the checkpoint out of the run's files, which the next fit replaces; returns its path."""
     kept, batch, run = capture.folder / _BEFORE, capture.batch, capture.run
     if not batch.handover:
         tensors, header = last_checkpoint(run)
@@ -123,7 +123,7 @@ def _make_room(capture: Capture) -> Path:
 
 
 def _joined_config(capture: Capture) -> tuple[FitConfig, bool]:
-    """That of the fit before, with more Gaussians where there are more photographs; and whether the fit begins with
+    """The configuration of the last fit, with more Gaussians for more photographs; and whether the fit begins with
     what there is.
     """
     recorded = capture.batch.plan["before"]

@@ -115,14 +115,14 @@ def rank_next(run: Path, k: int, length: str | None, show: bool = True) -> list[
 
 
 def _own_gains(loaded: LoadedRun, train: list[Camera], scoring: Scoring, cache: Cache) -> Iterator[float]:
-    """What each of a few photographs that are there adds to all others."""
+    """Information gain of each of a few existing photographs, given all others."""
     for one in train[:: -(-len(train) // _COMPARED_PHOTOGRAPHS)]:
         others = [camera for camera in train if camera is not one]
         yield select(loaded.scene, [one], others, 1, scoring=scoring, cache=cache).scores[0]
 
 
 def _places(gaussians: Gaussians, cameras: list[Camera], train: list[Camera], settings: RenderSettings) -> list[Place]:
-    """Places where a person can stand, and from which there is not more emptiness than in the photographs."""
+    """Places where a person can stand, and whose view is not emptier than the photographs."""
     obstacles = _solid(gaussians, train)
     places = places_around(cameras, upright(cameras), seen_distance(gaussians), obstacles)
     # What looks past the scene would tell most, of what nobody wants to see.
@@ -131,7 +131,7 @@ def _places(gaussians: Gaussians, cameras: list[Camera], train: list[Camera], se
 
 
 def _place_json(place: Place, meters: float | None) -> dict[str, Any]:
-    """What a file says of a place."""
+    """A place as next.json holds it."""
     return {
         "base": place.base,
         "origin": place.origin.tolist(),
@@ -141,19 +141,19 @@ def _place_json(place: Place, meters: float | None) -> dict[str, Any]:
 
 
 def _camera(view: View, pixels: int) -> Camera:
-    """The pinhole camera of a photograph, of at most so many pixels."""
+    """The pinhole camera of a photograph, reduced in size."""
     return at_most(dataclasses.replace(view.camera.undistorted(), name=view.name), pixels)
 
 
 def _empty_share(gaussians: Gaussians, camera: Camera, settings: RenderSettings) -> float:
-    """Share of a picture in which nothing is seen."""
+    """Share of a picture's pixels that no Gaussian covers."""
     with torch.no_grad():  # looked at only
         alpha = render(gaussians, at_most(camera, _EMPTY_PIXELS), settings, outputs=()).alpha
     return float((alpha.cpu() < 0.5).float().mean())
 
 
 def _solid(gaussians: Gaussians, cameras: list[Camera]) -> np.ndarray:
-    """(P, 3) centers of Gaussians that one does not walk through."""
+    """(P, 3) centers of the Gaussians that block a path, world."""
     means = gaussians.means.detach().cpu().double().numpy() + gaussians.origin  # looked at only
     solid = means[gaussians.opacities.detach().cpu().numpy() > _SOLID_OPACITY]
     middle = np.median(np.stack([camera.center for camera in cameras]), axis=0)

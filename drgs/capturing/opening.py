@@ -1,4 +1,4 @@
-"""Which capture a command begins, goes on with or adds to, and why it may not."""
+"""Which capture a command begins, resumes or extends; what contradicts it is refused."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def new_files(
 
 
 def open_record(options: CaptureOptions, inputs: list[list[Any]], is_dataset: bool) -> CaptureRecord:
-    """The record to go on with, whose last batch is the one to work at.
+    """The record of the capture to continue; its last batch is the current one.
 
     Args:
         options: What was asked for.
@@ -110,7 +110,7 @@ def _check_same(options: CaptureOptions, before: CaptureRecord, batch: Batch, is
 
 
 def _with_batch(options: CaptureOptions, record: CaptureRecord, batch: Batch) -> CaptureRecord:
-    """A record whose last batch is a new one, in place of one that has no poses yet."""
+    """The record with a new last batch, which replaces one without poses."""
     if len(record.batches) > 1 and _is_unposed(record):
         record.batches.pop()
     if not (record.path / SCENE).is_dir():

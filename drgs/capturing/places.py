@@ -75,7 +75,7 @@ class Place:
     pitch: float
 
     def words(self, meters: float | None = None) -> str:
-        """What to do, in the imperative.
+        """Where to stand and where to look, as an instruction.
 
         Args:
             meters: Meters of the world's unit; None: lengths are shares of the way.
@@ -155,7 +155,7 @@ def places_around(
 
 
 def _placed(camera: Camera, up: np.ndarray, way: float, move: tuple[float, float, float]) -> Place:
-    """A move from a photograph; the camera looks at what was in its middle."""
+    """A camera moved from a photograph's, looking at what was in the middle of the photograph."""
     right, upward, ahead = level_frame(camera, up)
     target = camera.center + way * camera.c2w[:3, 2]
     eye = camera.center + way * (move[0] * right + move[1] * upward + move[2] * ahead)

@@ -1,4 +1,4 @@
-"""The step `poses` of a capture: cameras and points by structure from motion, and what they say about the shoot."""
+"""The step `poses` of a capture: cameras and points by structure from motion, and problems of the shoot."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["Outcome", "add_poses", "find_poses", "given_poses"]
 
 Outcome: TypeAlias = "tuple[str, list[Finding]]"
-"""Of a step: its line, and what is wrong with the capture."""
+"""Result of a step: the line that is printed, and findings about the capture."""
 
 
 def find_poses(capture: Capture) -> Outcome:
@@ -60,7 +60,7 @@ def find_poses(capture: Capture) -> Outcome:
 
 
 def add_poses(capture: Capture) -> Outcome:
-    """Poses of photographs that join others, whose own stay.
+    """Poses of photographs that are added to others; those of the others do not change.
 
     Raises:
         ValueError: As `find_poses`.
@@ -90,7 +90,7 @@ def add_poses(capture: Capture) -> Outcome:
 
 
 def given_poses(capture: Capture) -> Outcome:
-    """What is to be said of a data set that has poses."""
+    """The result of a data set that comes with poses."""
     dataset, findings = capture.dataset, []
     if not dataset.is_dynamic:
         findings = diagnosis.of_poses(dataset, [view.name for view in dataset.views])
@@ -100,7 +100,7 @@ def given_poses(capture: Capture) -> Outcome:
 
 @contextmanager
 def _explained(capture: Capture) -> Iterator[None]:
-    """An error has what is wrong with the photographs behind it."""
+    """Append the findings about the photographs to an error's text."""
     try:
         yield
     except ValueError as error:
@@ -109,7 +109,7 @@ def _explained(capture: Capture) -> Iterator[None]:
 
 
 def _shown_by(bar: Bar) -> Callable[[str], None]:
-    """Shows what is being done within mapping."""
+    """Show the progress of mapping."""
     return lambda text: bar.update(bar.done, text=text)
 
 
@@ -121,6 +121,6 @@ def _posed(capture: Capture, files: list[Path]) -> list[str]:
 
 
 def _links_to(folder: Path, files: list[Path]) -> list[Path]:
-    """What in a folder is a link to one of the files."""
+    """The links in a folder that lead to one of the files."""
     named = {path.resolve() for path in files}
     return [path for path in folder.iterdir() if path.is_symlink() and path.resolve() in named]

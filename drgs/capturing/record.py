@@ -1,4 +1,4 @@
-"""`capture.json`: which steps of a capture are done, and what came out of each; written after each of them."""
+"""`capture.json`: the steps of a capture that are done, with their results; written after each of them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from drgs.sfm.findings import Finding
 __all__ = ["FOLDER", "Batch", "CaptureRecord", "DoneStep", "inputs_of"]
 
 FOLDER = "capture"
-"""Folder in the run: photographs, the data set that is made of them, and `capture.json`."""
+"""Folder in the run with the photographs, their data set and `capture.json`."""
 _FILE = "capture.json"
 _ADVICE = "capture into another folder (-o)"
 _STEP = {"name": str, "line": str, "seconds": float}
@@ -71,13 +71,13 @@ class Batch:
     result: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def step(self, name: str) -> DoneStep | None:
-        """A step that is done; None where it is not."""
+        """The record of a step; None while it is not done."""
         return next((step for step in self.steps if step.name == name), None)
 
 
 @dataclasses.dataclass
 class CaptureRecord:
-    """What `capture.json` holds.
+    """Contents of `capture.json`.
 
     Attributes:
         path: Folder of the record.
@@ -89,7 +89,7 @@ class CaptureRecord:
 
     @property
     def batch(self) -> Batch:
-        """The last one, which is being worked at."""
+        """The current batch, the last one."""
         return self.batches[-1]
 
     @classmethod

@@ -116,7 +116,7 @@ def _dataset_of(options: CaptureOptions, config: FitConfig) -> Dataset | None:
 
 @contextlib.contextmanager
 def _resumable() -> Iterator[None]:
-    """An interruption says how to go on."""
+    """Add to an interruption's text how to resume."""
     try:
         yield
     except KeyboardInterrupt as error:
@@ -127,7 +127,7 @@ def _resumable() -> Iterator[None]:
 def _steps(
     capture: Capture, photographs: list[Path], videos: list[Path], report: Report
 ) -> dict[str, Callable[[], Outcome]]:
-    """What each step is, in their order."""
+    """The steps, in their order."""
     steps: dict[str, Callable[[], Outcome]] = {}
     if capture.has_poses:
         steps["poses"] = lambda: given_poses(capture)
@@ -143,7 +143,7 @@ def _steps(
 
 
 def _run_steps(capture: Capture, steps: dict[str, Callable[[], Outcome]]) -> None:
-    """All steps that are not done yet, and what to know at the next shoot."""
+    """Run the steps that are not done yet, and print the findings for the next shoot."""
     run = shlex.quote(str(capture.options.output))
     for name, work in steps.items():
         try:
@@ -162,7 +162,7 @@ def _run_steps(capture: Capture, steps: dict[str, Callable[[], Outcome]]) -> Non
 
 
 def _run_step(capture: Capture, name: str, work: Callable[[], Outcome]) -> None:
-    """One step, unless it is done; its outcome is printed and recorded."""
+    """Run a step, unless it is done; print and record its result."""
     before = capture.batch.step(name)
     if before is not None:
         capture.say(f"{name}: {before.line} (done before)")

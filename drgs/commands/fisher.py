@@ -1,4 +1,4 @@
-"""`drgs fisher`: what known views say about every Gaussian, and what other views would still find uncertain.
+"""`drgs fisher`: information of known views about every Gaussian, and maps of the uncertainty in other views.
 
 Two maps a view, both sums over the parameters k of squared derivatives J_pk of a pixel p, with H the information of the
 known views and Hc that of the view itself:
@@ -92,7 +92,7 @@ def run(args: Fisher) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class InformationMaps:
-    """What known views say about every Gaussian, and maps of what other views would still find uncertain.
+    """Information of known views about every Gaussian, and maps of the uncertainty in other views.
 
     Attributes:
         path: File or run that the scene is of.
@@ -153,7 +153,7 @@ class InformationMaps:
         return groups, rows
 
     def _report(self, blocks: SceneBlocks, groups: dict[str, GroupSummary], rows: list[MappedView]) -> dict[str, Any]:
-        """What fisher.json holds."""
+        """Contents of fisher.json."""
         scoring = self.scoring
         is_probed = "deformation" in blocks.names or scoring.method == "probes"
         return {
@@ -184,7 +184,7 @@ def _map_kinds(names: Sequence[str]) -> list[str]:
 
 @dataclasses.dataclass(frozen=True)
 class GroupSummary:
-    """What the known views say about a group of parameters: a summary of its information's entries.
+    """Summary of the known views' information about a group of parameters.
 
     Attributes:
         shape: Shape of the information.
@@ -225,7 +225,7 @@ class MapSummary:
 
 @dataclasses.dataclass(frozen=True)
 class PoseSummary:
-    """What a view says about its own pose: a 6x6 matrix, and its eigenvalues, the least first."""
+    """A view's information about its own pose: a 6x6 matrix and its eigenvalues, ascending."""
 
     information: list[list[float]]
     eigenvalues: list[float]
@@ -299,7 +299,7 @@ def _view(
     compared: ComparedMaps | None,
     has_pose: bool,
 ) -> MappedView:
-    """Maps of one view, and what it says."""
+    """Write the maps of one view; returns its part of the report."""
     Hc = together(scene_blocks.information(camera))
     rows = together(scene_blocks.with_unknowns().information(camera)) if scene_blocks.scoring.nuisances.names else None
     weights = dict(zip(KINDS, map_weights(H, Hc, prior, rows), strict=True))
@@ -328,7 +328,7 @@ def _view(
 
 
 def _print(args: Fisher, known: Known, groups: dict[str, GroupSummary], views: list[MappedView], source: str) -> None:
-    """What was found, as tables on stdout."""
+    """Print the information as tables."""
     rows = []
     several = blocks if len(blocks := tuple(next(iter(groups.values())).blocks)) > 1 else ()
     for name, row in groups.items():
@@ -360,7 +360,7 @@ def _percent(several: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _parts(blocks: dict[str, float], several: tuple[str, ...]) -> tuple[str, ...]:
-    """What share of a sum each block has, for those columns."""
+    """Share of each block in a sum, for the columns of a table."""
     total = sum(blocks.values())
     return tuple(f"{100 * blocks[block] / total:.1f}" if total else "-" for block in several)
 

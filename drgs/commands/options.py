@@ -1,4 +1,4 @@
-"""The options of every command: a frozen dataclass each, whose fields say all that there is to say of an option.
+"""The options of every command: a frozen dataclass each, whose fields define name, type, default and help.
 
 The name of a field is that of the option, its type what may be chosen, and `option` has its default, text and range;
 `part` holds a record of the package, whose fields are options in the same way (`drgs.checks.records`). The command
@@ -74,7 +74,7 @@ VIEWS = (1, 10_000)  # views of one command; more is a typing error
 
 
 def _scene() -> Any:
-    """What a command looks at."""
+    """The scene of a command, its first argument."""
     return option(
         help="A run folder, or Gaussians: .ply, .spz, .splat, .ksplat, .sog, .glb, a SOG or INRIA model folder.",
         positional=True,

@@ -1,4 +1,4 @@
-"""`drgs query`: which Gaussians, and which pixels of views, are what a text means."""
+"""`drgs query`: Gaussians, and pixels of views, that match a text."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def read_embeddings(path: Path) -> torch.Tensor:
 
 
 def _decoder(args: Query, given: SceneInput) -> Decoder | None:
-    """What decodes the features, or None where they are the teacher's own; ValueError where there are no features."""
+    """The decoder of the features, or None where they are the teacher's own; ValueError where there are no features."""
     g, decoder = given.gaussians, given.decoder
     if g.features is None:
         raise ValueError(
@@ -127,7 +127,7 @@ def _decoder(args: Query, given: SceneInput) -> Decoder | None:
 
 
 def _query(args: Query, given: SceneInput) -> TextQuery:
-    """What is looked for."""
+    """The query of the command line."""
     temperature = TEMPERATURE if args.temperature is None else args.temperature
     if args.text_embedding is not None:
         vectors = read_embeddings(args.text_embedding)

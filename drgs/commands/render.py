@@ -140,7 +140,7 @@ def _check(args: Render, settings: RenderSettings, formats: tuple[str, ...]) -> 
 def _write_lists(
     args: Render, report: dict[str, Any], film: Film, given: SceneInput, cameras: list[Camera], formats: tuple[str, ...]
 ) -> None:
-    """Write what stands beside pictures and films: ply files, cameras.json, render.json."""
+    """Write the files beside pictures and films: ply files, cameras.json, render.json."""
     if film.flight is not None:
         report["flight"] = {
             "path": str(args.path),
@@ -300,7 +300,7 @@ def _write_pictures(
 
 
 def _report(settings: RenderSettings, views: list[dict[str, Any]], movies: list[str], fps: float) -> dict[str, Any]:
-    """What `render_views` returns."""
+    """Result of `render_views`."""
     times = [view["seconds"] for view in views]
     return {
         "settings": dataclasses.asdict(settings),
@@ -391,7 +391,7 @@ def _summary(report: dict, folder: Path) -> str:
 
 
 def _say_how_long(args: Render, gaussians: Gaussians, cameras: list[Camera], settings: RenderSettings) -> None:
-    """Exact order on every ray may take minutes where the centers' order takes seconds: said beforehand."""
+    """Print a forecast of the time with exact order on every ray, which may take minutes."""
     if settings.order != "ray" or sum(camera.width * camera.height for camera in cameras) < _FORECAST_PIXELS:
         return
     seconds = forecast(gaussians, cameras, settings)
@@ -412,7 +412,7 @@ def _say(args: Render, text: str) -> None:
 
 
 def forecast(gaussians: Gaussians, cameras: list[Camera], settings: RenderSettings) -> float:
-    """Seconds that all views will take, kernels compiled; finding out takes about a fifth of one view.
+    """Forecast of the seconds of all views, kernels compiled; it takes about a fifth of one view's time itself.
 
     Args:
         gaussians: Gaussians to be rendered.
@@ -473,7 +473,7 @@ class SingleFile:
 
     @property
     def format(self) -> str:
-        """What it is written as."""
+        """Its format."""
         return self.path.suffix[1:]
 
     def named(self, cameras: list[Camera]) -> list[Camera]:

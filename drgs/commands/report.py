@@ -1,4 +1,4 @@
-"""`drgs report`: what a fit looked like, as one HTML file."""
+"""`drgs report`: the report of a fit as one HTML file."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def report_of(run: Run, path: Path, dataset: Dataset | None) -> None:
 
 
 def is_report(path: Path) -> bool:
-    """Whether a file says that `drgs report` wrote it."""
+    """Whether `drgs report` wrote a file, by its first 1,000 bytes."""
     with path.open("rb") as file:
         return f'<meta name="generator" content="{GENERATOR}">'.encode() in file.read(1000)
 

@@ -107,7 +107,7 @@ def _same_data(out: Path, given: Sequence[Path]) -> dict[str, str]:
 
 
 def _figures(plan: StudyPlan, out: Path, args: Reproduce) -> list[tuple[str, str]]:
-    """(file, what it shows) of the figures, of the first unit that has most policies' runs."""
+    """(file, caption) of the figures, of the first unit that has most policies' runs."""
     units: dict[tuple, dict[str, Cell]] = {}
     for cell in plan.cells:
         run = out / "runs" / plan.study.name / cell.name
@@ -130,7 +130,7 @@ def _figures(plan: StudyPlan, out: Path, args: Reproduce) -> list[tuple[str, str
 
 
 def _maps(run: Path, folder: Path) -> list[Path]:
-    """Write maps of what rules look at in the first held-out view of a run; their files."""
+    """Write maps by which policies score the first held-out view of a run; returns their files."""
     given = SceneInput.at(run)
     assert given.record is not None
     settings = RenderSettings.preset("fast", background=given.record.config.settings.background)

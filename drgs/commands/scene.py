@@ -93,7 +93,7 @@ def _pose_error(text: str) -> tuple[float, float]:
 
 
 def _say(name: str, folder: Path, maker: ModuleType, numbers: dict[str, Any]) -> None:
-    """What was made, and what to do next."""
+    """Print the data set's folder and the next command."""
     every = ""
     if name == "capture":
         truth = json.loads((folder / "truth.json").read_text())

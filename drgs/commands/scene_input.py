@@ -1,4 +1,4 @@
-"""What a command was given to look at: a file of Gaussians, or a run and what is known of how it was fitted."""
+"""The scene of a command: a file of Gaussians, or a run with the record of its fit."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class SceneInput:
 
     @classmethod
     def of(cls, args: Crossval | Fisher | Query | Render | Select | Tradeoff) -> SceneInput:
-        """What the command line names, and says about settings.
+        """The scene that the command line names.
 
         Raises:
             FileNotFoundError: If there is no such file, or the run has no checkpoint yet.
@@ -73,7 +73,7 @@ class SceneInput:
 
     @classmethod
     def at(cls, path: Path) -> SceneInput:
-        """What a file of Gaussians, a folder of them (SOG, INRIA's), or a run folder holds.
+        """The scene of a file of Gaussians, a folder of them (SOG, INRIA's) or a run folder.
 
         Raises:
             FileNotFoundError: If there is no such file, a folder is no run's, or the run has no checkpoint yet.
@@ -96,11 +96,11 @@ class SceneInput:
         return cls(loaded.gaussians, run, loaded.record, **known)
 
     def settings(self, preset: str) -> RenderSettings:
-        """How a command renders it with a preset."""
+        """The render settings of a preset over the background of the fit."""
         return RenderSettings.preset(preset, **self.fields)
 
     def over_background(self, settings: RenderSettings) -> RenderSettings:
-        """What --preset and --set say (`args.settings()`), over the background of the fit unless --set names one."""
+        """Settings of --preset and --set (`args.settings()`), over the background of the fit unless --set has one."""
         return settings if settings.background == self.background else settings.replace(background=self.background)
 
     def scoring(self, scoring: Scoring, settings: RenderSettings) -> Scoring:
@@ -111,7 +111,7 @@ class SceneInput:
         return scoring.over(self.estimated)
 
     def semantics(self) -> SemanticMetric | None:
-        """The metric of its decoder, in which features tell about the geometry; None without a decoder."""
+        """The metric of its decoder, for features in information about geometry; None without a decoder."""
         from drgs.information.semantics import SemanticMetric  # not for those that ask for no information
 
         return None if self.decoder is None else SemanticMetric(self.decoder.metric())
@@ -129,17 +129,17 @@ class SceneInput:
 
     @property
     def scene(self) -> Scene:
-        """What is rendered: the Gaussians, or those that a field moves."""
+        """The scene that is rendered: Gaussians, or a `DynamicGaussians`."""
         return self.moving or self.gaussians
 
     @property
     def colors(self) -> Gaussians:
-        """The Gaussians without their features, for what looks at colors alone."""
+        """The Gaussians without their features, for renderings of colors alone."""
         return self.gaussians.replace(features=None)
 
     @property
     def background(self) -> tuple[float, float, float]:
-        """What is behind everything, whatever the preset."""
+        """Background color of the run, for every preset."""
         return tuple(self.fields.get("background", RenderSettings.background))
 
 

@@ -1,4 +1,4 @@
-"""`drgs select`: which cameras would tell most about a scene, as a table and as JSON."""
+"""`drgs select`: cameras ranked by information gain about a scene, as a table and as JSON."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def _report(
     candidates: list[Camera],
     source: str,
 ) -> dict[str, Any]:
-    """What the JSON file holds."""
+    """Contents of the JSON file."""
     shown = [{"index": i, "name": camera.name} for i, camera in enumerate(candidates)]
     timely = [{**one, "time": camera.time} for one, camera in zip(shown, candidates, strict=True)]
     cameras = [{"camera": camera_to_json(camera)} for camera in candidates]
@@ -137,7 +137,7 @@ def _refine(args: Select) -> Refine | None:
 
 
 def print_picks(report: dict, selection: Selection, output: Path) -> None:
-    """The picks with each group's part of the score, and what to know about them, on stdout."""
+    """Print the picks with each group's part of the score, and notes."""
     title = report["policy"] + (f" ({report['criterion']})" if report["policy"] == "fisher" else "")
     compared = selection.combine == "zscore"
     rows = []

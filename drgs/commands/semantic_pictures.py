@@ -64,7 +64,7 @@ def picture_functions(kinds: Iterable[str], given: SceneInput, scene: Path) -> d
         count = len(classes)
 
         def labels(out: Output) -> np.ndarray:
-            """Where next to nothing is, the decoder answers by its bias alone: that is no label."""
+            """(H, W) labels; 0 where the opacity is low and the decoder's bias alone would decide."""
             return np.where(out.alpha.cpu() < OPAQUE, 0, classify(_shown(out), known, decoder))
 
         made["labels"] = lambda out: label_picture(labels(out), count)

@@ -62,13 +62,13 @@ def _output(args: Share) -> Path:
 
 
 def is_page(path: Path) -> bool:
-    """Whether a file says that `drgs share` wrote it."""
+    """Whether `drgs share` wrote a file, by its first 1,000 bytes."""
     with path.open("rb") as file:
         return f'<meta name="generator" content="{SHARED_BY}">'.encode() in file.read(1000)
 
 
 def shared_of(args: Share) -> Shared:
-    """What the page of a command line shows.
+    """Contents of the page of a command line.
 
     Raises:
         FileNotFoundError, ValueError: If a file that was named is not there or damaged.

@@ -1,4 +1,4 @@
-"""`drgs teach`: what a local CLIP model says about each photograph of a data set, as files that `drgs fit` finds.
+"""`drgs teach`: features of a local CLIP model for each photograph of a data set, as files that `drgs fit` reads.
 
 Everything is written into the data set's own folder, beside its photographs, where the loader and Feature 3DGS look:
 `rgb_feature_langseg/NAME_fmap_CxHxW.pt` for each photograph, `text_embeddings.npy` and, where the data set names no
@@ -172,7 +172,7 @@ def _files(views: list[View]) -> dict[str, View]:
 
 
 def _start(output: LockedFolder, record: dict) -> None:
-    """Write what is about to be made; what was made otherwise before is deleted first."""
+    """Write the record of the maps to come; maps of another record are deleted first."""
     path = output.path / _RECORD
     held = read_json(path) if path.is_file() else {}
     wanted = json.loads(json.dumps(record))

@@ -1,4 +1,4 @@
-"""`drgs tradeoff`: what every accuracy/speed setting costs and gives, on a user's own scene and views.
+"""`drgs tradeoff`: error and time of every accuracy/speed setting, on a user's own scene and views.
 
 Truth is preset `exact`, with the user's --set and background; its own error is measured against the float64 oracle on a
 sample of pixels and added to every other one before a budget is compared with it. Errors of a setting:
@@ -114,7 +114,7 @@ def run(args: Tradeoff) -> None:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Report:
-    """What tables and page show.
+    """Contents of the tables and of the page.
 
     Attributes:
         scene: Path of the scene.
@@ -239,7 +239,7 @@ def _cells(row: TradeoffRow) -> list[str]:
 
 
 def _notes(report: _Report) -> list[str]:
-    """What the numbers do not say."""
+    """Notes below the tables."""
     measured, camera = report.measured, report.views[0]
     own = measured.own
     took = [_milliseconds(measured.truth.seconds[clock]) for clock in CLOCKS]

@@ -30,7 +30,7 @@ ORBIT_KEYS = {
     "span": "degrees of the orbit; default that of the photographs, else 360 (select and fisher: 360 if closed)",
     "fov": "horizontal field of view in degrees; default the photographs', else 45",
 }
-"""Key -> what it says, as help shows it."""
+"""Key -> its meaning, for help."""
 
 
 def parsed(texts: Sequence[str]) -> dict[str, Any]:
@@ -69,7 +69,7 @@ def check_color(option: str, color: tuple[float, ...]) -> None:
 
 
 def parsed_size(option: str, text: str) -> tuple[int, int]:
-    """(width, height) of a WIDTHxHEIGHT; ValueError if it is none."""
+    """(width, height) of a text WIDTHxHEIGHT, else ValueError."""
     sides = re.fullmatch(r"(\d{1,9})x(\d{1,9})", text)
     if not sides:
         raise ValueError(f"{option}: must be WIDTHxHEIGHT, got {text!r}; say e.g. 320x240")
@@ -119,7 +119,7 @@ def parsed_orbit(texts: Sequence[str], keys: Sequence[str] = tuple(ORBIT_KEYS)) 
 
 
 def _orbit_value(key: str, text: str) -> Any:
-    """A value by its key: a direction, three numbers or a number; None is what the scene says."""
+    """A value by its key: a direction, three numbers or a number; None leaves it to the scene."""
     if key == "up":
         if text != "auto" and text not in UP:
             raise ValueError(f"--orbit up must be one of auto, {', '.join(UP)}, got {text!r}; choose one")

@@ -83,13 +83,13 @@ def _watch(args: View, viewer: Viewer, stamps: dict[Path, tuple[int, int, int]])
 
 
 def _reading(args: View, viewer: Viewer) -> Iterator[None]:
-    """Job: what the files hold now, in all browsers."""
+    """A job that shows the files' present contents in all browsers."""
     viewer.replace(subject_of(args, SceneInput.of(args), viewer.subject))
     yield
 
 
 def _stamps(paths: list[Path]) -> dict[Path, tuple[int, int, int]]:
-    """What changes of a file when another one takes its place; those that are not there are left out."""
+    """Path -> size and time of change, which a replaced file changes; missing files are left out."""
     stamps = {}
     for path in paths:
         try:
@@ -116,7 +116,7 @@ def watched_files(args: View) -> list[Path]:
 
 
 def subject_of(args: View, given: SceneInput, before: Subject | None = None) -> Subject:
-    """What is looked at.
+    """The viewer's subject: the scene, its photographs and its pictures.
 
     Args:
         args: The options of the command line.
@@ -175,7 +175,7 @@ def _times(given: SceneInput) -> tuple[float, ...]:
 
 
 def _paint(args: View, given: SceneInput) -> dict[str, PictureFunction]:
-    """What draws features and labels, as far as there are any."""
+    """Kind -> function that makes pictures of features and labels, of those that the scene has."""
     functions: dict[str, PictureFunction] = {}
     if given.gaussians.features is None:
         return functions
@@ -188,7 +188,7 @@ def _paint(args: View, given: SceneInput) -> dict[str, PictureFunction]:
 
 
 def _known(args: View, given: SceneInput, notes: list[str]) -> Known | None:
-    """The views that it was fitted to; None where nobody says, or their data set has gone."""
+    """The views that the run was fitted to; None without a run, or where its data set has gone."""
     if args.train is None and given.run is None:
         return None
     try:
@@ -221,7 +221,7 @@ def _placed_views(args: View, given: SceneInput, ranking: Ranking | None, notes:
 
 
 def _uncertainty(args: View, given: SceneInput, known: Known | None) -> Uncertainty | None:
-    """What the photographs leave uncertain, by the fast settings, whose maps are those of the exact ones."""
+    """Uncertainty given the photographs, with the fast settings, whose maps are like those of exact ones."""
     if known is None or not known.cameras:
         return None
     cameras = known.cameras

@@ -104,7 +104,7 @@ class Source:
 
     @functools.cached_property
     def record(self) -> FitRecord | None:
-        """How it was fitted, if it is a run."""
+        """The record of its fit, if it is a run."""
         if self.kind != "run":
             return None
         run = Run(Path(self.text))
@@ -463,7 +463,7 @@ def _with_name(view: View) -> Camera:
 
 
 def evenly(views: list, limit: int) -> list:
-    """At most `limit` of them, the first one among them."""
+    """At most `limit` items, evenly spaced, with the first one."""
     if len(views) <= limit:
         return views
     return [views[i * len(views) // limit] for i in range(limit)]

@@ -101,14 +101,14 @@ def features(planes: Sequence[torch.Tensor], places: torch.Tensor, time: torch.T
     return product(found)
 
 
-def product(found: Sequence[torch.Tensor]) -> torch.Tensor:
+def product(looked_up: Sequence[torch.Tensor]) -> torch.Tensor:
     """(N, L C) features of what places look up in each plane, (N, C) in the order of `HexPlane`."""
-    return torch.cat([functools.reduce(torch.mul, found[k : k + 6]) for k in range(0, len(found), 6)], 1)
+    return torch.cat([functools.reduce(torch.mul, looked_up[k : k + 6]) for k in range(0, len(looked_up), 6)], 1)
 
 
 @dataclasses.dataclass(frozen=True)
 class Corners:
-    """What places read of a plane.
+    """Nodes of a plane, and their weights, between which places interpolate.
 
     Attributes:
         nodes: (N, 4) int64 which of its nodes, row by row.

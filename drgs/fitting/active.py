@@ -61,11 +61,11 @@ _FEWEST_POINTS = 4  # points: each Gaussian's width is of its distances to the t
 
 
 class ActiveViews:
-    """The training split of an active fit: what has been seen, and what to see next.
+    """The training split of an active fit: the views picked so far, and the choice of the next one.
 
     Attributes:
         active: How views are chosen.
-        views: The training split, in its order; what has not been picked has not been opened.
+        views: The training split, in its order; files of views that are not picked are not opened.
         timetable: Steps at which views are picked, and among which.
         chosen: Indices of views that may be read, in the order in which they came.
         picks: One record a pick, as in selection.json.
@@ -101,7 +101,7 @@ class ActiveViews:
         self.views = list(views)
         self._config = config
         self._workers = workers
-        policy_named(active.policy)  # else the first pick would be where that is found out
+        policy_named(active.policy)  # now, not at the first pick
         criterion_named(active.scoring.criterion, "--criterion")
         self.timetable = Timetable.of(self.views, config, moves)
         first = len(self.timetable.start)
@@ -126,7 +126,7 @@ class ActiveViews:
         self._sizes: dict[tuple[int, int], tuple[int, int]] = {}
 
     def check_blocks(self, lacking: Mapping[Block, str]) -> None:
-        """Refuse blocks that the fit does not have; else the first pick would be where that is found out.
+        """Raise ValueError for blocks that the fit does not have, before its first step and not at the first pick.
 
         Args:
             lacking: Blocks of information that there are not, and what the fit is without them, in words.
@@ -139,7 +139,7 @@ class ActiveViews:
 
     @property
     def scoring(self) -> Scoring:
-        """How candidates are scored, as far as the selection says it."""
+        """How candidates are scored, by the selection alone."""
         return self.active.scoring_of(self._config.settings)
 
     @property
@@ -234,7 +234,7 @@ class ActiveViews:
             return matched_points(seen, self._matches, bar.stage)
 
     def _count_start(self, bar: Bar) -> int:
-        """How many points are triangulated with the initial views alone; what is matched here is kept."""
+        """Number of points triangulated from the initial views alone; matches are kept."""
         from drgs.sfm.points import triangulated_count
 
         if self._began is None:
@@ -244,7 +244,7 @@ class ActiveViews:
 
     def new_start(self) -> tuple[torch.Tensor, torch.Tensor] | None:
         """(P, 3) points and (P, 3) colors to begin the fit again with, as all views seen so far show them together;
-        None where it goes on.
+        None where the Gaussians are kept.
 
         What a few photographs put at wrong depths stays there: it explains these, and hides what comes later. But to
         begin again loses what was learned. So `auto` does it until a start has had enough triangulated points.
@@ -261,7 +261,7 @@ class ActiveViews:
         last = next((pick["triangulated"] for pick in reversed(self.picks) if pick.get("restarted")), None)
         with Bar("points of all views") as bar:
             began = self._count_start(bar) if last is None else last
-            if restart == "auto" and began >= _ENOUGH_TRIANGULATED:  # it goes on: nobody needs the points
+            if restart == "auto" and began >= _ENOUGH_TRIANGULATED:  # the Gaussians are kept, and the points not needed
                 found = triangulated_count(seen, self._matches, bar.stage)
                 self.picks[-1] |= {"triangulated": found, "restarted": False}
                 return None
@@ -285,7 +285,7 @@ class ActiveViews:
         return count in self.active.measure and all(record["views"] != count for record in self.measured)
 
     def add_measured(self, step: int, result: dict) -> None:
-        """Record what `drgs.fitting.metrics.evaluate` found, without single views.
+        """Record the means of `drgs.fitting.metrics.evaluate`.
 
         Args:
             step: Steps done.
@@ -360,7 +360,7 @@ class ActiveViews:
         return self._read(index), record
 
     def to_json(self) -> dict:
-        """What selection.json holds."""
+        """Contents of selection.json."""
         initial = self.chosen[: len(self.timetable.start)]
         return {
             "schema": SCHEMA,
@@ -417,7 +417,7 @@ class ActiveViews:
         self._generator.set_state(tensors["policy_rng"])
 
     def _resolved(self, config: dict) -> dict:
-        """A config whose schedule and numbers are those of this fit where it leaves them to the data set."""
+        """The configuration with this fit's schedule and numbers in place of those that it leaves to the data set."""
         timetable = self.timetable
         filled: dict = {"add": timetable.add, "every": timetable.every}
         filled = {name: x for name, x in filled.items() if config[name] is None}

@@ -1,4 +1,4 @@
-"""What a fit does, as frozen records by subject; imports nothing heavy, for the command line reads its options here.
+"""Configuration of a fit, frozen records by subject; imports nothing heavy, as the command line reads its options here.
 
 A field is an option of `drgs fit`: its text and its range are stated beside its default, and nowhere else. What takes
 longer to say stands in the docstring of its record.
@@ -337,8 +337,8 @@ class MotionConfig(Record):
     """Gaussians that a deformation field moves [1], where the training views are of two times or more.
 
     The static stage fits Gaussians that stand still to the first time of all training cameras (to all times, where
-    fewer than 3 photographs show the first). The dynamic stage goes on with them, and with their moments in the
-    optimizer, and adds the field. Rates and SH follow one schedule over both; those of the field begin with the dynamic
+    fewer than 3 photographs show the first). The dynamic stage continues with them and with their optimizer's moments,
+    and adds the field. Rates and SH follow one schedule over both; those of the field begin with the dynamic
     stage. Density control goes through its schedule in each stage: the static one up to half of `max_gaussians`, the
     dynamic one up to all, so that there are some left for what appears later.
 
@@ -420,7 +420,7 @@ class MotionConfig(Record):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SavingConfig(Record):
-    """When checkpoints are written. It changes nothing of what is fitted: a fit may go on with another one."""
+    """When checkpoints are written. This does not change the fit, which may be resumed with another one."""
 
     save_every: int = option(1000, "Steps between checkpoints.", within=COUNT, rare=True)
     save_minutes: float = option(
@@ -522,7 +522,7 @@ class SelectionConfig(Record):
             raise ValueError("active: scoring must leave settings and semantics to the fit, got others; drop them")
 
     def scoring_of(self, settings: RenderSettings, semantics: SemanticMetric | None = None) -> Scoring:
-        """As `drgs.select` takes it, for views that are rendered with these settings."""
+        """A `Scoring` for views that are rendered with these settings."""
         return dataclasses.replace(self.scoring, settings=settings, semantics=semantics)
 
     def flat(self) -> dict[str, Any]:

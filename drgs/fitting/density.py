@@ -48,7 +48,7 @@ def divide(opacity: torch.Tensor, copies: torch.Tensor) -> tuple[torch.Tensor, t
 
 
 def relocate(rows: GaussianRows, min_opacity: float, jitter: float, generator: torch.Generator) -> int:
-    """Move Gaussians with opacity <= `min_opacity` onto others, drawn by opacity; how many were moved.
+    """Move Gaussians with opacity <= `min_opacity` onto others, drawn by opacity; returns how many were moved.
 
     Args:
         rows: Changed in place; moments of all that moved, and of opacity and scale of all that were divided, are 0.

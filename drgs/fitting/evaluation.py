@@ -100,7 +100,7 @@ def _check_pictures(output: LockedFolder, recorded: FitRecord, split: str, frame
 
 
 def _component_metrics(run: RunViews) -> dict[str, Any]:
-    """What components say of a run that is measured again."""
+    """The components' part of the metrics of a run that is measured again."""
     metrics: dict[str, Any] = {}
     for component in COMPONENTS.values():
         metrics |= component.run_metrics(run)
@@ -140,7 +140,7 @@ def _most_pixels(views: list[View], max_pixels: int, scale: float) -> int:
 
 
 def _segmentation(loaded: LoadedRun, dataset: Dataset, frames: list[Frame]) -> Segmentation | str | None:
-    """What of the run's labels is measured.
+    """How the run's labels are measured.
 
     Raises:
         ValueError: If numbers in the data set's labels mean other classes than they did when the run was fitted.

@@ -1,4 +1,4 @@
-"""What a step minimizes: a list of terms, among them L1 and structural similarity, cheap enough for two CPU cores.
+"""The loss of a step: a list of terms, among them L1 and structural similarity, cheap enough for two CPU cores.
 
 SSIM is the training variant of 3DGS: 11x11 Gaussian window with sigma 1.5, zero padding, one value per pixel and
 channel, mean over all of them. `drgs.fitting.metrics` also reports the variant without padding that papers print.
@@ -39,11 +39,11 @@ _C2 = 0.03**2
 
 
 class LossTerm(Protocol):
-    """A part of what a step minimizes. `terms_of` lists those of a fit; a new one is a class like those below."""
+    """A term of the loss. `terms_of` lists those of a fit; a new one is a class like those below."""
 
     @property
     def name(self) -> str:
-        """What no other term of the fit is called; a plain attribute will do."""
+        """Unique name of the term within the fit; a plain attribute will do."""
 
     @property
     def outputs(self) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""A fit whose photographs come one at a time, as a robot takes them: a trainer that begins with the first of them.
+"""Online fit: photographs are added one at a time, as a robot takes them, to a trainer that begins with the first.
 
 Where a photograph has a depth map, it brings points wherever the Gaussians leave it open, or stand behind what it
 shows. Where none has, the fit begins with random points where two cameras look, and density control does the rest.
@@ -46,18 +46,18 @@ _WHOLE = re.compile("[0-9a-f]{1,32}")  # 128 bits
 
 
 class OnlineFit:
-    """Gaussians that are fitted to photographs as they come.
+    """A fit to which photographs are added one at a time.
 
     Attributes:
-        config: What every step does. Its schedules are of `max_steps`; when these are done, twice as many follow, from
-            the middle of the schedules on.
-        trainer: The fit; None until it has something to begin with.
+        config: Configuration of the fit. When its `max_steps` are done, they are doubled: schedules continue from their
+            middle.
+        trainer: The fit; None until there are points to begin with.
     """
 
     def __init__(self, config: FitConfig) -> None:
         """
         Args:
-            config: Configuration of a fit to what stands still, without a selection.
+            config: Configuration of a static fit, without a selection.
         Raises:
             ValueError: If it is of another kind of fit.
         """
@@ -69,7 +69,7 @@ class OnlineFit:
         self._rng = np.random.default_rng(config.seed)
 
     def add(self, image: np.ndarray, camera: Camera, depth: np.ndarray | None = None) -> int:
-        """One more photograph; returns the number of Gaussians that it brings.
+        """Add a photograph; returns the number of Gaussians that are added for it.
 
         Args:
             image: (H, W, 3), uint8 or in [0, 1].
@@ -179,12 +179,12 @@ class OnlineFit:
         return len(points)
 
     def _room(self) -> int:
-        """How many Gaussians a photograph may bring."""
+        """Largest number of Gaussians that a photograph may add."""
         there = 0 if self.trainer is None else len(self.trainer.rows)
         return int(_BUDGET_SHARE * max(self.config.density.max_gaussians - there, 0))
 
     def _add_points(self, frame: Frame, depth: np.ndarray) -> int:
-        """Gaussians where a depth map shows what the others do not."""
+        """Add Gaussians where a depth map shows surfaces that the present ones lack."""
         assert self.trainer is not None  # there are others
         seen = frame.camera
         with torch.no_grad():

@@ -2,8 +2,8 @@
 
 Gaussians that are fitted with one renderer alone fit its approximations, too: what another one shows of them may be
 several dB worse, where they are large and near above all, whose order the renderers disagree about. Gaussians that have
-met each of them agree with all. Which preset is due is a function of the step alone, so that a fit that goes on after
-a pause meets the same ones; views come in another random order every epoch, so that each view meets every renderer,
+met each of them agree with all. The preset of a step depends on its number alone, so that a resumed fit has the same
+ones; views come in another random order every epoch, so that each view meets every renderer,
 whatever their number is. Imports nothing heavy: options are checked here.
 """
 

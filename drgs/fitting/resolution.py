@@ -1,6 +1,6 @@
-"""Photographs that begin small: a fit sees them at half, a quarter ... of their width and height, then at their own.
+"""Coarse to fine: the first steps are fitted to photographs of half, a quarter ... of the width and height.
 
-At first only what is large is to be found, and a small photograph shows it in a fraction of the time. With n downscales
+Early steps fit large structures alone, which a small photograph shows at a fraction of the cost. With n downscales
 the first steps see photographs of 1 / 2^n of the width and height, which double after equal shares of the steps, until
 from `FULL` of the steps on they have the size of the fit. What a step sees depends on its number alone. The idea is
 that of Nerfstudio's splatfacto [1], which counts steps where this has a fraction of them.
@@ -34,7 +34,7 @@ _LEAST = 11  # pixels of the shorter side: the window of SSIM (losses.py) is as 
 
 
 class Resolution:
-    """How large a step sees the photographs.
+    """The size of the photographs in each step.
 
     Attributes:
         num_downscales: How many times they are halved at the start.
@@ -67,8 +67,8 @@ class Resolution:
         """The line on stderr for an event of its own; None for others."""
         return f"photographs of {event['width']}x{event['height']}" if event["event"] == "resolution" else None
 
-    def seen(self, index: int, frame: Frame, step: int) -> Frame:
-        """A photograph as a step sees it: area averages of pixels, mask and alpha, with the camera of that size.
+    def resized(self, index: int, frame: Frame, step: int) -> Frame:
+        """A photograph at the size of a step: area averages of pixels, mask and alpha, with the camera of that size.
 
         A pixel shows something transient where one of those that it is made of does. Labels and the map of a teacher
         are as they were. Averages are kept until the size changes.

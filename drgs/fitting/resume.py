@@ -1,4 +1,4 @@
-"""Which run folder a fit may write into, and the checkpoint that it goes on from."""
+"""Which run folder a fit may write into, and the checkpoint from which it is resumed."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def last_checkpoint(run: Run) -> tuple[dict, dict] | tuple[None, None]:
             for other in {run.state, run.path / PREVIOUS} - {path}:
                 _put_aside(other, held, problem is not None)
         if problem:
-            _log.warning("%s; going on from the one before it, step %d", problem, header["step"])
+            _log.warning("%s; resuming from the one before it, step %d", problem, header["step"])
         return tensors, header
     if problem:
         raise ValueError(

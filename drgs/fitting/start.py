@@ -32,10 +32,10 @@ _log = logging.getLogger("drgs.train")
 
 
 def start(setup: Setup, begin: Path | None = None) -> tuple[Trainer, str]:
-    """A trainer at step 0, and where its Gaussians come from, in words.
+    """Make a trainer at step 0; and the source of its Gaussians, in words.
 
     Args:
-        setup: What is known of the fit, with its photographs; gets its points.
+        setup: The fit's setup with its photographs; its points are set here.
         begin: Checkpoint whose Gaussians it begins with; None: with points.
     """
     config, dataset = setup.config, setup.dataset
@@ -52,7 +52,7 @@ def start(setup: Setup, begin: Path | None = None) -> tuple[Trainer, str]:
 
 
 def start_plain(dataset: Dataset, views: list[View], frames: list[Frame], config: FitConfig) -> Trainer:
-    """A trainer at step 0 of a fit to views that stand still, without a teacher, as its speed is measured.
+    """A trainer at step 0 of a static fit without a teacher, to measure its speed.
 
     Args:
         dataset, views, frames: The data set, its training views, and their photographs.
@@ -88,7 +88,7 @@ def _rows_at_points(setup: Setup) -> tuple[GaussianRows, str]:
 
 
 def _warn_of_masks(setup: Setup) -> None:
-    """Log what masks and alpha channels leave out, where that may not be what was meant."""
+    """Log how much masks and alpha channels leave out, where that may be unintended."""
     config, frames = setup.config, setup.frames
     partial = {view.name for view in setup.dataset.views if not view.empty_outside}
     masked = sum(frame.name in partial and (frame.mask is not None or frame.alpha is not None) for frame in frames)
@@ -131,7 +131,7 @@ def begin_with(
     with the points, 27.3 dB with copies of Gaussians instead.
 
     Args:
-        checkpoint: File of a fit to what stands still.
+        checkpoint: File of a static fit.
         frames: Training photographs, of which the checkpoint names those that are not new.
         points, colors: (P, 3) of the data set, in the same world; None where it has none.
         config: Configuration of the new fit.

@@ -45,7 +45,7 @@ _RESERVED = {"parameter", "adam", "rng", "queue", "policy_rng"}
 
 @dataclasses.dataclass(frozen=True)
 class StepResult:
-    """What one step was.
+    """Result of one step.
 
     Attributes:
         loss: Loss of its view, before the step, as all of these.
@@ -70,7 +70,7 @@ class Trainer:
         frames: Training photographs.
         rows: The Gaussians and their optimizer.
         extent: Extent of the scene, its unit of length.
-        components: What the fit has besides, in the order of the table.
+        components: The fit's components, in the order of the table.
         terms: Terms of the loss that every fit has, added up before those of components.
         renderers: What each step is rendered with.
         resolution: How large each step sees the photographs.
@@ -128,7 +128,7 @@ class Trainer:
 
     @property
     def networks(self) -> list[Network]:
-        """What is fitted beside the Gaussians."""
+        """Networks that are fitted beside the Gaussians."""
         return [network for component in self.components for network in component.networks]
 
     @property
@@ -151,7 +151,7 @@ class Trainer:
         return {component.name: component for component in self.components}[name]
 
     def network(self, name: str) -> torch.nn.Module | None:
-        """What is fitted beside the Gaussians under a name, as it is now; None if there is nothing."""
+        """The module of the network of a name; None if there is none."""
         return next((network.module for network in self.networks if network.name == name), None)
 
     def _check(self) -> None:
@@ -227,7 +227,7 @@ class Trainer:
         self._start_count = len(self.rows)
 
     def reschedule(self, max_steps: int) -> None:
-        """Let the fit end at another step; schedules go by the share of the steps that is done, so that they go on.
+        """Change the number of steps; schedules depend on the share of the steps that is done, and continue.
 
         Args:
             max_steps: Steps of the whole fit, more than have been done.
@@ -242,7 +242,7 @@ class Trainer:
         self.renderers = RendererSchedule.of(self.config.renderers, self.config.settings, max_steps)
         self.resolution = Resolution(self.config.data.num_downscales, max_steps)
 
-    def another(self, config: FitConfig, frames: list[Frame], rows: GaussianRows, component: Component) -> Trainer:
+    def trial(self, config: FitConfig, frames: list[Frame], rows: GaussianRows, component: Component) -> Trainer:
         """See `Fit`."""
         others = [component if x.name == component.name else x for x in components_of()]
         return Trainer(config, frames, rows, self.extent, others)
@@ -265,8 +265,8 @@ class Trainer:
         gaussians = self._scene().at(frame.camera.time)
         for component in self.components:
             frame = component.frame(self, frame)
-        frame = self.resolution.seen(index, frame, done)
-        out = self.shown(self._rendered(gaussians, frame), frame)
+        frame = self.resolution.resized(index, frame, done)
+        out = self.as_photograph(self._rendered(gaussians, frame), frame)
         loss, values = self._loss(out, frame, gaussians)
         networks = self.networks
         optimizers = [self.rows.optimizer, *(network.optimizer for network in networks)]
@@ -332,12 +332,12 @@ class Trainer:
     def scene(self) -> Scene:
         """See `Fit`."""
         scene = self._scene()
-        return scene.detach() if isinstance(scene, Gaussians) else scene  # looked at, not optimized
+        return scene.detach() if isinstance(scene, Gaussians) else scene  # for display, not optimized
 
-    def shown(self, out: Output, frame: Frame) -> Output:
+    def as_photograph(self, out: Output, frame: Frame) -> Output:
         """See `Fit`."""
         for component in self.components:
-            out = component.shown(out, frame)
+            out = component.as_photograph(out, frame)
         return out
 
     def describe(self, event: Mapping[str, Any]) -> list[str]:
@@ -389,10 +389,10 @@ class Trainer:
         Raises:
             ValueError: If the checkpoint belongs to another config, other views or other networks.
         """
-        # What an older drgs did not know, it did as the defaults say.
+        # Options that an older version did not have are at their defaults.
         before = FitConfig.from_json(header["config"])
         if config.renderers == AUTO and config.settings == before.settings:
-            config = config.replace(renderers=before.renderers)  # `auto` goes on with what the fit began with
+            config = config.replace(renderers=before.renderers)  # `auto` keeps the renderers that the fit began with
         if other := config.difference(before):
             name, now, was = other
             raise ValueError(
@@ -489,7 +489,7 @@ class Trainer:
         return gaussians
 
     def _scene(self) -> Scene:
-        """What a step renders; differentiated."""
+        """The scene that a step renders; differentiated."""
         scene: Scene = self._gaussians()
         for component in self.components:
             scene = component.scene(self, scene)
@@ -499,7 +499,7 @@ class Trainer:
         return [*self.terms, *(term for component in self.components for term in component.terms)]
 
     def _rendered(self, gaussians: Gaussians, frame: Frame) -> Output:
-        """What the terms need to see of the Gaussians in a photograph's view."""
+        """Rendering of the Gaussians by a photograph's camera, with the outputs that the terms of the loss need."""
         options: dict[str, Any] = {}
         for component in self.components:
             gaussians = component.rendered(gaussians, frame)
@@ -516,7 +516,7 @@ class Trainer:
             value = term(out, frame, gaussians)
             if value is not None:
                 total = value if total is None else total + value
-                values[term.name] = float(value.detach())  # to be looked at
+                values[term.name] = float(value.detach())  # logged, not optimized
         if total is None:
             raise ValueError(f"fit: a view must have a term of the loss, {frame.name} has none; add one")
         return total, values
@@ -528,13 +528,13 @@ class Trainer:
         return float((error * frame.mask).sum() / frame.mask.sum().clamp(min=1))
 
     def _not_finite(self, loss: torch.Tensor) -> str | None:
-        """What of a parameter, the loss and every gradient is not finite, the first of them; None if all are.
+        """Name of the first parameter, else of the loss or a gradient, that is not finite; None if all are finite.
 
         A sum is not finite where one of its numbers is not.
         """
         named = [*self.rows.tensors.items()]
         named += [(f"{n.name}.{key}", x) for n in self.networks for key, x in n.module.named_parameters()]
-        # Values that are looked at.
+        # Values, without gradients.
         if all(
             math.isfinite(float(x)) for x in (loss.detach(), *(x.grad.sum() for _, x in named if x.grad is not None))
         ):

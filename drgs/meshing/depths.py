@@ -1,4 +1,4 @@
-"""Depth images of cameras, as fusion wants them: where a ray ends, how firmly, and what is seen there."""
+"""Depth images for fusion: where each ray ends, with which weight, and its color."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _LEAST_LOG_ARGUMENT = 1e-30  # least argument of a logarithm, which stays finite
 
 @dataclass(frozen=True)
 class DepthView:
-    """What one camera sees.
+    """Depths, weights and colors of one camera.
 
     Attributes:
         camera: The camera.
@@ -58,7 +58,7 @@ def depth_views(
     deviations: torch.Tensor | None = None,
     advance: Callable[[], None] | None = None,
 ) -> list[DepthView]:
-    """Render what `mesh_of` fuses.
+    """Render the depth images that `mesh_of` fuses.
 
     Args:
         gaussians: N Gaussians; those of a skybox are to be left out before.

@@ -134,7 +134,7 @@ def mesh_of_depths(
     advance: Callable[[str, int, int], None] | None = None,
     empty: float = 1.0,
 ) -> TriangleMesh:
-    """The surface of depth images: fusion, colors, and what is cut away.
+    """The surface of depth images: fusion, colors, and cuts where views do not determine it.
 
     Args:
         views: Depth images; with `spread` where `options.crop` is above 0.
@@ -239,7 +239,7 @@ def _attributes(
 
 
 def _counter(label: str, total: int, advance: Callable[[str, int, int], None] | None) -> Callable[[], None] | None:
-    """What counts the steps of a stage."""
+    """A callback that counts the steps of a stage."""
     if advance is None:
         return None
     done = iter(range(1, total + 1))

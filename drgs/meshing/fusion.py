@@ -81,7 +81,7 @@ def _projected(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def sampled(view: DepthView, points: np.ndarray, trunc: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What a view says about points.
+    """Signed distances and weights of points by one view.
 
     Depth is interpolated between the four pixels around where their values agree within `trunc`, else it is the nearest
     pixel's: across the edge of an object there is no surface. Within a pixel of an edge a view does not say that a
@@ -233,7 +233,7 @@ def _edges(brick: np.ndarray, local: np.ndarray) -> np.ndarray:
 
 
 class _Seen:
-    """A view, and a quick test of whether it may see anything of a ball."""
+    """A view with a fast test of whether a ball may be in its frustum."""
 
     def __init__(self, view: DepthView, axis: np.ndarray | None, angle: float):
         self.view = view

@@ -1,4 +1,4 @@
-"""How a surface is made; imports nothing heavy, so that `drgs --help` reads it."""
+"""Options of a mesh; imports nothing heavy, so that `drgs --help` reads it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DepthKind = Literal["median", "expected"]
 
 @dataclasses.dataclass(frozen=True)
 class MeshOptions(Record):
-    """How a surface is made of depth images."""
+    """How depth images are fused into a mesh."""
 
     where: ClassVar[str] = "mesh"
 

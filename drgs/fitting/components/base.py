@@ -1,18 +1,18 @@
-"""What a component of a fit is: something that is fitted, or decided, beside photographs and Gaussians.
+"""The protocol of a component: something that a fit estimates, or decides, besides the Gaussians.
 
 A component is a class with one row in `drgs.fitting.components.table.COMPONENTS`. `drgs.train.fit` and the `Trainer`
 call its methods below at their times and know no component by name. Every method has a default that does nothing, so
-that a component writes those alone that it needs. What its life is, in the order of calls:
+that a component overrides only those that it needs. They are called in this order:
 
     prepare      before photographs are decoded: what the cameras and the configuration say
     setting      whether it is to be part of this fit; then conflicts are refused
     begin        photographs are there, of a new fit and of one that is resumed
     start        a new fit has its first Gaussians: networks, rows, evidence
     resume       instead of `start`, from a checkpoint
-    before_density, before_step, frame, gaussians, scene, rendered, shown, terms, after_backward               each step
+    before_density, before_step, frame, gaussians, scene, rendered, as_photograph, terms, after_backward       each step
     changed, new_rows, restart, join                                    Gaussians or photographs come, or are replaced
     state, write_files                                                                                  each checkpoint
-    record, log_fields, describe, evaluation, metrics                                what it says in files and on stderr
+    record, log_fields, describe, evaluation, metrics                                 its part of files and of stderr
 
 Class methods read what a run folder says, when no fit is there: `load_gaussians`, `load_scene`, `run_metrics`, `report`
 and the checks of a checkpoint.
@@ -46,22 +46,22 @@ if TYPE_CHECKING:
     from drgs.settings import RenderSettings
     from drgs.sfm.guided import Matches
 
-__all__ = ["WAYS", "Checkpoint", "Component", "Conflict", "Fit", "RunViews", "Setup", "check_conflicts"]
+__all__ = ["MODES", "Checkpoint", "Component", "Conflict", "Fit", "RunViews", "Setup", "check_conflicts"]
 
-WAYS = {
+MODES = {
     "selection": "where views are chosen on the way",
     "begin": "where the fit begins with the Gaussians of another",
     "pace": "where the number of steps follows the time that there is",
 }
-"""Ways to fit that a component may not be built for, by the names that `Conflict.other` has for them, in words."""
+"""Modes of a fit that a component may not support: name, as in `Conflict.other`, -> a clause for messages."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Conflict:
-    """Something that a component cannot stand beside.
+    """Another component, or a mode of the fit, with which a component cannot be combined.
 
     Attributes:
-        other: Name of another component, or of one of `WAYS`.
+        other: Name of another component, or of one of `MODES`.
         why: The reason, a clause.
         advice: What to do.
     """
@@ -73,20 +73,20 @@ class Conflict:
 
 @dataclasses.dataclass
 class Setup:
-    """What is known of a fit before its first step.
+    """State of a fit before its first step.
 
     Attributes:
         dataset: The data set.
-        config: What to do; components replace what `auto` means in it.
+        config: Configuration; components replace `auto` in it by what they choose.
         train, test: The two splits.
         views: Training views that may be read at the start: all, or the first ones of an active fit.
-        times: Distinct times of the views that the fit distinguishes, sorted; none where nothing can move, or is to.
-        components: Those of the fit, in their order.
-        ways: Which of `WAYS` it goes.
+        times: Distinct times of the views that the fit distinguishes, sorted; none of a static fit.
+        components: Components of the fit, in their order.
+        modes: The fit's modes, of `MODES`.
         frames, held_out: Photographs of the views that are fitted to at the start, and of `test`, once decoded.
         reserved: Gaussians of the budget that components will add at the start.
-        points: (P, 3) initial points, world, once they are there.
-        matches: What was matched between photographs for initial points; None where nothing was.
+        points: (P, 3) initial points, world, once there are some.
+        matches: Matches between photographs for the initial points; None where none were made.
         picked_points: Of an active fit, `ActiveViews.compared_points`.
     """
 
@@ -97,7 +97,7 @@ class Setup:
     views: list[View]
     times: tuple[float, ...]
     components: Sequence[Component]
-    ways: frozenset[str] = frozenset()
+    modes: frozenset[str] = frozenset()
     frames: list[Frame] = dataclasses.field(default_factory=list)
     held_out: list[Frame] = dataclasses.field(default_factory=list)
     reserved: int = 0
@@ -108,17 +108,17 @@ class Setup:
     @property
     def is_active(self) -> bool:
         """Whether views are chosen on the way."""
-        return "selection" in self.ways
+        return "selection" in self.modes
 
     def conflict(self, component: Component) -> tuple[Conflict, str] | None:
-        """The first thing of this fit that a component cannot stand beside, and where that is, in words."""
-        there = {name: WAYS[name] for name in WAYS if name in self.ways}
+        """The first conflict of a component within this fit, and its clause for messages."""
+        there = {name: MODES[name] for name in MODES if name in self.modes}
         there |= {x.name: x.where for x in self.components if x is not component and x.setting(self) is not None}
         return next(((x, there[x.other]) for x in component.conflicts if x.other in there), None)
 
 
 def check_conflicts(setup: Setup) -> None:
-    """Refuse components that cannot stand beside others of this fit.
+    """Raise NotImplementedError if components of this fit cannot be combined.
 
     Raises:
         NotImplementedError: On the first, in one line.
@@ -135,7 +135,7 @@ def check_conflicts(setup: Setup) -> None:
 
 
 class Fit(Protocol):
-    """What a component sees of a fit, and may change: `drgs.fitting.trainer.Trainer` has it."""
+    """The part of a `drgs.fitting.trainer.Trainer` that components read and change."""
 
     config: FitConfig
     frames: list[Frame]
@@ -151,22 +151,22 @@ class Fit(Protocol):
         """The fraction of the steps that is done."""
 
     def photographs(self) -> list[Frame]:
-        """The training photographs, whose cameras are put where they are now."""
+        """The training photographs, with their cameras as estimated now."""
 
     def gaussians(self) -> Gaussians:
         """The Gaussians as they are shown and saved, without a graph; at rest where they move."""
 
     def scene(self) -> Scene:
-        """What a step renders, to be looked at."""
+        """The scene that a step renders, without gradients to Gaussians."""
 
-    def shown(self, out: Output, frame: Frame) -> Output:
-        """A rendering as a photograph shows it."""
+    def as_photograph(self, out: Output, frame: Frame) -> Output:
+        """A rendering as the photograph's own exposure and the like change it."""
 
     def begin_stage(self) -> None:
-        """Other things are fitted from now on: the epoch, and the growth of density control, begin anew."""
+        """Begin a stage in which other parameters are fitted: the epoch, and density control's growth, start again."""
 
-    def another(self, config: FitConfig, frames: list[Frame], rows: GaussianRows, component: Component) -> Fit:
-        """A short fit for a trial: to other Gaussians, and with this component in place of the one of its name."""
+    def trial(self, config: FitConfig, frames: list[Frame], rows: GaussianRows, component: Component) -> Fit:
+        """A fit of other Gaussians for a trial, with this component in place of the one of its name."""
 
     def step(self) -> Any:
         """One step."""
@@ -188,12 +188,12 @@ class Checkpoint:
 
 @dataclasses.dataclass(frozen=True)
 class RunViews:
-    """A run that is measured again (`drgs eval`).
+    """A run that `drgs eval` measures again.
 
     Attributes:
-        scene: What is shown.
+        scene: The scene of the run.
         settings: Settings of the fit's renderings.
-        refined: Whether the run has cameras of its own.
+        refined: Whether the run has refined cameras.
         stated: Cameras of the training photographs that were fitted to, as the data set states them.
         cameras: The same as the run has them.
         held_out: Photographs that were not fitted to, at the size of the fit; none where others are measured.
@@ -212,15 +212,16 @@ class Component:
 
     Attributes:
         name: Its name in the table.
-        option: Option that it is asked for by, and the value, or values, that are without it; for messages.
-        where: Where it is, in words, as other components say what they cannot stand beside.
-        conflicts: What it cannot stand beside. Each pair is declared once, by the one of the two that gives way.
-        block: Block of information that can only be asked of a fit with it, and what a fit is without; None: none.
-        reserved_names: Names in a checkpoint, or what names begin with up to a dot, that no network may have.
+        option: Option that switches it on, and the value, or values, that leave it out; for messages.
+        where: Clause for messages of components that conflict with it, e.g. `where exposure is fitted`.
+        conflicts: Components and modes that it cannot be combined with. Each pair is declared once, by the one that
+            gives way.
+        block: Block of information that needs this component, and what a fit without it is, in words; None: none.
+        reserved_names: Names in a checkpoint, or their first parts up to a dot, that no network may have.
         header_kinds: Keys of its part of a checkpoint's header -> kind, as of `drgs.io.json_files.check_json`.
         terms: Terms of the loss, added up after those that every fit has.
         rates: Learning rates by the name of a tensor of `GaussianRows`, also of one that every fit has.
-        networks: What it fits beside the Gaussians.
+        networks: Networks that it fits beside the Gaussians.
         nuisance: The unknown of each photograph that it estimates, eliminated from information; None: none.
         pictures: Suffixes of the pictures that measuring a view draws besides that of its colors.
         rendering: Arguments of `drgs.render` of a step.
@@ -243,13 +244,13 @@ class Component:
     # -------------------------------------------------------------------------------------- before the first step
 
     def prepare(self, setup: Setup) -> None:
-        """See what views, not yet decoded, and the configuration say; may replace `setup.config`."""
+        """Read the configuration and the views, which are not decoded yet; may replace `setup.config`."""
 
     def setting(self, setup: Setup) -> str | None:
-        """The value of its option where it is to be part of this fit, and is refused in a conflict; else None."""
+        """The value of its option if it is to be part of this fit (a conflict is then refused); else None."""
 
     def begin(self, setup: Setup, resumed: bool) -> None:
-        """Check, and decide by, decoded photographs; may reserve Gaussians of the budget.
+        """Check the decoded photographs, and decide by them; may reserve Gaussians of the budget.
 
         Args:
             setup: With its photographs.
@@ -257,34 +258,34 @@ class Component:
         """
 
     def initial_views(self, views: list[View]) -> list[View]:
-        """Those of the views that initial points may come from."""
+        """Views that initial points may come from."""
         return views
 
     def start(self, fit: Fit, setup: Setup) -> None:
-        """Begin with a new fit, whose first Gaussians are there."""
+        """Begin with a new fit, which has its first Gaussians."""
 
     def resume(self, fit: Fit, checkpoint: Checkpoint) -> None:
-        """Begin with what a checkpoint holds; the tensors of `networks` that are made here are restored afterwards."""
+        """Begin from a checkpoint; the tensors of `networks` that are made here are restored afterwards."""
 
     # ---------------------------------------------------------------------------------------------------- each step
 
     def before_density(self, fit: Fit) -> list[dict]:
-        """What is due before schedules and density control; returns events for the log."""
+        """Act before schedules and density control; returns events for the log."""
         return []
 
     def before_step(self, fit: Fit) -> list[dict]:
-        """What is due after these, before a photograph is drawn and seen; returns events for the log."""
+        """Act after these, before a photograph is drawn; returns events for the log."""
         return []
 
     def stage(self, fit: Fit) -> Stage | None:
-        """Over which density control runs now; None: over the whole fit."""
+        """The steps over which density control runs now; None: the whole fit."""
 
     def fitted_frames(self, frames: list[Frame]) -> list[Frame]:
-        """Those of the photographs that steps are fitted to now."""
+        """Photographs that steps are fitted to now."""
         return frames
 
     def frame(self, fit: Fit, frame: Frame) -> Frame:
-        """A photograph as a step sees it; its camera may be differentiated."""
+        """The photograph that a step is compared with; its camera may be differentiated."""
         return frame
 
     def camera(self, frame: Frame) -> Camera:
@@ -292,19 +293,19 @@ class Component:
         return frame.camera
 
     def gaussians(self, gaussians: Gaussians) -> Gaussians:
-        """The Gaussians that are shown and saved, of those that are fitted; differentiated."""
+        """The Gaussians that are rendered and saved, from those that are fitted; differentiated."""
         return gaussians
 
     def scene(self, fit: Fit, scene: Scene) -> Scene:
-        """What is rendered of the Gaussians; differentiated."""
+        """The scene that is rendered, from the Gaussians; differentiated."""
         return scene
 
     def rendered(self, gaussians: Gaussians, frame: Frame) -> Gaussians:
-        """What of the Gaussians at the time of a photograph is rendered for it."""
+        """The Gaussians that are rendered for a photograph, from those at its time."""
         return gaussians
 
-    def shown(self, out: Output, frame: Frame) -> Output:
-        """A rendering as a photograph shows it, before terms of the loss see it; differentiated."""
+    def as_photograph(self, out: Output, frame: Frame) -> Output:
+        """A rendering with the photograph's own exposure and the like, for the loss; differentiated."""
         return out
 
     def after_backward(self, fit: Fit) -> None:
@@ -313,14 +314,14 @@ class Component:
     # ------------------------------------------------------------------------- Gaussians and photographs that come
 
     def changed(self, fit: Fit) -> None:
-        """Gaussians or photographs have come or gone."""
+        """Gaussians or photographs have been added or removed."""
 
     def new_rows(self, fit: Fit, count: int) -> dict[str, torch.Tensor]:
         """Rows of its tensors for Gaussians that are added at points; left out, they are 0."""
         return {}
 
     def restart(self, fit: Fit) -> None:
-        """All Gaussians have been replaced by new ones at points; networks and schedules go on."""
+        """All Gaussians have been replaced by new ones at points; networks and schedules continue."""
 
     def join(self, fit: Fit, frame: Frame, setup: Setup) -> list[dict]:
         """A photograph is about to be added to `fit.frames`; returns events for the log, with which config.json is
@@ -350,7 +351,7 @@ class Component:
         return {}
 
     def describe(self, event: Mapping[str, Any]) -> str | None:
-        """The line on stderr for an event of the log that is its own; None: none."""
+        """The line on stderr for one of its own events of the log; None for others."""
 
     def evaluation(self, fit: Fit, held_out: list[Frame]) -> dict[str, Any]:
         """Arguments of `drgs.fitting.metrics.evaluate`."""
@@ -369,7 +370,7 @@ class Component:
 
     @classmethod
     def check(cls, checkpoint: Checkpoint) -> str | None:
-        """What is wrong with its part of a checkpoint, in words."""
+        """The first problem of its part of a checkpoint, in words; None: none."""
 
     @classmethod
     def load_gaussians(cls, gaussians: Gaussians, checkpoint: Checkpoint) -> Gaussians:
@@ -378,7 +379,7 @@ class Component:
 
     @classmethod
     def load_scene(cls, scene: Scene, checkpoint: Checkpoint) -> Scene:
-        """As `scene`, of a checkpoint; to be looked at, not fitted."""
+        """As `scene`, of a checkpoint; for rendering, not fitted."""
         return scene
 
     @classmethod

@@ -461,7 +461,7 @@ class ExposureComponent(Component):
         active = checkpoint.header.get("active") or {}
         self.evidence = checkpoint.header.get("exposure", active.get("exposure"))  # version 0.2.0 wrote it there
 
-    def shown(self, out: Output, frame: Frame) -> Output:
+    def as_photograph(self, out: Output, frame: Frame) -> Output:
         """See `Component`."""
         return out if self.module is None else self.module(out, frame)
 
@@ -562,7 +562,7 @@ def _trial(fit: Fit, views: list[View], estimate: ExposureEstimate) -> float:
             if use:
                 gains = estimate.log_gains[rest] - estimate.log_gains[rest].mean(axis=0)
                 component.use(short, seen, dataclasses.replace(estimate, log_gains=gains))
-            trial = fit.another(short, seen, few, component)
+            trial = fit.trial(short, seen, few, component)
             for _ in range(short.max_steps):
                 trial.step()
                 bar.advance()

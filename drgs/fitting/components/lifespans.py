@@ -188,7 +188,7 @@ class LifespansComponent(Component):
         if most <= 0:
             return []
         new = find_new_gaussians(
-            fit.photographs(), fit.scene(), fit.config.settings, fit.extent, most, fit.generator, fit.shown
+            fit.photographs(), fit.scene(), fit.config.settings, fit.extent, most, fit.generator, fit.as_photograph
         )
         self._use(fit)
         add_new_gaussians(fit.rows, new, self.times, _CLOSED_LOGIT, fit.config.density.max_gaussians)

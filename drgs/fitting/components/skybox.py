@@ -392,7 +392,7 @@ class SkyboxComponent(Component):
             ValueError: If a skybox is asked for where data say what is behind everything.
         """
         config, frames = setup.config, setup.frames
-        if "begin" in setup.ways:
+        if "begin" in setup.modes:
             return SkyboxChoice("the fit goes on from Gaussians of another one")
         if config.data.skybox == "off":
             return SkyboxChoice("skybox is off")

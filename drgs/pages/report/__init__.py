@@ -1,4 +1,4 @@
-"""What a fit looked like, as one self-contained page: what its folder says, charts, pictures, and the page itself."""
+"""The report of a fit as one self-contained page: contents of its run folder, charts and pictures."""
 
 from drgs.checks.imports import modules_of
 

@@ -1,4 +1,4 @@
-"""What a run folder says about how a fit went, checked before it is shown: log, metrics, selection, environment."""
+"""Contents of a run folder for its report, checked: log, metrics, selection and environment."""
 
 from __future__ import annotations
 
@@ -63,12 +63,12 @@ class Account:
 
     @property
     def step(self) -> int:
-        """Steps done, as far as the log knows."""
+        """Steps done, by the log."""
         return max((row["step"] for row in self.events), default=0)
 
     @property
     def state(self) -> str:
-        """Whether it is done, in a phrase."""
+        """Whether the fit is done, in words."""
         last = self.events[-1]["event"] if self.events else ""
         steps = f"{self.step:,} of {self.record.config.max_steps:,} steps"
         if last == "done":
@@ -77,7 +77,7 @@ class Account:
 
 
 def account_of(run: Run) -> Account:
-    """What a run folder says.
+    """Read a run folder.
 
     Raises:
         FileNotFoundError: If it is no run folder.
@@ -113,7 +113,7 @@ def _check_numbers(path: Path, values: dict) -> None:
 
 
 def _events(run: Run) -> tuple[list[dict[str, Any]], float]:
-    """The log, without what a resumed fit did again or a killed one left half written; the seconds it covers."""
+    """Events of the log without repeated steps of resumed fits and half-written lines; and the fit's seconds."""
     path = run.path / "log.jsonl"
     kept: list[dict[str, Any]] = []
     began = last = None

@@ -1,4 +1,4 @@
-"""Charts of a fit as SVG texts for a page: how it went, what was picked and why, and where the cameras stand.
+"""Charts of a fit as SVG texts for a page: its progress, the picks with their scores, and a map of the cameras.
 
 matplotlib draws them, without its global state; without the package there is none, and the page says how to get it.
 """
@@ -29,7 +29,7 @@ _MOST_BARS = 40  # latest picks that are drawn: more bars are too thin to read
 
 
 def is_available() -> bool:
-    """Whether there is a matplotlib to draw with."""
+    """Whether matplotlib is installed."""
     try:
         import matplotlib  # noqa: F401
     except ImportError:
@@ -221,5 +221,5 @@ def _is_number(value: object) -> bool:
 
 
 def _plain(text: str) -> str:
-    """A name as it is: matplotlib would read what stands between two dollars as a formula."""
+    """A name with its dollar signs escaped, between which matplotlib reads formulas."""
     return (text if len(text) <= 18 else "..." + text[-15:]).replace("$", r"\$")

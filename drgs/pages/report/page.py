@@ -36,7 +36,7 @@ _NO_CHARTS = "Charts are left out: they need matplotlib, pip install 'drgs[repor
 
 @dataclasses.dataclass(frozen=True)
 class Shown:
-    """What was drawn for a page.
+    """Charts and pictures of a page.
 
     Attributes:
         charts: Name (`progress`, `scores`, `cameras`) -> SVG, or None.
@@ -111,7 +111,7 @@ def page_html(account: Account, shown: Shown, command: str, command_text: str) -
 
 
 def _sections(context: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Anchors of what is on the page."""
+    """Anchors of the sections of the page."""
     there = {
         "fit": ("How it went", context["charts"].get("progress") or context["previews"]),
         "views": ("Views", context["views"]),
@@ -232,7 +232,7 @@ def _segmentation(metrics: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def _picks(account: Account) -> dict[str, Any]:
-    """What was picked, and what the held-out views had on the way."""
+    """Table of the picks, with the held-out PSNR between them."""
     selection = account.selection
     rows = []
     if selection is None:
@@ -295,7 +295,7 @@ def _configuration(account: Account) -> list[tuple[str, str, bool]]:
 
 
 def _rows(way: str, fields: dict, usual: dict) -> list[tuple[str, str, bool]]:
-    """Those of a nested record, its innermost fields by their ways."""
+    """Rows of a nested record: its innermost fields by their paths."""
     rows = []
     for name, value in fields.items():
         if isinstance(value, dict) and isinstance(usual[name], dict) and usual[name]:

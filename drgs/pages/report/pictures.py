@@ -1,4 +1,4 @@
-"""Pictures of a page: those that a fit has left in its folder, and those that are drawn of its last checkpoint."""
+"""Pictures of a page: files of the run folder, and renderings of its last checkpoint."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _MOST_STILLS = 12  # times at which one camera of a sequence is shown, evenly sp
 
 @dataclasses.dataclass(frozen=True)
 class Picture:
-    """A picture with what is said below it.
+    """A picture and its caption.
 
     Attributes:
         data: base64 of a JPEG.
@@ -69,14 +69,14 @@ def jpeg(image: np.ndarray, text: str, widest: int = _WIDEST) -> Picture:
 
 
 def spread(items: Sequence, count: int) -> list:
-    """At most so many of them, the first and the last included."""
+    """At most `count` items, evenly spaced, with the first and the last."""
     if len(items) <= count:
         return list(items)
     return [items[round(i)] for i in np.linspace(0, len(items) - 1, count)]
 
 
 def previews(account: Account) -> list[Picture]:
-    """What the fit looked like on the way: photograph and rendering, side by side."""
+    """Previews of the fit: photograph and rendering, side by side."""
     found = []
     for path in account.run.renders.glob("preview_*.png"):
         if (number := re.fullmatch(r"preview_(\d+)", path.stem)) and int(number[1]) <= account.step:
@@ -86,7 +86,7 @@ def previews(account: Account) -> list[Picture]:
 
 
 def view_pictures(account: Account, names: Sequence[str], kind: str) -> dict[str, Picture]:
-    """View -> the picture of it that the last measurement has left: `png` or `semantics.png`."""
+    """View -> its picture of the last measurement: `png` or `semantics.png`."""
     if account.metrics is None:
         return {}
     every = [row["name"] for row in account.metrics["views"]]
@@ -116,7 +116,7 @@ def maps(
     settings: RenderSettings,
     nuisances: Nuisances,
 ) -> dict[str, tuple[Picture, Picture]]:
-    """View -> pictures of what `uncertain` says of it."""
+    """View -> pictures of the maps of `uncertain`."""
     return {
         name: (
             jpeg(pictures.map_picture(_enlarged(variance)), "predictive variance"),
@@ -133,7 +133,7 @@ def uncertain(
     settings: RenderSettings,
     nuisances: Nuisances,
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """View -> two (H, W) maps: how uncertain each pixel is by what the fitted views say, and what no Gaussian covers.
+    """View -> two (H, W) maps: uncertainty of each pixel given the fitted views, and how much no Gaussian covers.
 
     The first is the predictive variance by the blocks geometry and backdrop, with lambda = 1, for noise of 1; of more
     than 24 known views, 24 evenly chosen ones stand for all. The second is 1 - alpha. `nuisances` are eliminated from

@@ -1,4 +1,4 @@
-"""The page of a run: what there is about it, gathered and written."""
+"""Make and write the report page of a run."""
 
 from __future__ import annotations
 

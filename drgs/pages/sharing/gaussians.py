@@ -19,7 +19,7 @@ __all__ = ["archive_of"]
 
 
 def archive_of(g: Gaussians) -> tuple[bytes, dict[str, Any] | None]:
-    """The archive, and what a page must know to read its spherical harmonics; None where there are none.
+    """The archive, and where in it spherical harmonics are; None where there are none.
 
     Spark reads the archive, but cuts SH off: `gaussians.js` reads them again, from the bytes that are named here.
 
@@ -43,7 +43,7 @@ def archive_of(g: Gaussians) -> tuple[bytes, dict[str, Any] | None]:
 
 
 def _sum(webp: bytes) -> int:
-    """What a page compares with its own: whether its browser tells the bytes of pictures as they are."""
+    """Checksum of a picture, by which a page finds out whether its browser decodes pictures unchanged."""
     values = pixels_of_webp("share", webp, 1, 1 << 28).reshape(-1).astype(np.uint64)
     weights = (np.arange(len(values), dtype=np.uint64) & 255) + 1
     return int((values * weights).sum() % (1 << 32))

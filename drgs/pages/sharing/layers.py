@@ -1,4 +1,4 @@
-"""What a page knows of each Gaussian beside its looks: its class, how uncertain it is, where it is at other times."""
+"""Layers of a page, a value for each Gaussian: its class, its uncertainty, its place at other times."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def classes_layer(
 def uncertainty_of(
     scene: Scene, cameras: Sequence[Camera], settings: RenderSettings, nuisances: Nuisances
 ) -> np.ndarray:
-    """(N,) what the photographs leave uncertain of where each Gaussian is.
+    """(N,) standard deviation of each Gaussian's position given the photographs.
 
     The standard deviation of its center for unit noise of the photographs' colors, in scene units: the square root of
     the sum over its three coordinates of 1 / (H + lambda), as `drgs convert --uncertainty` writes it.

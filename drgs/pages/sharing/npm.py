@@ -53,7 +53,7 @@ class Package:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """The files in it that are kept."""
+        """The files of the package that are kept."""
         return (*dict.fromkeys(self.modules.values()), self.license)
 
     @property
@@ -81,7 +81,7 @@ PACKAGES = (
         {"@sparkjsdev/spark": "dist/spark.module.min.js"},
     ),
 )
-"""What draws a page, both under the MIT license."""
+"""The packages that draw a page, both under the MIT license."""
 
 
 def viewer_files(cache: Path | None = None) -> Path:
@@ -101,7 +101,7 @@ def viewer_files(cache: Path | None = None) -> Path:
 
 
 def fetch_into(folder: Path) -> None:
-    """Fetch what is not there yet: each package whole or not at all.
+    """Fetch missing packages, each whole or not at all.
 
     Args:
         folder: Folder that gets a folder for each package; it is made.
@@ -123,7 +123,7 @@ def _user_cache() -> Path:
 
 
 def _fetched(package: Package) -> bytes:
-    """The archive as npm has it."""
+    """Download the archive of a package."""
     _log.info("fetching %s, once, for the pages of drgs share", package.address)
     try:
         with urllib.request.urlopen(package.address, timeout=_TIMEOUT) as answer:
@@ -154,7 +154,7 @@ def _checked(package: Package, archive: bytes) -> dict[str, bytes]:
 
 
 def _write(path: Path, data: bytes) -> None:
-    """A file, whole or not at all, also where two processes write it at once."""
+    """Write a file atomically, also where two processes write it at once."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".drgs.", delete=False) as file:
         file.write(data)

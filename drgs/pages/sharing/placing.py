@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 __all__ = ["PhotoKind", "columns", "photo", "upright_matrix"]
 
 PhotoKind = Literal["fitted", "next", "other"]
-"""A photograph, one to be taken next, or a view of what has no photographs."""
+"""A photograph, a photograph to take next, or a view of a scene without photographs."""
 
 _AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # of OpenGL's cameras, which look along -z with y up, in ours
 

@@ -1,4 +1,4 @@
-"""What the page of a scene shows: its Gaussians, the photographs' cameras, where it is uncertain, its classes."""
+"""Contents of the page of a scene: Gaussians, cameras of photographs, uncertainty and classes."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def scene_of_file(
     ranking: Ranking | None = None,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Shared:
-    """What the page of Gaussians without photographs shows.
+    """Contents of the page of Gaussians without photographs.
 
     Args:
         gaussians: At least one.
@@ -75,7 +75,7 @@ def scene_of_run(
     moments: int = MOMENTS,
     uncertainty: bool = True,
 ) -> Shared:
-    """What the page of a fit shows.
+    """Contents of the page of a run.
 
     Args:
         run: The run folder.
@@ -123,7 +123,7 @@ def _shared(
     around: Callable[[Gaussians], Camera] | None,
     background: tuple[float, float, float],
 ) -> Shared:
-    """A scene, looked at from where its photographs were taken."""
+    """Contents of a page that begins at the photographs' cameras."""
     fitted = [camera for kind, camera in cameras if kind == "fitted"]
     target, up = None, _UP
     if fitted:
@@ -152,7 +152,7 @@ def _ranking_of(run: Run, loaded: LoadedRun) -> Ranking | None:
 
 
 def _lines(run: Run, loaded: LoadedRun, photographs: int) -> list[str]:
-    """What a page says of its scene; what does not carry over is said in the log, too."""
+    """Lines of text about the scene; what the page cannot show is logged, too."""
     config = loaded.record.config
     lines = [f"{len(loaded.gaussians):,} Gaussians, fitted to {photographs:,} photographs."]
     if not planar_of(config.renderers, config.settings):
@@ -171,7 +171,7 @@ def _classes(loaded: LoadedRun) -> tuple[dict[str, Any], np.ndarray] | None:
 
 
 def _cameras(views: Sequence, names: Sequence[str], ranking: Ranking | None) -> list[tuple[PhotoKind, Camera]]:
-    """Cameras of the photographs that a run was fitted to, and of those to take next; none where nobody knows."""
+    """Cameras of a run's photographs and of the photographs to take next; none where they are not known."""
     placed = placed_views_of(views, names, ranking)
     fitted = [place.camera for place in placed if place.kind == "training"]
     picks = {place.best.pick: place.best.camera for place in placed if place.kind != "training" and place.best.pick}
@@ -181,7 +181,7 @@ def _cameras(views: Sequence, names: Sequence[str], ranking: Ranking | None) -> 
 
 
 def _times(loaded: LoadedRun, count: int) -> tuple[float, ...]:
-    """At most so many times, from the first to the last; none where nothing moves."""
+    """At most `count` times from the first to the last; none of a static scene."""
     if loaded.moving is None:
         return ()
     low, high = (float(x) for x in loaded.moving.field.grid.span)
@@ -194,7 +194,7 @@ def _times(loaded: LoadedRun, count: int) -> tuple[float, ...]:
 
 
 def _uncertainty(loaded: LoadedRun, fitted: list[Camera]) -> np.ndarray | None:
-    """(N,) what the photographs leave uncertain of where each Gaussian is, in scene units."""
+    """(N,) standard deviation of each Gaussian's position given the photographs, scene units."""
     if loaded.moving is not None:
         fitted = [camera for camera in fitted if camera.time is not None]
     if not fitted:

@@ -24,7 +24,7 @@ class BuildWithViewer(build_py):
     """`build_py`, and the packages of `drgs.pages.sharing.npm` beside the modules."""
 
     def run(self) -> None:
-        """Without a network a wheel goes without it, which is said: `drgs share` then fetches it at first use."""
+        """Fetch the viewer's code; without a network warn, and leave it to `drgs share`."""
         super().run()
         if self.editable_mode:
             return
@@ -41,7 +41,7 @@ class BuildWithViewer(build_py):
 
 
 def _npm() -> ModuleType:
-    """The module beside this one, which imports nothing of drgs."""
+    """Load npm.py by its path, without importing drgs."""
     name = "_drgs_sharing_npm"
     if name not in sys.modules:
         spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name("npm.py"))

@@ -1,4 +1,4 @@
-"""The page of a scene: what it shows, gathered and written."""
+"""Make and write the page of a scene."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _FAR_FACTOR = 10.0  # far plane over the distance of the farthest Gaussian: a re
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Shared:
-    """What a page shows.
+    """Contents of a page.
 
     Attributes:
         title: Name of the scene.
