@@ -146,7 +146,7 @@ def fit(
     run, first = Run(out_dir), None if begin is None else Path(begin)
     with lock_run(run, "fit", resume, [dataset.path]), threads, Bar("fit", show=progress):
         try:
-            setup, plan = _prepared(dataset, config, components, workers, pace, first)
+            setup, plan = _setup_of(dataset, config, components, workers, pace, first)
             return _fit(run, setup, plan, resume, pace, first)
         except (MemoryError, RuntimeError) as error:
             if not is_out_of_memory(error):
@@ -157,7 +157,7 @@ def fit(
             ) from error
 
 
-def _prepared(
+def _setup_of(
     dataset: Dataset,
     config: FitConfig,
     components: Sequence[Callable[[], Component]] | None,
@@ -231,10 +231,10 @@ def _fit(
         if len(named := [settings.nearest_preset()[0] for settings in trainer.renderers.all_settings]) > 1:
             bar.note(f"every step has one of the renderers {', '.join(named)}; --for fast fits for one alone")
         loop.run(bar)
-    return _finished(loop)
+    return _result_of(loop)
 
 
-def _finished(loop: _Loop) -> FitResult:
+def _result_of(loop: _Loop) -> FitResult:
     """Measure what was fitted, and write metrics.json."""
     run, trainer, setup, plan = loop.run_folder, loop.trainer, loop.setup, loop.plan
     gaussians, config, held_out = trainer.gaussians(), trainer.config, setup.held_out

@@ -20,7 +20,7 @@ from drgs.display.pictures import write_png
 from drgs.files import Run
 from drgs.pages.report import pictures
 from drgs.pages.report.account import account_of
-from drgs.pages.report.write import _Cast
+from drgs.pages.report.write import _Cameras
 
 LENS = (-0.3, 0.08, 0.002, -0.003, 0.0)
 
@@ -126,7 +126,7 @@ def test_information_through_the_lens(place, tmp_path):
 def test_maps_of_a_report(place, monkeypatch):
     """They are of the photographs as they were taken, as the pictures beside them."""
     account = account_of(Run(place / "run"))
-    cast = _Cast.of(account, drgs.data.load(account.record.data))
+    cast = _Cameras.of(account, drgs.data.load(account.record.data))
     cameras = [*cast.fitted, *cast.held.values()]
     assert len(cameras) >= 9
     assert {camera.distortion for camera in cameras} == {LENS}

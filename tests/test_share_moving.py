@@ -15,7 +15,7 @@ from drgs.commands.options import Share
 from drgs.commands.share import shared_of
 from drgs.deform import DynamicGaussians
 from drgs.dynamics.lifespans import Lifespans
-from drgs.pages.sharing.layers import moments_of
+from drgs.pages.sharing.layers import motion_layer
 from drgs.pages.sharing.write import write_page
 
 
@@ -35,7 +35,7 @@ def test_moments(run):  # noqa: F811
     """Numbers of 16 bits say where what moves is at each moment, to their step; what stands still is left out."""
     shared = shared_of_run(run)
     order = morton_order(shared.gaussians.means.numpy())
-    known, places, codes, lives = moments_of(shared.moving, shared.times, shared.gaussians, order)
+    known, places, codes, lives = motion_layer(shared.moving, shared.times, shared.gaussians, order)
     places = np.frombuffer(places, "<u4")
     codes = np.frombuffer(codes, "<u2").reshape(len(shared.times), 10, len(places))
     low, high = np.array(known["low"]), np.array(known["high"])
@@ -84,7 +84,7 @@ def test_lives_of_a_page(run):  # noqa: F811
     """What is there for a time is told by numbers of its own; moments say where it would be all the time."""
     shared = with_lives(shared_of_run(run))
     order = morton_order(shared.gaussians.means.numpy())
-    _, places, _, lives = moments_of(shared.moving, shared.times, shared.gaussians, order)
+    _, places, _, lives = motion_layer(shared.moving, shared.times, shared.gaussians, order)
     places, lives = np.frombuffer(places, "<u4"), np.frombuffer(lives, "<f4").reshape(9, -1)
     living = shared.moving.has_lifespan.numpy()[order]
     assert set(np.flatnonzero(living)) <= set(places.tolist())

@@ -761,7 +761,7 @@ def test_a_run_that_goes_on_is_shown(place, tmp_path, viewers):  # noqa: F811
     """Another checkpoint takes the place of what was shown: its step, its Gaussians, our picture of them."""
     shutil.copytree(place / "run", tmp_path / "run")
     args = View(scene=tmp_path / "run", preset="fast")
-    from drgs.commands.view import _reading, _stamps
+    from drgs.commands.view import _reload_job, _stamps
 
     viewer = viewers(subject_of(args, SceneInput.of(args)))
     before, pose = _stamps(watched_files(args)), viewer.subject.first.pose
@@ -773,13 +773,13 @@ def test_a_run_that_goes_on_is_shown(place, tmp_path, viewers):  # noqa: F811
         tensors, header = load_state(state)
         save_state(state, tensors, header | {"step": 13})
         assert _stamps(watched_files(args)) != before
-        viewer.worker.put("files", _reading(args, viewer))
+        viewer.worker.put("files", _reload_job(args, viewer))
         html(client, "step 13 of 12", after=at)
         client.picture(after=at)
         state.write_bytes(b"broken")
         (tmp_path / "run/point_cloud.ply").unlink()
         at = len(client.heard)
-        viewer.worker.put("files", _reading(args, viewer))
+        viewer.worker.put("files", _reload_job(args, viewer))
         html(client, "state.safetensors", after=at)
         client.look(pose.wxyz, np.array(pose.position) * 1.1)
         client.picture(after=at)  # what was there is still shown

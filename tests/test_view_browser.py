@@ -304,7 +304,7 @@ def test_a_click_on_a_camera_shows_it(shown, place):  # noqa: F811
     def watch():
         while not stop.wait(0.5):
             if view._stamps(watched_files(args)) != stamps:
-                viewer.worker.put("files", view._reading(args, viewer))
+                viewer.worker.put("files", view._reload_job(args, viewer))
                 return
 
     thread = threading.Thread(target=watch)

@@ -64,7 +64,7 @@ def test_a_run_becomes_dynamic_and_goes_on(stages, viewers, capfd):  # noqa: F81
         for round_, state in enumerate((moving, still, moving, still), 1):
             at = len(client.heard)
             now(state)
-            viewer.worker.put("files", view._reading(args, viewer))
+            viewer.worker.put("files", view._reload_job(args, viewer))
             html(client, f"step {12 if state is moving else 2} of 12", after=at)
             client.picture(after=at)
             (session,) = viewer.sessions.values()

@@ -377,16 +377,16 @@ class Stopwatch:
             config: Configuration with the sizes.
             is_first: Whether to take all renderers' first steps, which compile, beforehand.
         """
-        return _seconds_a_step(train, dataset, config, is_first)
+        return _seconds_per_step(train, dataset, config, is_first)
 
 
-def _seconds_a_step(train: list[View], dataset: Dataset, config: FitConfig, is_first: bool) -> float:
+def _seconds_per_step(train: list[View], dataset: Dataset, config: FitConfig, is_first: bool) -> float:
     """`Stopwatch.step`."""
     views = train[:: max(1, len(train) // _TIMED_VIEWS)]
-    with Bar("", show=False), _unlogged(), fewer_torch_threads():  # that of how long steps take is shown
+    with Bar("", show=False), _without_log(), fewer_torch_threads():  # that of how long steps take is shown
         frames = frames_for(views, config.data)
         timed = config.replace(data=dataclasses.replace(config.data, skybox="off", exposure="off", poses="fixed"))
-        trainer = start_plain(_filled(dataset, config), views, frames, timed)
+        trainer = start_plain(_with_more_points(dataset, config), views, frames, timed)
         # As late in a fit, where all degrees of color are there.
         while trainer.rows.sh_degree < config.sh_degree:
             trainer.rows.raise_sh_degree()
@@ -399,7 +399,7 @@ def _seconds_a_step(train: list[View], dataset: Dataset, config: FitConfig, is_f
 
 
 @contextlib.contextmanager
-def _unlogged() -> Iterator[None]:
+def _without_log() -> Iterator[None]:
     """Hide the log lines of a fit that is only timed."""
     log = logging.getLogger("drgs.train")
     level = log.level
@@ -410,7 +410,7 @@ def _unlogged() -> Iterator[None]:
         log.setLevel(level)
 
 
-def _filled(dataset: Dataset, config: FitConfig) -> Dataset:
+def _with_more_points(dataset: Dataset, config: FitConfig) -> Dataset:
     """The data set with as many points as a fit has Gaussians on average: between its points and its most.
 
     Points are repeated, displaced by a little of their own spread.

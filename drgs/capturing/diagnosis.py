@@ -41,7 +41,7 @@ _WIDEST_STEP = 35.0  # degrees between neighbors, seen from what they show, abov
 _SHOWN = 3  # names, or gaps, that a finding repeats: it is one line
 _EXPOSURE_PIXELS = 20_000  # pixels of a photograph whose colors are compared: points are few, their colors smooth
 _BAD_DB = 3.0  # dB below the median of the other held-out views
-_FAR_VIEW = 1.5  # times the usual distance (`_apart`) to the nearest training view
+_FAR_VIEW = 1.5  # times the usual distance (`_distance_to_nearest`) to the nearest training view
 _FAR_ALONE = 3.0  # the same, of the only held-out view, whose PSNR nothing is there to compare with
 _SPACING_VIEWS = 40  # photographs that say how far apart they usually are; more would take seconds
 _LOWERED_DB = 1.0  # dB by which a single view lowers the mean of all, that are worth a sentence
@@ -69,12 +69,12 @@ def of_photographs(
             gray.append(float(plain.mean()))
             bar.advance()
     findings = []
-    if blurred := [name for name, share in zip(names, _relative(sharp), strict=True) if share < _BLURRED]:
+    if blurred := [name for name, share in zip(names, _over_neighbors(sharp), strict=True) if share < _BLURRED]:
         one = "is" if len(blurred) == 1 else "are"
         findings.append(
             Finding(
                 "blur",
-                f"{_some(blurred)} {one} blurred, compared with the photographs next to {_them(blurred)}",
+                f"{_few_names(blurred)} {one} blurred, compared with the photographs next to {_pronoun(blurred)}",
                 "take these again: hold the phone still, with more light or a shorter exposure",
             )
         )
@@ -82,14 +82,14 @@ def of_photographs(
         findings.append(
             Finding(
                 "blank",
-                f"{_some(dark)} show next to nothing, too dark or too bright",
+                f"{_few_names(dark)} show next to nothing, too dark or too bright",
                 "leave these out, or take them again in other light",
             )
         )
     return findings
 
 
-def _relative(values: Sequence[float]) -> list[float]:
+def _over_neighbors(values: Sequence[float]) -> list[float]:
     """Each value over the median of its neighbors."""
     ratios = []
     for index, value in enumerate(values):
@@ -131,10 +131,10 @@ def of_poses(dataset: Dataset, names: Sequence[str], summary: SfmSummary | None 
         )
     if dataset.points is None or not len(dataset.points) or count < 3 or dataset.times:
         return findings
-    return findings + _of_steps(sorted(dataset.views, key=lambda view: view.name), dataset.points)
+    return findings + _of_neighbors(sorted(dataset.views, key=lambda view: view.name), dataset.points)
 
 
-def _of_steps(views: list[View], points: np.ndarray) -> list[Finding]:
+def _of_neighbors(views: list[View], points: np.ndarray) -> list[Finding]:
     """Turns on the spot, and gaps, from one photograph to the next.
 
     Args:
@@ -236,9 +236,9 @@ def of_views(dataset: Dataset, train: Sequence[str], psnr: Mapping[str, float]) 
         return []
     by_name = {view.name: view for view in dataset.views}
     fitted = [by_name[name] for name in train if name in by_name]
-    apart = {name: _apart(by_name[name], fitted) for name in psnr if name in by_name}
+    apart = {name: _distance_to_nearest(by_name[name], fitted) for name in psnr if name in by_name}
     some = fitted[:: -(-len(fitted) // _SPACING_VIEWS)] if fitted else []
-    spacing = [_apart(view, [other for other in fitted if other is not view]) for view in some]
+    spacing = [_distance_to_nearest(view, [other for other in fitted if other is not view]) for view in some]
     usual = float(np.median([*spacing, *apart.values()])) if fitted else 0.0
     others = {name: [x for other, x in psnr.items() if other != name] for name in psnr}
     if len(psnr) > 1:
@@ -256,7 +256,11 @@ def of_views(dataset: Dataset, train: Sequence[str], psnr: Mapping[str, float]) 
                 text += f", and their mean is {mean:.1f} dB, without it {without:.1f}"
         else:
             text += ", and is the only one"
-        nearest = min(fitted, key=lambda view: _apart(by_name[name], [view])).name if fitted and name in by_name else ""
+        nearest = (
+            min(fitted, key=lambda view: _distance_to_nearest(by_name[name], [view])).name
+            if fitted and name in by_name
+            else ""
+        )
         why = f": the nearest photograph, {nearest}, looks from elsewhere, maybe nothing else shows what it does"
         advice = (
             f"take two or three photographs around where {name} was taken"
@@ -267,7 +271,7 @@ def of_views(dataset: Dataset, train: Sequence[str], psnr: Mapping[str, float]) 
     return findings
 
 
-def _apart(view: View, others: Sequence[View]) -> float:
+def _distance_to_nearest(view: View, others: Sequence[View]) -> float:
     """Distance of the nearest other camera: degrees between axes, and distance in units of their spread."""
     if not others:
         return 0.0
@@ -292,11 +296,11 @@ def _angle(a: np.ndarray, b: np.ndarray) -> float:
     return math.degrees(math.acos(float(np.clip(a @ b / length, -1, 1))))
 
 
-def _some(names: Sequence[str]) -> str:
+def _few_names(names: Sequence[str]) -> str:
     """A few names, and how many more there are."""
     more = len(names) - _SHOWN
     return ", ".join(names[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
-def _them(names: Sequence[str]) -> str:
+def _pronoun(names: Sequence[str]) -> str:
     return "it" if len(names) == 1 else "them"

@@ -45,8 +45,8 @@ def fit_photographs(capture: Capture) -> Outcome:
     before = begin = None
     config = capture.config
     if capture.is_added:
-        before = _make_room(capture)
-        config, continues = _joined_config(capture)
+        before = _put_checkpoint_aside(capture)
+        config, continues = _config_with_more_photographs(capture)
         begin = before if continues else None
     resume = is_run(capture.options.output)
     if resume:
@@ -101,7 +101,7 @@ def _quality(capture: Capture, result: FitResult, max_pixels: int) -> str:
     return f", held-out PSNR {psnr:.2f} dB" + (f", {earlier['psnr']:.2f} dB before" if is_comparable else "")
 
 
-def _make_room(capture: Capture) -> Path:
+def _put_checkpoint_aside(capture: Capture) -> Path:
     """Move the checkpoint out of the run's files, which the next fit replaces; returns its path."""
     kept, batch, run = capture.folder / _BEFORE, capture.batch, capture.run
     if not batch.handover:
@@ -122,7 +122,7 @@ def _make_room(capture: Capture) -> Path:
     return kept
 
 
-def _joined_config(capture: Capture) -> tuple[FitConfig, bool]:
+def _config_with_more_photographs(capture: Capture) -> tuple[FitConfig, bool]:
     """The configuration of the last fit, with more Gaussians for more photographs; and whether the fit begins with
     what there is.
     """

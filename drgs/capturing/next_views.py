@@ -90,7 +90,7 @@ def rank_next(run: Path, k: int, length: str | None, show: bool = True) -> list[
             cache=cache,
             progress=bar.update,
         )
-        usual = statistics.mean(_own_gains(loaded, train, scoring, cache))
+        usual = statistics.mean(_gains_of_photographs(loaded, train, scoring, cache))
         rows = [{"index": i, "name": place.camera.name} for i, place in enumerate(places)]
         after = [_place_json(place, meters) for place in places]
         picks = [
@@ -114,7 +114,7 @@ def rank_next(run: Path, k: int, length: str | None, show: bool = True) -> list[
     return picks
 
 
-def _own_gains(loaded: LoadedRun, train: list[Camera], scoring: Scoring, cache: Cache) -> Iterator[float]:
+def _gains_of_photographs(loaded: LoadedRun, train: list[Camera], scoring: Scoring, cache: Cache) -> Iterator[float]:
     """Information gain of each of a few existing photographs, given all others."""
     for one in train[:: -(-len(train) // _COMPARED_PHOTOGRAPHS)]:
         others = [camera for camera in train if camera is not one]
@@ -123,7 +123,7 @@ def _own_gains(loaded: LoadedRun, train: list[Camera], scoring: Scoring, cache: 
 
 def _places(gaussians: Gaussians, cameras: list[Camera], train: list[Camera], settings: RenderSettings) -> list[Place]:
     """Places where a person can stand, and whose view is not emptier than the photographs."""
-    obstacles = _solid(gaussians, train)
+    obstacles = _obstacles(gaussians, train)
     places = places_around(cameras, upright(cameras), seen_distance(gaussians), obstacles)
     # What looks past the scene would tell most, of what nobody wants to see.
     most = _MOST_EMPTY + max(_empty_share(gaussians, camera, settings) for camera in train)
@@ -152,7 +152,7 @@ def _empty_share(gaussians: Gaussians, camera: Camera, settings: RenderSettings)
     return float((alpha.cpu() < 0.5).float().mean())
 
 
-def _solid(gaussians: Gaussians, cameras: list[Camera]) -> np.ndarray:
+def _obstacles(gaussians: Gaussians, cameras: list[Camera]) -> np.ndarray:
     """(P, 3) centers of the Gaussians that block a path, world."""
     means = gaussians.means.detach().cpu().double().numpy() + gaussians.origin  # looked at only
     solid = means[gaussians.opacities.detach().cpu().numpy() > _SOLID_OPACITY]

@@ -31,7 +31,7 @@ def new_files(
         ValueError: If all are.
     """
     others = before.batches
-    if len(others) > 1 and (options.resume or _is_unposed(before)):
+    if len(others) > 1 and (options.resume or _has_no_poses(before)):
         others = others[:-1]
     known = [row for batch in others for row in batch.inputs]
     new = [[path for path in paths if inputs_of([path])[0] not in known] for paths in (photographs, videos)]
@@ -57,9 +57,9 @@ def open_record(options: CaptureOptions, inputs: list[list[Any]], is_dataset: bo
     before = CaptureRecord.read(folder)
     batch = Batch(inputs, {"frames": options.frames, "masks": options.masks, "seed": options.seed})
     # What ended before its first photographs had poses is begun anew by the same command.
-    is_new = before is None or (len(before.batches) == 1 and _is_unposed(before) and not options.resume)
+    is_new = before is None or (len(before.batches) == 1 and _has_no_poses(before) and not options.resume)
     if options.add and not options.resume and before is not None:
-        return _with_batch(options, before, batch)
+        return _with_new_batch(options, before, batch)
     if is_new or before is None:
         if options.add:
             raise ValueError(f"{options.output}: --add must have a capture to add to, found none; leave --add out")
@@ -79,7 +79,7 @@ def open_record(options: CaptureOptions, inputs: list[list[Any]], is_dataset: bo
     return before
 
 
-def _is_unposed(record: CaptureRecord) -> bool:
+def _has_no_poses(record: CaptureRecord) -> bool:
     """Whether the last photographs have no poses yet, so that they have changed nothing."""
     return record.batch.step("poses") is None
 
@@ -109,9 +109,9 @@ def _check_same(options: CaptureOptions, before: CaptureRecord, batch: Batch, is
         )
 
 
-def _with_batch(options: CaptureOptions, record: CaptureRecord, batch: Batch) -> CaptureRecord:
+def _with_new_batch(options: CaptureOptions, record: CaptureRecord, batch: Batch) -> CaptureRecord:
     """The record with a new last batch, which replaces one without poses."""
-    if len(record.batches) > 1 and _is_unposed(record):
+    if len(record.batches) > 1 and _has_no_poses(record):
         record.batches.pop()
     if not (record.path / SCENE).is_dir():
         raise ValueError(

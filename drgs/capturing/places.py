@@ -139,7 +139,7 @@ def places_around(
     places = list[Place]()
     for move in _MOVES:
         for camera, way in known:
-            place = _placed(camera, up, way, move)
+            place = _moved_camera(camera, up, way, move)
             eye = place.camera.center
             taken = [*centers, *(other.camera.center for other in places)]
             if np.linalg.norm(np.stack(taken) - eye, axis=1).min() < _LEAST_APART * min(way, usual):
@@ -154,7 +154,7 @@ def places_around(
     return [places[i * len(places) // most] for i in range(most)]
 
 
-def _placed(camera: Camera, up: np.ndarray, way: float, move: tuple[float, float, float]) -> Place:
+def _moved_camera(camera: Camera, up: np.ndarray, way: float, move: tuple[float, float, float]) -> Place:
     """A camera moved from a photograph's, looking at what was in the middle of the photograph."""
     right, upward, ahead = level_frame(camera, up)
     target = camera.center + way * camera.c2w[:3, 2]

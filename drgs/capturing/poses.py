@@ -41,13 +41,13 @@ def find_poses(capture: Capture) -> Outcome:
         capture.plan("poses", plan)
         size = {"max_image_size": plan.max_image_size}
         capture.say(planned_poses(plan, len(names), capture.clock.left, budget))
-    with _explained(capture), Bar("poses") as bar:
+    with _with_findings(capture), Bar("poses") as bar:
         summary = run_sfm(
             capture.photos,
             capture.scene,
             SfmOptions(seed=capture.options.seed, masks=capture.options.masks, **size),
             bar.stage,
-            _shown_by(bar),
+            _progress_on(bar),
         )
     capture.poses_changed()
     line = (
@@ -68,19 +68,19 @@ def add_poses(capture: Capture) -> Outcome:
     scene, files = capture.scene, list_images(capture.photos)
     if not (scene / HELD_OUT).is_file():
         write_held_out(scene, fit_record(capture.run).test, "capture")
-    posed, summary = _posed(capture, files), None
+    posed, summary = _views_of_files(capture, files), None
     if not posed:
         with lock_folder(scene, "capture") as held:
             for link in _links_to(scene / "images", files):  # of a command that ended before it had poses
                 held.remove(link)
         before = capture.record.batches[0].plan.get("poses", {})
         size = {key: before[key] for key in ("max_image_size",) if key in before}
-        with _explained(capture), Bar("poses") as bar:
+        with _with_findings(capture), Bar("poses") as bar:
             options = SfmOptions(seed=capture.options.seed, **size)
-            joined = register(scene, files, options, bar.stage, _shown_by(bar))
+            joined = register(scene, files, options, bar.stage, _progress_on(bar))
         summary = joined.summary
         capture.poses_changed()
-        posed = _posed(capture, files)
+        posed = _views_of_files(capture, files)
     with Bar("what poses say"):
         names = [path.name for path in list_images(scene / "images")]
         findings = diagnosis.of_poses(capture.dataset, names, summary)
@@ -99,7 +99,7 @@ def given_poses(capture: Capture) -> Outcome:
 
 
 @contextmanager
-def _explained(capture: Capture) -> Iterator[None]:
+def _with_findings(capture: Capture) -> Iterator[None]:
     """Append the findings about the photographs to an error's text."""
     try:
         yield
@@ -108,12 +108,12 @@ def _explained(capture: Capture) -> Iterator[None]:
         raise ValueError(f"poses: {error}{reasons}") from None
 
 
-def _shown_by(bar: Bar) -> Callable[[str], None]:
+def _progress_on(bar: Bar) -> Callable[[str], None]:
     """Show the progress of mapping."""
     return lambda text: bar.update(bar.done, text=text)
 
 
-def _posed(capture: Capture, files: list[Path]) -> list[str]:
+def _views_of_files(capture: Capture, files: list[Path]) -> list[str]:
     """Names of the views of the data set whose photograph is one of the files."""
     named = {path.resolve() for path in files}
     views = capture.dataset.views

@@ -50,11 +50,11 @@ def capture_photographs(args: Capture, config: FitConfig) -> None:
         add=args.add,
         progress=not args.quiet,
     )
-    say = _say_nothing if args.quiet else functools.partial(print, flush=True)
+    say = _no_output if args.quiet else functools.partial(print, flush=True)
     run_capture(options, config, say, report_of)
 
 
-def _say_nothing(_: str) -> None:
+def _no_output(_: str) -> None:
     """With --quiet."""
 
 

@@ -55,7 +55,7 @@ _PRESETS = {
 }
 _DIFFERENCE_GAIN = 8  # factor of difference pictures: differences of a few of 255 levels become visible; chosen
 _PANEL_WIDTH = 600  # pixels of width of a picture in overview.png; chosen
-_OWN = ("demo", "eval", "report")  # commands whose files in the run may be replaced
+_OWN_COMMANDS = ("demo", "eval", "report")  # commands whose files in the run may be replaced
 _TARGET = (0.0, -0.02, 0.12)  # the middle of the table, in meters
 _DISTANCE = 1.1  # meters from there to the cameras of the turntable, outside of the table; chosen
 
@@ -142,11 +142,11 @@ def make_demo(out_dir: Path, plan: Plan, progress: bool = False) -> dict:
 
 def _make_demo(out_dir: Path, run_folder: LockedFolder, plan: Plan, progress: bool) -> dict:
     """The tour, in folders that belong to it: six stages, each timed, and demo.json at the end."""
-    run_folder.check_all(_OWN)
-    tour = _Tour(out_dir, plan, progress)
+    run_folder.check_all(_OWN_COMMANDS)
+    tour = _Demo(out_dir, plan, progress)
     began = time.perf_counter()
     dataset = load(tour.still_life())
-    run_folder.clear(_OWN)
+    run_folder.clear(_OWN_COMMANDS)
     fitted, frames = tour.fit(dataset)
     g = fitted.gaussians
     images, rows = tour.compare(g, frames)
@@ -177,7 +177,7 @@ def _make_demo(out_dir: Path, run_folder: LockedFolder, plan: Plan, progress: bo
 
 
 @dataclasses.dataclass
-class _Tour:
+class _Demo:
     """The stages of the demo; each says what comes out, and how long it took is in `seconds`."""
 
     out_dir: Path

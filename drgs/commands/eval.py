@@ -45,7 +45,7 @@ def print_table(metrics: dict, *, lpips: bool = False) -> None:
         f"{metrics['count']} {metrics['split']} views"
         + (f", {scale:g} times as wide and high as fitted" if scale else ""),
         ("view", *names),
-        [(row["name"], *(_shown(row[name], digits.get(name, ".4f")) for name in names)) for row in rows],
+        [(row["name"], *(_formatted(row[name], digits.get(name, ".4f")) for name in names)) for row in rows],
     )
     if found := metrics.get("segmentation"):
         _print_segmentation(metrics, found)
@@ -60,7 +60,7 @@ def print_table(metrics: dict, *, lpips: bool = False) -> None:
         print(_motion_line(moved, metrics["gaussians"]))
 
 
-def _shown(value: float | None, digits: str) -> str:
+def _formatted(value: float | None, digits: str) -> str:
     return "-" if value is None else f"{value:{digits}}"
 
 

@@ -335,7 +335,7 @@ def _print(args: Fisher, known: Known, groups: dict[str, GroupSummary], views: l
         share = f"{row.zero / max(math.prod(row.shape), 1):.1%}"
         shape = "x".join(map(str, row.shape))
         rows.append(
-            (name, shape, f"{row.sum:.4g}", f"{row.median_of_positive or 0:.4g}", share, *_parts(row.blocks, several))
+            (name, shape, f"{row.sum:.4g}", f"{row.median_of_positive or 0:.4g}", share, *_shares(row.blocks, several))
         )
     title = f"information of {len(known.cameras)} views ({known.source})"
     tables.show(title, ("group", "shape", "sum", "median > 0", "nothing known", *_percent(several)), rows)
@@ -343,7 +343,7 @@ def _print(args: Fisher, known: Known, groups: dict[str, GroupSummary], views: l
     for row in views:
         values = row.pose.eigenvalues if row.pose else []
         numbers = (row.gain["eig"], row.gain["logdet"], row.variance.mean, *values[:1], *values[-1:])
-        parts = _parts({block: maps["variance"].sum for block, maps in row.blocks.items()}, several)
+        parts = _shares({block: maps["variance"].sum for block, maps in row.blocks.items()}, several)
         rows.append((row.name, *(f"{x:.3g}" for x in numbers), *parts))
     poses = ("pose: least", "most") if args.pose else ()
     columns = ("view", "eig", "logdet", "mean variance", *poses, *(f"eig: {x}" for x in _percent(several)))
@@ -359,7 +359,7 @@ def _percent(several: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(f"{block if len(several) < 3 else block[:4] + '.'} %" for block in several)  # of 80 columns
 
 
-def _parts(blocks: dict[str, float], several: tuple[str, ...]) -> tuple[str, ...]:
+def _shares(blocks: dict[str, float], several: tuple[str, ...]) -> tuple[str, ...]:
     """Share of each block in a sum, for the columns of a table."""
     total = sum(blocks.values())
     return tuple(f"{100 * blocks[block] / total:.1f}" if total else "-" for block in several)

@@ -57,7 +57,7 @@ def run(args: Query) -> None:
     count = int(selected.sum())
     kept = g.take(~selected if args.remove else selected)
     largest = float(score.max()) if len(g) else 0.0
-    _refuse_nothing(len(g), count, largest, query, args.remove, _too_short(given))
+    _check_not_empty(len(g), count, largest, query, args.remove, _advice_of_short_fit(given))
     cameras, source = views_to_sample(args, given, given.keeps_lenses(args.undistort))
     check_lenses("query", settings, cameras)
     pixels = args.max_pixels or (given.record.config.data.max_pixels if given.record else None)
@@ -137,7 +137,7 @@ def _query(args: Query, given: SceneInput) -> TextQuery:
     return TextQuery.of_classes(given.classes, args.classes, args.threshold, temperature)
 
 
-def _too_short(given: SceneInput) -> str:
+def _advice_of_short_fit(given: SceneInput) -> str:
     """What to do, if a run has done fewer steps than its features need to tell classes apart; else "".
 
     They begin at 0 and move by their learning rate a step, Adam's: to about 1 in 1 / rate steps. Measured in
@@ -156,7 +156,7 @@ def _too_short(given: SceneInput) -> str:
     )
 
 
-def _refuse_nothing(total: int, selected: int, largest: float, query: TextQuery, remove: bool, too_short: str) -> None:
+def _check_not_empty(total: int, selected: int, largest: float, query: TextQuery, remove: bool, too_short: str) -> None:
     """Raise ValueError where the PLY would hold no Gaussian; `too_short`: what to do about the fit, if anything."""
     if selected == 0:
         advice = f"{'give a' if query.threshold is None else 'lower'} --threshold or look for something else"

@@ -103,7 +103,7 @@ def run(args: Render) -> None:
     if "ply" in formats:
         output.check(ply_names(cameras))
     if not args.quiet:
-        _say_how_long(args, gaussians, cameras, settings)
+        _print_forecast(args, gaussians, cameras, settings)
     with Bar("render", len(cameras), not args.quiet) as bar:
         report = render_views(
             gaussians if given.moving is None else given.moving,
@@ -119,10 +119,10 @@ def run(args: Render) -> None:
         )
     report = {"scene": str(args.scene), "cameras": source, "gaussians": len(gaussians)} | report
     if single is not None:
-        _say(args, _summary(report, single.path))
+        _print(args, _summary(report, single.path))
         return
     _write_lists(args, report, film, given, cameras, formats)
-    _say(args, _summary(report, args.output))
+    _print(args, _summary(report, args.output))
 
 
 def _check(args: Render, settings: RenderSettings, formats: tuple[str, ...]) -> None:
@@ -153,7 +153,7 @@ def _write_lists(
     if all(not camera.is_distorted and camera.K[0, 1] == 0 for camera in cameras):
         save_cameras_json(args.output / "cameras.json", cameras)
     else:
-        _say(
+        _print(
             args,
             "no cameras.json: its layout has no lens and no skew; render.json holds the cameras, --cameras reads it",
         )
@@ -201,7 +201,7 @@ def _cameras_of(
     bent = sum(camera.is_distorted for camera in cameras)
     if bent and not args.panorama and not (follows or given.keeps_lenses(args.undistort)):
         cameras = [camera.undistorted() for camera in cameras]
-        _say(args, f"{bent} cameras have a lens: drawn without it; --undistort off draws through it")
+        _print(args, f"{bent} cameras have a lens: drawn without it; --undistort off draws through it")
     check_lenses("render", settings, cameras)
     return cameras, source
 
@@ -289,7 +289,7 @@ def _write_pictures(
         pictures.write_png(folder / files[-1], rgb)
     if "jpg" in kinds:
         files.append(f"{name}.jpg")
-        pictures.write_jpg(folder / files[-1], rgb, is_panorama=_is_whole(camera))
+        pictures.write_jpg(folder / files[-1], rgb, is_panorama=_is_full_panorama(camera))
     if "exr" in kinds:
         files.append(f"{name}.exr")
         pictures.write_exr(folder / files[-1], rgb, A=alpha, Z=distance)
@@ -332,7 +332,7 @@ def _movie_of(video: str, kind: str, end: str) -> str:
     return f"{video}.{kind}.{end}" if kind else f"{video}.{end}"
 
 
-def _is_whole(camera: Camera) -> bool:
+def _is_full_panorama(camera: Camera) -> bool:
     """Whether a camera sees all round, 360 by 180 degrees."""
     if camera.model != "equirectangular":
         return False
@@ -390,20 +390,20 @@ def _summary(report: dict, folder: Path) -> str:
     return text
 
 
-def _say_how_long(args: Render, gaussians: Gaussians, cameras: list[Camera], settings: RenderSettings) -> None:
+def _print_forecast(args: Render, gaussians: Gaussians, cameras: list[Camera], settings: RenderSettings) -> None:
     """Print a forecast of the time with exact order on every ray, which may take minutes."""
     if settings.order != "ray" or sum(camera.width * camera.height for camera in cameras) < _FORECAST_PIXELS:
         return
     seconds = forecast(gaussians, cameras, settings)
     if seconds > _LONG_SECONDS:
         what = f"{args.preset}, {len(cameras)} views of {cameras[0].width}x{cameras[0].height}"
-        _say(
+        _print(
             args,
             f"{what} will take about {duration(seconds)} on this machine; --preset fast takes a small part of that",
         )
 
 
-def _say(args: Render, text: str) -> None:
+def _print(args: Render, text: str) -> None:
     if not args.quiet:
         print(text, flush=True)
 

@@ -45,7 +45,7 @@ def run(args: Reproduce) -> None:
     """`drgs reproduce static -o OUT`."""
     out: Path = args.output
     lock_folder(out, "reproduce", [_GIVEN, *(f"{args.what}.{kind}" for kind in ("md", "json", "png"))], args.data)
-    known = _same_data(out, args.data)
+    known = _data_of_rows(out, args.data)
     weights = args.lpips_weights and args.lpips_weights.resolve()
     if weights:
         Lpips(weights)  # which every fit would else find out at its end
@@ -94,7 +94,7 @@ def _run_on(workers: Cluster, *where: Any) -> tuple[list[Cell], dict[Cell, str]]
     return run_cells_on(workers, *where)
 
 
-def _same_data(out: Path, given: Sequence[Path]) -> dict[str, str]:
+def _data_of_rows(out: Path, given: Sequence[Path]) -> dict[str, str]:
     """Name -> data set of a folder's rows and of those that are given; refuses a name that rows have of another one."""
     path = out / _GIVEN
     known = read_json(path, "data sets by name", "restore it") if path.exists() else {}

@@ -65,7 +65,7 @@ def run(args: Scene) -> None:
     with Bar("path tracing", show=not args.quiet) as bar:
         folder = maker.generate(args.output, **numbers, progress=bar.update)
     if not args.quiet:
-        _say(args.name, folder, maker, numbers)
+        _print_result(args.name, folder, maker, numbers)
 
 
 def maker_of(name: str) -> ModuleType:
@@ -92,7 +92,7 @@ def _pose_error(text: str) -> tuple[float, float]:
     return degrees, meters
 
 
-def _say(name: str, folder: Path, maker: ModuleType, numbers: dict[str, Any]) -> None:
+def _print_result(name: str, folder: Path, maker: ModuleType, numbers: dict[str, Any]) -> None:
     """Print the data set's folder and the next command."""
     every = ""
     if name == "capture":

@@ -50,10 +50,10 @@ def picture_functions(kinds: Iterable[str], given: SceneInput, scene: Path) -> d
     from drgs.features.segmentation import classify
     from drgs.fitting.segments import feature_colors
 
-    made: dict[str, PictureFunction] = {}
+    functions: dict[str, PictureFunction] = {}
     if "features" in kinds:
         colors = feature_colors(given.gaussians, decoder)
-        made["features"] = lambda out: colors.picture(_shown(out), decoder)
+        functions["features"] = lambda out: colors.picture(_features(out), decoder)
     if {"labels", "overlay"} & {*kinds}:
         if classes is None or classes.embeddings is None or (given.run is not None and decoder is None):
             raise ValueError(
@@ -65,13 +65,13 @@ def picture_functions(kinds: Iterable[str], given: SceneInput, scene: Path) -> d
 
         def labels(out: Output) -> np.ndarray:
             """(H, W) labels; 0 where the opacity is low and the decoder's bias alone would decide."""
-            return np.where(out.alpha.cpu() < OPAQUE, 0, classify(_shown(out), known, decoder))
+            return np.where(out.alpha.cpu() < OPAQUE, 0, classify(_features(out), known, decoder))
 
-        made["labels"] = lambda out: label_picture(labels(out), count)
-        made["overlay"] = lambda out: overlay(out.rgb.cpu().clamp(0, 1).numpy(), labels(out), count)
-    return {kind: made[kind] for kind in kinds}
+        functions["labels"] = lambda out: label_picture(labels(out), count)
+        functions["overlay"] = lambda out: overlay(out.rgb.cpu().clamp(0, 1).numpy(), labels(out), count)
+    return {kind: functions[kind] for kind in kinds}
 
 
-def _shown(out: Output) -> torch.Tensor:
+def _features(out: Output) -> torch.Tensor:
     assert out.features is not None  # the Gaussians have some
     return out.features

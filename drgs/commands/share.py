@@ -83,7 +83,7 @@ def shared_of(args: Share) -> Shared:
             raise ValueError(
                 f"{args.scene}: there must be at least one Gaussian, got none; fit longer, or name another"
             )
-        return scene_of_file(given.gaussians, args.scene.stem, _all_of_it, ranking, given.background)
+        return scene_of_file(given.gaussians, args.scene.stem, _overview_camera, ranking, given.background)
     run = Run(args.scene)
     loaded = load_run(run)
     return scene_of_run(
@@ -91,7 +91,7 @@ def shared_of(args: Share) -> Shared:
         _dataset(loaded.record),
         loaded=loaded,
         ranking=ranking,
-        around=_all_of_it,
+        around=_overview_camera,
         moments=args.moments,
         uncertainty=args.uncertainty,
     )
@@ -107,7 +107,7 @@ def _dataset(record: FitRecord) -> Dataset | None:
         return None
 
 
-def _all_of_it(gaussians: Gaussians) -> Camera:
+def _overview_camera(gaussians: Gaussians) -> Camera:
     """A camera that sees all Gaussians."""
     width, height = _DEFAULT_SIZE
     return scene_orbit(gaussians, 1, width=width, height=height)[0]

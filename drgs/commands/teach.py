@@ -55,7 +55,7 @@ def run(args: Teach) -> None:
     folder = args.data if args.data.is_dir() else args.data.parent
     output = lock_folder(folder, "teach", inputs=[args.model])
     output.remove_unfinished(_FOLDER)
-    _refuse_others(output)
+    _check_no_other_files(output)
     names = _names(args, output)
     times = DataConfig.times if args.times is None else args.times
     files = _files(data.load(args.data, points=False, strict=args.strict, semantics=False, times=times).views)
@@ -76,7 +76,7 @@ def run(args: Teach) -> None:
         "templates": TEMPLATES,
     }
     texts = encoder.texts(names) if names else None  # before anything is written: there may be no tokenizer
-    _start(output, record)
+    _write_record(output, record)
     if texts is not None:
         _write_texts(output, texts, names)
     with Bar("maps that are there", show=not args.quiet):  # each of them is hashed
@@ -103,7 +103,7 @@ def _scales(text: str) -> list[float]:
     return scales
 
 
-def _refuse_others(output: LockedFolder) -> None:
+def _check_no_other_files(output: LockedFolder) -> None:
     """Raise ValueError where a teacher's files are there that this command did not write."""
     folder = output.path / _FOLDER
     if not folder.is_dir() or folder.is_symlink():
@@ -171,7 +171,7 @@ def _files(views: list[View]) -> dict[str, View]:
     return files
 
 
-def _start(output: LockedFolder, record: dict) -> None:
+def _write_record(output: LockedFolder, record: dict) -> None:
     """Write the record of the maps to come; maps of another record are deleted first."""
     path = output.path / _RECORD
     held = read_json(path) if path.is_file() else {}

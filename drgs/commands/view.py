@@ -79,10 +79,10 @@ def _watch(args: View, viewer: Viewer, stamps: dict[Path, tuple[int, int, int]])
         now = _stamps(watched_files(args))
         if now != stamps and not viewer.worker.has("files"):
             stamps = now
-            viewer.worker.put("files", _reading(args, viewer))
+            viewer.worker.put("files", _reload_job(args, viewer))
 
 
-def _reading(args: View, viewer: Viewer) -> Iterator[None]:
+def _reload_job(args: View, viewer: Viewer) -> Iterator[None]:
     """A job that shows the files' present contents in all browsers."""
     viewer.replace(subject_of(args, SceneInput.of(args), viewer.subject))
     yield
@@ -126,15 +126,15 @@ def subject_of(args: View, given: SceneInput, before: Subject | None = None) -> 
         FileNotFoundError, ValueError: If a file that was named is not there or damaged.
     """
     notes: list[str] = []
-    known = _known(args, given, notes)
+    known = _known_views(args, given, notes)
     ranking = ranking_of(args.selection, given)
     placed_views = _placed_views(args, given, ranking, notes)
     uncertainty = _uncertainty(args, given, known)
     origin = np.array(given.gaussians.origin, np.float64)
-    first = before.first if before else _first(args, given.gaussians, known.cameras if known else [])
+    first = before.first if before else _first_camera(args, given.gaussians, known.cameras if known else [])
     # What a network leaves uncertain takes tangents of all pixels; the rest of a map costs no more than a picture.
     pixels = known.pixels if known and given.moving is not None else None
-    if before is not None and _same(before.placed_views, placed_views) and before.ranking == ranking:
+    if before is not None and _same_places(before.placed_views, placed_views) and before.ranking == ranking:
         placed_views = before.placed_views
     return Subject(
         name="/".join(args.scene.resolve().parts[-2:]),
@@ -144,7 +144,7 @@ def subject_of(args: View, given: SceneInput, before: Subject | None = None) -> 
         origin=origin,
         times=_times(given),
         settings=given.settings,
-        layers=layers_of(_paint(args, given), uncertainty, pixels),
+        layers=layers_of(_picture_functions(args, given), uncertainty, pixels),
         placed_views=placed_views,
         ranking=ranking,
         uncertainty=uncertainty,
@@ -174,7 +174,7 @@ def _times(given: SceneInput) -> tuple[float, ...]:
     return tuple(dict.fromkeys(float(x) for x in given.moving.field.grid.span))
 
 
-def _paint(args: View, given: SceneInput) -> dict[str, PictureFunction]:
+def _picture_functions(args: View, given: SceneInput) -> dict[str, PictureFunction]:
     """Kind -> function that makes pictures of features and labels, of those that the scene has."""
     functions: dict[str, PictureFunction] = {}
     if given.gaussians.features is None:
@@ -187,7 +187,7 @@ def _paint(args: View, given: SceneInput) -> dict[str, PictureFunction]:
     return functions
 
 
-def _known(args: View, given: SceneInput, notes: list[str]) -> Known | None:
+def _known_views(args: View, given: SceneInput, notes: list[str]) -> Known | None:
     """The views that the run was fitted to; None without a run, or where its data set has gone."""
     if args.train is None and given.run is None:
         return None
@@ -216,7 +216,7 @@ def _placed_views(args: View, given: SceneInput, ranking: Ranking | None, notes:
     except (OSError, ValueError):
         if args.train is not None:
             raise
-        return placed_views_of([], (), ranking)  # `_known` has said why
+        return placed_views_of([], (), ranking)  # `_known_views` has said why
     return placed_views_of(views, fitted, ranking)
 
 
@@ -240,7 +240,7 @@ def _uncertainty(args: View, given: SceneInput, known: Known | None) -> Uncertai
     )
 
 
-def _first(args: View, gaussians: Gaussians, captured: list[Camera]) -> FirstView:
+def _first_camera(args: View, gaussians: Gaussians, captured: list[Camera]) -> FirstView:
     """Where the photographs were taken, towards what they look at; of a bare PLY, so that all of it is seen."""
     if not len(gaussians):
         raise ValueError(f"{args.scene}: there must be at least one Gaussian, got none; fit longer, or name another")
@@ -264,7 +264,7 @@ def _first(args: View, gaussians: Gaussians, captured: list[Camera]) -> FirstVie
     return FirstView(pose, target, up / np.linalg.norm(up))
 
 
-def _same(before: tuple[PlacedView, ...], after: tuple[PlacedView, ...]) -> bool:
+def _same_places(before: tuple[PlacedView, ...], after: tuple[PlacedView, ...]) -> bool:
     """Whether both are the same places with the same names: then a browser need not draw them again."""
     return [_key(placed) for placed in before] == [_key(placed) for placed in after]
 

@@ -234,10 +234,10 @@ def _orbit_to_render(
     how = {"width": width, "height": height, "fixed": fixed, "returns": returns}
     cameras, source = capture_orbit(captured, frames, distance_of=seen_distance(given.gaussians), **how)
     if cameras:
-        _say(args, source)
+        _print(args, source)
         return cameras, source
     if fixed.up is None:
-        _say(args, "orbit with minus-y up, as COLMAP's worlds stand; turn it with --orbit up=z")
+        _print(args, "orbit with minus-y up, as COLMAP's worlds stand; turn it with --orbit up=z")
     up = next(name for name, direction in UP.items() if direction == (fixed.up or UP["minus-y"]))
     return scene_orbit(given.gaussians, frames, **how), f"orbit, up {up}"
 
@@ -480,6 +480,6 @@ def check_lenses(command: str, settings: RenderSettings, cameras: Iterable[Camer
         )
 
 
-def _say(args: Render | Crossval | Query | Tradeoff, text: str) -> None:
+def _print(args: Render | Crossval | Query | Tradeoff, text: str) -> None:
     if not args.quiet:
         print(text, flush=True)

@@ -169,7 +169,7 @@ def surface(
         advance: Called with the number of bricks that were done.
     """
     bricks = bricks_of(views, voxel, trunc) if bricks is None else bricks
-    cones = [_Seen.of(view) for view in views]
+    cones = [_ViewFrustum.of(view) for view in views]
     offsets = np.stack(np.meshgrid(*[np.arange(BRICK + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
     keys, places, faces = [], [], []
     count = 0
@@ -232,7 +232,7 @@ def _edges(brick: np.ndarray, local: np.ndarray) -> np.ndarray:
     return np.column_stack([brick * BRICK + below.astype(np.int64), way])
 
 
-class _Seen:
+class _ViewFrustum:
     """A view with a fast test of whether a ball may be in its frustum."""
 
     def __init__(self, view: DepthView, axis: np.ndarray | None, angle: float):
@@ -242,7 +242,7 @@ class _Seen:
         self._angle = angle
 
     @classmethod
-    def of(cls, view: DepthView) -> _Seen:
+    def of(cls, view: DepthView) -> _ViewFrustum:
         """The cone of a pinhole; other lenses see all around."""
         camera = view.camera
         if camera.is_distorted or camera.is_rolling:

@@ -145,7 +145,7 @@ class Study:
         start = self.of_one_camera if self.of_one_camera and not cell.camera else {}
         return self.fit.replace(**changed, start=cell.start, **{**start, **protocol.selection, **fields})
 
-    def _made(self, cell: Cell) -> Path:
+    def _folder_of(self, cell: Cell) -> Path:
         """The folder of a cell's data set, once no other process is making it any more."""
         is_announced = False
         while True:
@@ -165,7 +165,7 @@ class Study:
         """
         (every, offset) = cell.split
         config = self.config_of(cell)
-        dataset = load_dataset(self._made(cell), config, lazy=True, points=PROTOCOLS[cell.protocol].leaks)
+        dataset = load_dataset(self._folder_of(cell), config, lazy=True, points=PROTOCOLS[cell.protocol].leaks)
         if cell.camera:
             return dataset  # which knows the camera, or has been refused
         names = sorted(view.name for view in (*dataset.views, *dataset.absent))
@@ -302,11 +302,11 @@ def out_of_race(study: Study, rows: Iterable[Mapping[str, Any]], protocol: str) 
 
 def result_line(study: Study, cell: Cell, row: Mapping[str, Any]) -> str:
     """The metrics of a finished cell, in a line."""
-    numbers = ", ".join(_said(m, row["metrics"][m.key]) for m in study.metrics)
+    numbers = ", ".join(_shown_metric(m, row["metrics"][m.key]) for m in study.metrics)
     return f"{cell.name}: {numbers}" + (f", {row['seconds']:.0f} s" if row["seconds"] is not None else "")
 
 
-def _said(metric: Metric, value: float | None) -> str:
+def _shown_metric(metric: Metric, value: float | None) -> str:
     return f"{metric.title} {'none' if value is None else f'{value:.{metric.digits}f}'}"
 
 

@@ -18,7 +18,7 @@ __all__ = ["StudyPlan", "plan_of"]
 
 _ROOMS = {"tiny": ("room-1",), "small": ("room-1", "room-2"), "paper": ("room-1", "room-2")}
 _CAMERA = "cam00"  # of a kitchen: in the middle of the arc
-_UNKNOWN = (0, 0)  # the split that a data set states
+_STATED_SPLIT = (0, 0)  # the split that a data set states
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +94,7 @@ def plan_of(
         lacking |= {(scene, label) for label in missing}
     units = [turn[k] for k in range(seeds) for turn in turns]  # seeds outermost, as of scenes that are made
     if not given:
-        units = _made_units(study, scale, moves, seeds, protocol)
+        units = _units_of_generated(study, scale, moves, seeds, protocol)
     cells = [cell for cell in study.cells(units) if (cell.scene, cell.policy) not in lacking]
     return StudyPlan(experiment, study, tuple(cells), tuple(notes))
 
@@ -119,7 +119,7 @@ def _check_options(
         raise ValueError(f"reproduce: --seeds must be at least 1, got {seeds}; raise it")
 
 
-def _made_units(study: Study, scale: StudyScale, moves: bool, seeds: int, protocol: ProtocolName) -> list:
+def _units_of_generated(study: Study, scale: StudyScale, moves: bool, seeds: int, protocol: ProtocolName) -> list:
     """Units of scenes that are made, seeds outermost."""
     if moves:
         return [(f"kitchen-{seed}", _CAMERA, "first", protocol, 0) for seed in range(1, seeds + 1)]
@@ -146,7 +146,7 @@ def _units_of(
     if moves:
         cameras = sorted({view.camera_name for view in test})
         if cameras == [""]:  # one camera that moves about and films, whose files state a split
-            return [(scene, _UNKNOWN, "seed", protocol, seed) for seed in range(seeds)]
+            return [(scene, _STATED_SPLIT, "seed", protocol, seed) for seed in range(seeds)]
         if len(cameras) > 1:
             raise ValueError(
                 f"{dataset.path}: must hold out one of several synchronous cameras, holds out "
@@ -155,8 +155,8 @@ def _units_of(
         return [(scene, cameras[0], "first", protocol, seed) for seed in range(seeds)]
     names = sorted(view.name for view in (*train, *test, *dataset.absent))
     every, offset = splits[0]
-    asked = set(names[offset::every] if every else ()) - {view.name for view in dataset.absent}
-    own = splits if {view.name for view in test} == asked else [_UNKNOWN]
+    stated = set(names[offset::every] if every else ()) - {view.name for view in dataset.absent}
+    own = splits if {view.name for view in test} == stated else [_STATED_SPLIT]
     units = dict[int, tuple]()
     for place, held_out in enumerate(own):
         turns = range(place, seeds, len(own))

@@ -32,7 +32,7 @@ _NONE = np.zeros((1, 1, 3), np.uint8)
 
 
 @dataclasses.dataclass
-class _Shown:
+class _Picture:
     """One row: (H, W, 3) colors, and features and labels, as far as there are any."""
 
     name: str
@@ -61,7 +61,7 @@ def comparison_sheet(runs: Mapping[str, Path], path: Path, view: str | None = No
     loaded = {name: load_run(Run(folder)) for name, folder in runs.items()}
     frame, count = _frame(next(iter(loaded.values())), view)
     rows = [_rendered(name, run, frame) for name, run in loaded.items()]
-    truth = _Shown("truth", frame.target().numpy())
+    truth = _Picture("truth", frame.target().numpy())
     truth.features = None if frame.teacher is None else frame.teacher().permute(1, 2, 0).float()
     truth.labels = None if frame.labels is None else np.asarray(frame.labels())
     colors = _feature_colors(truth, rows)
@@ -84,10 +84,10 @@ def _frame(run: LoadedRun, name: str | None) -> tuple[Frame, int]:
     return frame, len(run.classes) if run.classes is not None else 0
 
 
-def _rendered(name: str, run: LoadedRun, frame: Frame) -> _Shown:
+def _rendered(name: str, run: LoadedRun, frame: Frame) -> _Picture:
     with torch.no_grad():
         out = render(run.scene.at(frame.camera.time), frame.camera, run.record.config.settings)
-    shown = _Shown(name, out.rgb.cpu().clamp(0, 1).numpy())
+    shown = _Picture(name, out.rgb.cpu().clamp(0, 1).numpy())
     if out.features is not None and run.decoder is not None:
         rows = [run.decoder(row.to(run.decoder.matrix)).cpu().float() for row in out.features.detach()]
         shown.features = torch.stack(rows)
@@ -96,7 +96,7 @@ def _rendered(name: str, run: LoadedRun, frame: Frame) -> _Shown:
     return shown
 
 
-def _feature_colors(truth: _Shown, rows: Sequence[_Shown]) -> FeatureColors | None:
+def _feature_colors(truth: _Picture, rows: Sequence[_Picture]) -> FeatureColors | None:
     """One basis for all rows."""
     maps = [x.features for x in (truth, *rows) if x.features is not None]
     return FeatureColors.of(maps[:1]) if maps else None
@@ -112,7 +112,7 @@ def _differing(images: Sequence[np.ndarray]) -> tuple[int, int, int, int]:
     return int(top), int(left), height, width
 
 
-def _row(row: _Shown, box: tuple[int, int, int, int], colors: FeatureColors | None, classes: int) -> np.ndarray:
+def _row(row: _Picture, box: tuple[int, int, int, int], colors: FeatureColors | None, classes: int) -> np.ndarray:
     """The view with a frame around the part, and the part's pictures."""
     height, width = row.color.shape[:2]
     whole = _enlarged(pictures.to_bytes(row.color), (0, 0, height, width))
@@ -124,16 +124,16 @@ def _row(row: _Shown, box: tuple[int, int, int, int], colors: FeatureColors | No
         whole[top:bottom, line] = _FRAME
     parts = [pictures.caption(whole, row.name), pictures.caption(_enlarged(pictures.to_bytes(row.color), box), "color")]
     if colors is not None:
-        drawn = _NONE if row.features is None else _sized(colors.picture(row.features), (height, width))
+        drawn = _NONE if row.features is None else _resized(colors.picture(row.features), (height, width))
         parts.append(pictures.caption(_enlarged(drawn, box), "features"))
     if classes:
-        drawn = _NONE if row.labels is None else _sized(label_picture(row.labels, classes), (height, width))
+        drawn = _NONE if row.labels is None else _resized(label_picture(row.labels, classes), (height, width))
         parts.append(pictures.caption(_enlarged(drawn, box), "labels"))
     tallest = max(part.shape[0] for part in parts)
     return np.concatenate([np.pad(p, ((0, tallest - p.shape[0]), (0, _GAP), (0, 0))) for p in parts], axis=1)
 
 
-def _sized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def _resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """A picture of another resolution at that of the view, its pixels kept."""
     import cv2
 

@@ -131,7 +131,7 @@ def camera_map(
         return None
     centers = np.array([camera.center for camera in cameras], float)
     up = -np.mean([camera.c2w[:3, 1] for camera in cameras], axis=0)
-    axes = _ground(up, centers)
+    axes = _ground_axes(up, centers)
     reach = max(float(np.ptp(centers @ axes.T, axis=0).max()), 1e-9) * 0.06  # of one camera, too, there is a length
     figure, (axis,) = _figure("cameras", 1, 4.6)
     styles = {
@@ -141,9 +141,9 @@ def camera_map(
         "held out": ("D", _GREEN, 1.0),
     }
     for name, group in groups.items():
-        _stand(axis, group, axes, reach, styles[name], f"{name} ({len(group)})")
-    _stand(axis, [x for x, _ in picked], axes, reach, ("o", _RED, 1.0), f"picked, in order ({len(picked)})")
-    _stand(axis, [x for x, *_ in ways], axes, reach, ("^", _RED, 1.0), f"to be taken next ({len(ways)})")
+        _mark_cameras(axis, group, axes, reach, styles[name], f"{name} ({len(group)})")
+    _mark_cameras(axis, [x for x, _ in picked], axes, reach, ("o", _RED, 1.0), f"picked, in order ({len(picked)})")
+    _mark_cameras(axis, [x for x, *_ in ways], axes, reach, ("^", _RED, 1.0), f"to be taken next ({len(ways)})")
     for camera, origin, text in ways:
         place = axes @ camera.center
         arrow = {"arrowstyle": "->", "color": _RED, "lw": 1.2, "shrinkA": 3, "shrinkB": 3}
@@ -163,7 +163,7 @@ def camera_map(
     return _svg(figure, "cameras")
 
 
-def _stand(
+def _mark_cameras(
     axis: Axes, cameras: Sequence[Camera], axes: np.ndarray, reach: float, style: tuple[str, str, float], name: str
 ) -> None:
     """Marks of cameras, each with a line the way it looks; the style is marker, color and opacity."""
@@ -177,7 +177,7 @@ def _stand(
     axis.plot(*places.T, marker, color=color, ms=5, alpha=opacity, label=name, zorder=2)
 
 
-def _ground(up: np.ndarray, centers: np.ndarray) -> np.ndarray:
+def _ground_axes(up: np.ndarray, centers: np.ndarray) -> np.ndarray:
     """(2, 3) axes of the plane across `up`; of the one that cameras stand in, where they agree on no up."""
     length = float(np.linalg.norm(up))
     if length > 0.3:

@@ -24,7 +24,7 @@ from drgs.pages.report.pictures import Picture
 if TYPE_CHECKING:
     from drgs.pages.report.account import Account
 
-__all__ = ["GENERATOR", "Shown", "page_html"]
+__all__ = ["GENERATOR", "Drawings", "page_html"]
 
 GENERATOR = "drgs report"
 """What the page says of itself: a file that does is one that may be replaced."""
@@ -35,7 +35,7 @@ _NO_CHARTS = "Charts are left out: they need matplotlib, pip install 'drgs[repor
 
 
 @dataclasses.dataclass(frozen=True)
-class Shown:
+class Drawings:
     """Charts and pictures of a page.
 
     Attributes:
@@ -61,12 +61,12 @@ class Shown:
     notes: Sequence[str] = ()
 
 
-def page_html(account: Account, shown: Shown, command: str, command_text: str) -> str:
+def page_html(account: Account, drawings: Drawings, command: str, command_text: str) -> str:
     """The page.
 
     Args:
         account: Account of how the fit went.
-        shown: Charts and pictures.
+        drawings: Charts and pictures.
         command: Command that repeats the fit.
         command_text: What the command does not repeat, if anything.
     """
@@ -83,18 +83,18 @@ def page_html(account: Account, shown: Shown, command: str, command_text: str) -
         "title": account.run.path.resolve().name or "run",
         "subtitle": _subtitle(account),
         "tiles": _tiles(account),
-        "notes": [*shown.notes, *([] if any(shown.charts.values()) else [_NO_CHARTS])],
-        "charts": {name: Markup(svg) for name, svg in shown.charts.items() if svg},
-        "previews": shown.previews,
+        "notes": [*drawings.notes, *([] if any(drawings.charts.values()) else [_NO_CHARTS])],
+        "charts": {name: Markup(svg) for name, svg in drawings.charts.items() if svg},
+        "previews": drawings.previews,
         "previewed": "Photograph and rendering of the first held-out view, as it came along."
         if account.record.test
         else "Photograph and rendering of the first view, as it came along.",
         "split": {"test": "Held-out", "train": "Fitted"}.get(metrics.get("split", ""), "Measured"),
-        **_views(metrics, shown),
+        **_views(metrics, drawings),
         "renderers": renderers_table(metrics),
         "segmentation": _segmentation(metrics),
-        "stills": shown.stills,
-        "stills_text": f"Camera {shown.stills_of}, stopped where it is, at times of the sequence.",
+        "stills": drawings.stills,
+        "stills_text": f"Camera {drawings.stills_of}, stopped where it is, at times of the sequence.",
         **_picks(account),
         "places": [place["text"] for place in account.places],
         "components": [row for x in COMPONENTS.values() for row in x.report(account.config, metrics)],
@@ -157,7 +157,7 @@ def _tiles(account: Account) -> list[tuple[str, str]]:
         for name, text in names.items():
             if (value := metrics["mean"].get(name)) is not None:
                 what = f"{text}, {metrics['count']} {metrics['split']} views"
-                tiles.append((_shown(name, value) + " dB" * (name in _DIGITS), what))
+                tiles.append((_formatted(name, value) + " dB" * (name in _DIGITS), what))
         labels = (metrics.get("segmentation") or {}).get("run") or {}
         if isinstance(labels.get("miou"), float):
             tiles.append((f"{labels['miou']:.3f}", "mIoU"))
@@ -177,26 +177,26 @@ def _seconds(account: Account) -> float:
     return max((row["seconds"] for row in account.events if row["event"] in ("train", "done")), default=0.0)
 
 
-def _shown(name: str, value: float | None) -> str:
+def _formatted(name: str, value: float | None) -> str:
     return "-" if value is None else f"{value:.{_DIGITS.get(name, 3)}f}"
 
 
-def _views(metrics: Mapping[str, Any], shown: Shown) -> dict[str, Any]:
+def _views(metrics: Mapping[str, Any], drawings: Drawings) -> dict[str, Any]:
     """Views with their pictures, and the table of all."""
     rows = {row["name"]: row for row in metrics.get("views", ())}
     views = []
-    for name in shown.views:
+    for name in drawings.views:
         psnr = rows[name].get("psnr") if name in rows else None
         text = "" if psnr is None else f"{psnr:.2f} dB"
-        pictures = {"photo": shown.photos.get(name), "semantics": shown.semantics.get(name)}
-        views.append({"name": name, "text": text, "maps": shown.maps.get(name), **pictures})
+        pictures = {"photo": drawings.photos.get(name), "semantics": drawings.semantics.get(name)}
+        views.append({"name": name, "text": text, "maps": drawings.maps.get(name), **pictures})
     names = [name for name, value in metrics.get("mean", {}).items() if value is not None]
-    table = [(name, *(_shown(key, row.get(key)) for key in names)) for name, row in rows.items()]
+    table = [(name, *(_formatted(key, row.get(key)) for key in names)) for name, row in rows.items()]
     if rows:
-        table.append(("mean", *(_shown(key, metrics["mean"][key]) for key in names)))
+        table.append(("mean", *(_formatted(key, metrics["mean"][key]) for key in names)))
     several = len(views) > 1
     text = "From the worst to the best by PSNR." if several else ""
-    if shown.maps:
+    if drawings.maps:
         text += (
             " Predictive variance: how uncertain the color of each pixel is by what the fitted views say (unit noise, "
             "lambda = 1; bright is uncertain, and what no view has shown is brightest). Not covered: white where no "

@@ -18,7 +18,7 @@ from drgs.io.outputs import atomic_write
 from drgs.io.run import Run
 from drgs.pages.report import charts, pictures
 from drgs.pages.report.account import Account, account_of
-from drgs.pages.report.page import Shown, page_html
+from drgs.pages.report.page import Drawings, page_html
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -49,12 +49,12 @@ def write_report(run: Run, path: Path, command: str, command_text: str, dataset:
     """
     with Bar("report"):
         account = account_of(run)
-        page = page_html(account, _shown(account, dataset), command, command_text)
+        page = page_html(account, _pictures_and_charts(account, dataset), command, command_text)
         with atomic_write(path) as file:
             file.write(page.encode())
 
 
-def _shown(account: Account, dataset: Dataset | None) -> Shown:
+def _pictures_and_charts(account: Account, dataset: Dataset | None) -> Drawings:
     """Everything that can be drawn."""
     notes = []
     try:
@@ -66,23 +66,27 @@ def _shown(account: Account, dataset: Dataset | None) -> Shown:
         notes.append(
             f"The data set is not at {account.record.data} any more: no map of cameras, of information or over time."
         )
-    names = _typical(account)
-    cast = None if dataset is None else _Cast.of(account, dataset)
+    names = _typical_views(account)
+    run_cameras = None if dataset is None else _Cameras.of(account, dataset)
     found: dict[str, tuple[pictures.Picture, pictures.Picture]] = {}
     stills: list[pictures.Picture] = []
     still_name = ""
-    if loaded is not None and cast is not None:
-        shown = {name: cast.held[name] for name in names if name in cast.held}
+    if loaded is not None and run_cameras is not None:
+        shown = {name: run_cameras.held[name] for name in names if name in run_cameras.held}
         record = account.record
         nuisances = Nuisances(eliminate=record.estimated)
-        found = pictures.maps(loaded.scene, cast.fitted, shown, record.config.settings, nuisances)
-        stills, still_name = _stills(account, loaded, cast)
+        found = pictures.maps(loaded.scene, run_cameras.fitted, shown, record.config.settings, nuisances)
+        stills, still_name = _stills(account, loaded, run_cameras)
     picks = account.selection["picks"] if account.selection else []
     drawn: dict[str, str | None] = {}
     if charts.is_available():
         drawn = {"progress": charts.progress(account), "scores": charts.score_bars(picks)}
-        drawn["cameras"] = None if cast is None else charts.camera_map(cast.groups, cast.picked, _ways(account))
-    return Shown(
+        drawn["cameras"] = (
+            None
+            if run_cameras is None
+            else charts.camera_map(run_cameras.groups, run_cameras.picked, _marks_of_cameras(account))
+        )
+    return Drawings(
         charts=drawn,
         previews=pictures.previews(account),
         views=names,
@@ -95,7 +99,7 @@ def _shown(account: Account, dataset: Dataset | None) -> Shown:
     )
 
 
-def _ways(account: Account) -> list[tuple[Camera, np.ndarray, str]]:
+def _marks_of_cameras(account: Account) -> list[tuple[Camera, np.ndarray, str]]:
     """Argument `ways` of `charts.camera_map`: the places for the next photographs."""
     where = str(account.run.path / "next.json")
     found = [(camera_from_json(where, place["camera"]), np.array(place["origin"], float)) for place in account.places]
@@ -104,25 +108,25 @@ def _ways(account: Account) -> list[tuple[Camera, np.ndarray, str]]:
     return [(*pair, str(place["rank"])) for pair, place in zip(found, account.places, strict=True)]
 
 
-def _typical(account: Account) -> list[str]:
+def _typical_views(account: Account) -> list[str]:
     """Names of a few measured views, from the worst to the best."""
     rows = [] if account.metrics is None else account.metrics["views"]
     ranked = sorted(rows, key=lambda row: row["psnr"] if row.get("psnr") is not None else float("inf"))
     return [row["name"] for row in pictures.spread(ranked, _SHOWN_VIEWS)]
 
 
-def _stills(account: Account, loaded: LoadedRun, cast: _Cast) -> tuple[list[pictures.Picture], str]:
+def _stills(account: Account, loaded: LoadedRun, run_cameras: _Cameras) -> tuple[list[pictures.Picture], str]:
     """One camera over all times, of a scene that moves."""
     if loaded.moving is None or not account.record.times:
         return [], ""
-    name, camera = next(iter(cast.held.items()), ("", None))
+    name, camera = next(iter(run_cameras.held.items()), ("", None))
     if camera is None:
         return [], ""
     return pictures.stills(loaded.scene, camera, account.record.times, account.record.config.settings), name
 
 
 @dataclasses.dataclass(frozen=True)
-class _Cast:
+class _Cameras:
     """The cameras of a fit.
 
     Attributes:
@@ -137,7 +141,7 @@ class _Cast:
     picked: list[tuple[Camera, str]]
 
     @classmethod
-    def of(cls, account: Account, dataset: Dataset) -> _Cast:
+    def of(cls, account: Account, dataset: Dataset) -> _Cameras:
         """The cameras of a data set, by the split of the fit."""
         config = account.record.config
         train, test = dataset.split(config.data.test_every, config.data.test_offset, config.data.test_cameras)

@@ -36,13 +36,13 @@ def archive_of(g: Gaussians) -> tuple[bytes, dict[str, Any] | None]:
             content = archive.read(name)
             start = data.index(content, archive.getinfo(name).header_offset)
             spans.append([start, start + len(content)])
-            sums.append(_sum(content))
+            sums.append(_checksum(content))
     each = (harmonics["bands"] + 1) ** 2 - 1
     known = {"each": each, "rows": harmonics["count"], "codebook": harmonics["codebook"]}
     return data, {**known, "centroids": spans[0], "labels": spans[1], "sums": sums}
 
 
-def _sum(webp: bytes) -> int:
+def _checksum(webp: bytes) -> int:
     """Checksum of a picture, by which a page finds out whether its browser decodes pictures unchanged."""
     values = pixels_of_webp("share", webp, 1, 1 << 28).reshape(-1).astype(np.uint64)
     weights = (np.arange(len(values), dtype=np.uint64) & 255) + 1

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from drgs.information.nuisances import Nuisances
     from drgs.settings import RenderSettings
 
-__all__ = ["classes_layer", "moments_of", "uncertainty_layer", "uncertainty_of"]
+__all__ = ["classes_layer", "motion_layer", "uncertainty_layer", "uncertainty_of"]
 
 _NUM_COLORS = 256  # entries of the table of colors: a Gaussian's is one byte
 _MOST_DECADES = 3.0  # range of the scale of uncertainty, at most, as in the report's maps; chosen
@@ -96,7 +96,7 @@ def uncertainty_layer(values: np.ndarray) -> tuple[dict[str, Any], bytes]:
     return known, np.rint((_NUM_COLORS - 1) * shares).astype(np.uint8).tobytes()
 
 
-def moments_of(moving: DynamicGaussians, times: Sequence[float], rest: Gaussians, order: np.ndarray) -> tuple:
+def motion_layer(moving: DynamicGaussians, times: Sequence[float], rest: Gaussians, order: np.ndarray) -> tuple:
     """Where the Gaussians that move are at each of some times, in 16 bits a number, and when they are there.
 
     Args:

@@ -113,7 +113,7 @@ def fetch_into(folder: Path) -> None:
         target = folder / package.folder
         if all((target / name).is_file() for name in package.files):
             continue
-        content = _checked(package, _fetched(package))
+        content = _checked(package, _downloaded(package))
         for name, data in content.items():
             _write(target / name, data)
 
@@ -122,7 +122,7 @@ def _user_cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "drgs" / "npm"
 
 
-def _fetched(package: Package) -> bytes:
+def _downloaded(package: Package) -> bytes:
     """Download the archive of a package."""
     _log.info("fetching %s, once, for the pages of drgs share", package.address)
     try:

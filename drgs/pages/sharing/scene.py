@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     from drgs.io.run import Run
     from drgs.pages.sharing.placing import PhotoKind
 
-__all__ = ["FILE", "MOMENTS", "scene_of_file", "scene_of_run"]
+__all__ = ["FILE", "STORED_TIMES", "scene_of_file", "scene_of_run"]
 
 FILE = "scene.html"
 """The page in a run folder."""
 
-MOMENTS = 12
+STORED_TIMES = 12
 """Times at which a moving scene is stored, by default; the size of the page grows with it. Chosen, not tuned."""
 
 _UP = np.array((0.0, -1.0, 0.0))  # as COLMAP's worlds stand, where no photographs say
@@ -62,7 +62,9 @@ def scene_of_file(
         background: RGB in [0, 1].
     """
     shown = gaussians.replace(features=None).detach()
-    return _shared(shown, title, [f"{len(gaussians):,} Gaussians."], _cameras([], (), ranking), around, background)
+    return _with_photographs(
+        shown, title, [f"{len(gaussians):,} Gaussians."], _cameras([], (), ranking), around, background
+    )
 
 
 def scene_of_run(
@@ -72,7 +74,7 @@ def scene_of_run(
     loaded: LoadedRun | None = None,
     ranking: Ranking | None = None,
     around: Callable[[Gaussians], Camera] | None = None,
-    moments: int = MOMENTS,
+    moments: int = STORED_TIMES,
     uncertainty: bool = True,
 ) -> Shared:
     """Contents of the page of a run.
@@ -100,7 +102,7 @@ def scene_of_run(
     cameras = _cameras(views, fitted_names, ranking or _ranking_of(run, loaded))
     fitted = [camera for kind, camera in cameras if kind == "fitted"]
     return dataclasses.replace(
-        _shared(
+        _with_photographs(
             gaussians.replace(features=None).detach(),
             run.path.resolve().name,
             _lines(run, loaded, len(names)),
@@ -115,7 +117,7 @@ def scene_of_run(
     )
 
 
-def _shared(
+def _with_photographs(
     gaussians: Gaussians,
     title: str,
     lines: Sequence[str],
@@ -139,7 +141,7 @@ def _shared(
         lines=lines,
         gaussians=gaussians,
         cameras=cameras,
-        target=_ahead(gaussians, cameras[0][1]) if target is None else target,
+        target=_subject_point(gaussians, cameras[0][1]) if target is None else target,
         up=up,
         background=background,
     )
@@ -206,7 +208,7 @@ def _uncertainty(loaded: LoadedRun, fitted: list[Camera]) -> np.ndarray | None:
     return uncertainty_of(scene, spread(cameras, _MOST_PHOTOGRAPHS), config.settings, nuisances)
 
 
-def _ahead(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+def _subject_point(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """(3,) the point of a camera's axis that is as far away as what is before it."""
     axis = camera.c2w[:3, 2]
     means = gaussians.means.double().numpy() + np.array(gaussians.origin, np.float64)

@@ -14,7 +14,7 @@ from drgs.data.camera_layout import middle_camera
 from drgs.display.progress import Bar
 from drgs.io.outputs import atomic_write
 from drgs.pages.sharing.gaussians import archive_of
-from drgs.pages.sharing.layers import moments_of, uncertainty_layer
+from drgs.pages.sharing.layers import motion_layer, uncertainty_layer
 from drgs.pages.sharing.npm import viewer_files
 from drgs.pages.sharing.page import scene_html
 from drgs.pages.sharing.placing import PhotoKind, columns, photo, upright_matrix
@@ -102,7 +102,7 @@ def write_page(shared: Shared, path: str | os.PathLike) -> dict[str, int]:
         scene["classes"], labels = shared.classes
         parts["classes"] = labels[order].astype("<u2").tobytes()
     if shared.moving is not None:
-        scene["moments"], parts["moving"], parts["moments"], parts["lives"] = moments_of(
+        scene["moments"], parts["moving"], parts["moments"], parts["lives"] = motion_layer(
             shared.moving, shared.times, shared.gaussians, order
         )
     page, sizes = scene_html(shared.title, shared.lines, scene, parts, viewer)
