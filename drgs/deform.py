@@ -109,7 +109,7 @@ class DeformationField(torch.nn.Module):
         config: Sizes of its planes and layers.
         bounds: (2, 3) lowest and highest corner of the canonical means, in world units; means outside see the border.
             A side shorter than 1e-3 of the longest is widened to that, and a single point to sides of 1.
-        span: First and last time that will ever be asked for; others are refused, for nothing is known of them. They
+        span: First and last time of the field; other times are refused, as it has learned nothing of them. They
             may be one, at which the field is as at the first node.
         seed: Seed that the weights at the start are drawn by.
     Attributes:
@@ -166,7 +166,7 @@ class DeformationField(torch.nn.Module):
     ) -> dict[str, torch.Tensor]:
         """Squares of J^T u, J the derivative of the deltas by the parameters, summed over K cotangents u.
 
-        The field is evaluated once, and of the planes only nodes that the means read are looked at.
+        The field is evaluated once, and only nodes of the planes that the means read are touched.
 
         Args:
             means, time, origin: The same as for `forward`.

@@ -378,10 +378,10 @@ class _Loop:
                     self.run_folder.log("interrupted", step=trainer.step_index)
                     if not trainer.is_sound:
                         raise interrupts.interruption(
-                            "not saved, the last step was not finite; --resume goes on at the last checkpoint"
+                            "not saved, the last step was not finite; --resume continues at the last checkpoint"
                         )
                     self.save()
-                    raise interrupts.interruption(f"saved at step {trainer.step_index}, --resume goes on")
+                    raise interrupts.interruption(f"saved at step {trainer.step_index}, --resume continues")
                 while self.plan and self.plan.is_due(trainer.step_index):
                     self.save()  # measuring and choosing may take minutes, and can be interrupted anywhere
                     with interrupts.at_once():

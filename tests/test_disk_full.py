@@ -154,7 +154,7 @@ def test_a_fit_goes_on_after_a_full_disk(disk, tmp_path, capsys):
 
 def test_a_capture_goes_on_after_a_full_disk(disk, tmp_path, capsys, monkeypatch):
     """The disk fills up at the beginning of each step, and within poses of each stage, whose library would end the
-    process: one line, the steps before it stay, and --resume goes on with them.
+    process: one line, the steps before it stay, and --resume continues with them.
     """
     pytest.importorskip("pycolmap")
     import cv2

@@ -211,7 +211,7 @@ def test_an_interrupted_streak_of_bad_steps_is_not_saved(dataset, tmp_path, monk
 
     monkeypatch.setattr(Trainer, "step", broken)
     how = config(max_steps=8, save_every=3)
-    with pytest.raises(KeyboardInterrupt, match="not saved, the last step was not finite; --resume goes on"):
+    with pytest.raises(KeyboardInterrupt, match="not saved, the last step was not finite; --resume continues"):
         fit(dataset, tmp_path / "run", how, progress=False)
     assert load_state(Run(tmp_path / "run").state)[1]["step"] == 3
 

@@ -80,7 +80,7 @@ def test_terminated_fit_saves_and_goes_on_with_the_same_bits(
     monkeypatch.setattr(Trainer, "step", terminated)
     capsys.readouterr()
     assert cli.main(f"fit data -o {tmp_path / 'b'} {options}".split()) == 143
-    assert capsys.readouterr().err == "drgs fit: terminated: saved at step 5, --resume goes on\n"
+    assert capsys.readouterr().err == "drgs fit: terminated: saved at step 5, --resume continues\n"
     monkeypatch.setattr(Trainer, "step", step)
     assert load_state(tmp_path / "b" / "state.safetensors")[1]["step"] == 5
     assert cli.main(f"fit data -o {tmp_path / 'b'} {options} --resume".split()) == 0
@@ -95,7 +95,7 @@ def test_damaged_checkpoint(dataset, run, caplog, damage):  # noqa: F811
     run.state.write_bytes(data)
     assert again(dataset, run.path).metrics["step"] == 6
     assert "must be a checkpoint" in caplog.text
-    assert "going on from the one before it, step 3" in caplog.text
+    assert "resuming from the one before it, step 3" in caplog.text
     assert (run.path / "state.damaged.safetensors").read_bytes() == data
     assert load_state(run.state)[1]["step"] == 6
     again(dataset, run.path)

@@ -1,9 +1,9 @@
 """Sizes and steps that a budget of time allows, from short measurements on this machine.
 
-Poses are planned first: features of two of the photographs are found and matched, and from what that takes follows how
-large photographs may be looked at. What is left belongs to the fit: some steps of it are timed, in growing sizes, with
-as many Gaussians as it will have on average, and the largest size that fits gets as many steps as there is time for.
-Nothing is cut off while it runs: learning rates end where they should.
+Poses are planned first: two of the photographs are matched, and the seconds of that decide how large photographs may be
+for structure from motion. The rest of the time is the fit's: some steps of it are timed, in growing sizes, with as many
+Gaussians as it will have on average, and the largest size that fits gets as many steps as there is time for. No fit is
+cut off while it runs: learning rates end where they should.
 """
 
 from __future__ import annotations
@@ -243,7 +243,7 @@ def plan_frames(video: Path, photographs: int, most: int, budget: float) -> int:
     Args:
         video: One of the videos; two of its frames are timed.
         photographs: Number of photographs beside them.
-        most: Number of frames that is asked for.
+        most: Largest number of frames.
         budget: Seconds of the whole capture.
     """
     read = read_video(video)
@@ -281,7 +281,7 @@ def planned_poses(plan: PosePlan, count: int, left: float, budget: float) -> str
     """The plan in one line, with the seconds that it needs where the budget is too small.
 
     Args:
-        plan: How large photographs are looked at.
+        plan: Size of the photographs.
         count: Number of photographs.
         left: Seconds that are left of the budget.
         budget: Seconds of the whole capture.

@@ -124,7 +124,7 @@ class Capture:
     """One capture, whose steps read and change it (`drgs.capturing.steps`).
 
     Attributes:
-        options: What it was asked for.
+        options: Its options.
         clock: How much time there is.
         record: Which steps are done.
         photographs: The decoded photographs.
@@ -207,8 +207,8 @@ class Capture:
 
 
 def config_of(run: Run) -> FitConfig:
-    """The configuration that a fit goes on with: the checkpoint's, which config.json and the files that are made of the
-    checkpoint may differ from where there was no room for them.
+    """The configuration with which a fit is continued: the checkpoint's. On a full disk, config.json and files that are
+    made of the checkpoint may be older.
     """
     if run.state.is_file():
         return FitConfig.from_json(state_header(run.state)["config"])

@@ -106,7 +106,7 @@ def of_poses(dataset: Dataset, names: Sequence[str], summary: SfmSummary | None 
     Args:
         dataset: The data set, with points.
         names: All photographs, in the order in which they were taken.
-        summary: What structure from motion said; None where it was not asked.
+        summary: Summary of structure from motion; None where it was not run.
     """
     findings = []
     count = len(dataset.views)
@@ -202,7 +202,7 @@ def of_exposure(dataset: Dataset, seed: int = 0) -> list[Finding]:
 
     Args:
         dataset: The data set.
-        seed: Seed of the points that are looked at.
+        seed: Seed of the choice of points.
     """
     views = sorted(dataset.views, key=lambda view: view.name)
     if dataset.times or (compared := shared_points(dataset, views, seed)) is None:

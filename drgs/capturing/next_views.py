@@ -147,14 +147,14 @@ def _camera(view: View, pixels: int) -> Camera:
 
 def _empty_share(gaussians: Gaussians, camera: Camera, settings: RenderSettings) -> float:
     """Share of a picture's pixels that no Gaussian covers."""
-    with torch.no_grad():  # looked at only
+    with torch.no_grad():  # measured, not optimized
         alpha = render(gaussians, at_most(camera, _EMPTY_PIXELS), settings, outputs=()).alpha
     return float((alpha.cpu() < 0.5).float().mean())
 
 
 def _obstacles(gaussians: Gaussians, cameras: list[Camera]) -> np.ndarray:
     """(P, 3) centers of the Gaussians that block a path, world."""
-    means = gaussians.means.detach().cpu().double().numpy() + gaussians.origin  # looked at only
+    means = gaussians.means.detach().cpu().double().numpy() + gaussians.origin  # measured, not optimized
     solid = means[gaussians.opacities.detach().cpu().numpy() > _SOLID_OPACITY]
     middle = np.median(np.stack([camera.center for camera in cameras]), axis=0)
     far = np.linalg.norm(solid - middle, axis=1)

@@ -23,7 +23,7 @@ def new_files(
     """Photographs and videos that are not in a capture yet: a phone's folder has the old ones, too.
 
     Args:
-        options: What was asked for.
+        options: Options of the command.
         before: The capture that they join.
         photographs, videos: What was named.
         say: Prints how many are in the capture already.
@@ -46,7 +46,7 @@ def open_record(options: CaptureOptions, inputs: list[list[Any]], is_dataset: bo
     """The record of the capture to continue; its last batch is the current one.
 
     Args:
-        options: What was asked for.
+        options: Options of the command.
         inputs: `inputs_of` the files that were named.
         is_dataset: Whether they are a data set with poses.
     Raises:

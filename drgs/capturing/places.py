@@ -100,7 +100,7 @@ def length_in_words(share: float, meters: float | None) -> str:
 
     Args:
         share: The length in shares of the way to what a photograph shows.
-        meters: Length of that way in meters; None: nobody knows.
+        meters: Length of that way in meters; None: unknown.
     """
     if meters is None:
         if share > 7 / 8:

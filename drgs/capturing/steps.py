@@ -6,7 +6,7 @@
     report   what came out, and what to do at the next shoot
     share    one file to send
 
-Each step is recorded in RUN/capture/capture.json once it is done; the first that is not is where a capture goes on.
+Each step is recorded in RUN/capture/capture.json once it is done; a capture is resumed at the first that is not.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def run_capture(options: CaptureOptions, config: FitConfig, say: Callable[[str],
     """All steps of a capture that are not done yet.
 
     Args:
-        options: What is asked for.
+        options: Options of the capture.
         config: What the fit of the first photographs does where no budget says so; the seed is that of the options.
         say: Prints a line for the user.
         report: Writes the report; which command repeats a fit is known to commands alone.
@@ -121,7 +121,7 @@ def _resumable() -> Iterator[None]:
         yield
     except KeyboardInterrupt as error:
         text = f"{error}; " if str(error) else ""
-        raise interrupts.interruption(f"{text}the steps that are done are kept, --resume goes on") from None
+        raise interrupts.interruption(f"{text}the steps that are done are kept, --resume continues") from None
 
 
 def _steps(

@@ -334,7 +334,7 @@ def help_page(command: str, kind: type[Common], words: Sequence[str] = ()) -> st
 
 
 def _config_of(words: Sequence[str]) -> dict[str, Any]:
-    """The file that words name by --config, whatever else they say: help is asked for."""
+    """The file that words name by --config, whatever else they say, for a help page."""
     line: dict[str, Any] = {}
     for word, following in itertools.pairwise([*words, ""]):
         flag, equals, value = word.partition("=")

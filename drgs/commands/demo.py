@@ -311,7 +311,7 @@ def _draw(g: Gaussians, camera: Camera, settings: RenderSettings) -> torch.Tenso
     """(H, W, 3) on the CPU, computed when this returns."""
     import drjit as dr
 
-    with torch.no_grad():  # a picture is looked at only
+    with torch.no_grad():  # a picture, not optimized
         image = render(g, camera, settings, outputs=()).rgb.cpu()
     dr.sync_thread()
     return image

@@ -33,7 +33,7 @@ def print_table(metrics: dict, *, lpips: bool = False) -> None:
 
     Args:
         metrics: Content of metrics.json.
-        lpips: Whether LPIPS was asked for; otherwise nothing is said of it, as it is null for a reason that is known.
+        lpips: Whether to print LPIPS, and why it is null where it is.
     """
     digits = dict.fromkeys(("psnr", "cc_psnr", *OBJECT, *MOVING), ".2f")
     names = [name for name in (*OBJECT, *METRICS, *MOVING) if metrics["mean"].get(name) is not None]

@@ -53,7 +53,7 @@ class Film:
     Attributes:
         frames: Number of frames.
         fps: Frames a second.
-        flight: The flight of --path, with the duration that is asked for, else None.
+        flight: The flight of --path, with --duration where it is given, else None.
     """
 
     frames: int
@@ -193,7 +193,7 @@ def up_of(cameras: list[Camera], wished: tuple[float, float, float] | None) -> n
 
 
 def named_view(cameras: list[Camera], name: str | None, where: str) -> list[Camera]:
-    """The camera of a name, or the first view of a camera of that name; all, where none is asked for.
+    """The camera of a name, or the first view of a camera of that name; all without a name.
 
     Raises:
         ValueError: If there is none.

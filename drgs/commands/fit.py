@@ -56,7 +56,7 @@ def run(args: Fit) -> None:
 
 def _on_background(dataset: Dataset, config: FitConfig, args: Fit, lazy: bool) -> FitConfig:
     """The configuration with the background that the photographs are put on where --background does not say: that of
-    the run that goes on, else `default_background`, which is said.
+    the run that is resumed, else `default_background`, which is said.
     """
     run = Run(args.output)
     if args.resume and is_run(run.path):

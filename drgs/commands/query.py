@@ -180,7 +180,7 @@ def _view(
     name: str,
 ) -> dict:
     """Mask and picture of a view, and its row of query.json."""
-    with torch.no_grad():  # a picture is looked at only
+    with torch.no_grad():  # a picture, not optimized
         out = render(g, camera, settings, ())
     _, selected = query.score(out.features, decoder)
     mask = (selected & (out.alpha.cpu() >= OPAQUE)).numpy()

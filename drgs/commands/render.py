@@ -342,7 +342,7 @@ def _is_full_panorama(camera: Camera) -> bool:
 
 
 def _resized(camera: Camera, width: int | None, height: int | None) -> Camera:
-    """The camera at the size asked for; one side alone keeps the shape."""
+    """The camera at --width and --height; one of these alone keeps the shape."""
     if width is None and height is None:
         return camera
     if width is None:

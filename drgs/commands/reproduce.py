@@ -125,8 +125,8 @@ def _figures(plan: StudyPlan, out: Path, args: Reproduce) -> list[tuple[str, str
     shown = f"{cell.scene}, {view}: what each policy's fit makes of a view that none has seen, the truth last"
     last = list(folders)[-1]
     maps = _maps(folders[last], out / f"{args.what}-maps")
-    told = f"What moments, FisherRF and our blocks look at in a view of {cell.scene}, after `{last}`"
-    return [(f"{args.what}.png", shown), *((f"{path.parent.name}/{path.name}", told) for path in maps)]
+    caption = f"What moments, FisherRF and our blocks look at in a view of {cell.scene}, after `{last}`"
+    return [(f"{args.what}.png", shown), *((f"{path.parent.name}/{path.name}", caption) for path in maps)]
 
 
 def _maps(run: Path, folder: Path) -> list[Path]:
@@ -152,7 +152,7 @@ def _write(plan: StudyPlan, rows: list[dict], out: Path, args: Reproduce, pictur
         f"Made by `{_command(args)}` on {cpu_model()}, {datetime.date.today()}, commit {(commit() or 'unknown')[:7]}."
     )
     text = ["# Policies, compared", where, results_page(plan.study, plan.experiment, rows, remarks=plan.notes)]
-    text += [f"![{told}]({name})\n\n{told}." for name, told in pictures]
+    text += [f"![{caption}]({name})\n\n{caption}." for name, caption in pictures]
     with atomic_write(out / f"{args.what}.md") as file:
         file.write(("\n\n".join(text) + "\n").encode())
     write_json(

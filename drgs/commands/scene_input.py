@@ -116,11 +116,11 @@ class SceneInput:
 
         return None if self.decoder is None else SemanticMetric(self.decoder.metric())
 
-    def keeps_lenses(self, asked: str = "auto") -> bool:
+    def keeps_lenses(self, undistort: str = "auto") -> bool:
         """Whether cameras keep their lenses: what --undistort says, else as the run was fitted, else not."""
-        if asked == "auto" and self.record is not None:
-            asked = self.record.config.data.undistort
-        return asked == "off"
+        if undistort == "auto" and self.record is not None:
+            undistort = self.record.config.data.undistort
+        return undistort == "off"
 
     @property
     def estimated(self) -> tuple[Nuisance, ...]:
@@ -161,7 +161,7 @@ def ranking_of(selection: Path | None, given: SceneInput) -> Ranking | None:
 
     Args:
         selection: What `--selection` names.
-        given: What is looked at.
+        given: The command's scene.
     Raises:
         FileNotFoundError, ValueError: If a file is not there, or damaged.
     """

@@ -55,9 +55,9 @@ def run(args: Stress) -> int:
     if args.output is not None:
         _write(args, found, seconds)
     if not args.quiet:
-        held, told = (sum(row.verdict == verdict for row in found) for verdict in ("holds", "warns"))
+        held, warned = (sum(row.verdict == verdict for row in found) for verdict in ("holds", "warns"))
         print(
-            f"\n{len(found)} rows in {seconds:.0f} s: {held} hold, {told} refused or warned about, {len(failed)} fail"
+            f"\n{len(found)} rows in {seconds:.0f} s: {held} hold, {warned} refused or warned about, {len(failed)} fail"
         )
         for row in failed:
             print(f"FAILS: {row.case} on {row.traversal}: {row.remark}")
@@ -82,8 +82,8 @@ def _printed(row: StressRow) -> str:
     """Lines of at most 80 characters; the case has a line of its own."""
     gradient = " ".join((_number(row.gradient), row.group)).strip()
     others = (_number(row.forward), _number(row.duality), _number(row.fisher))
-    told = "; ".join(["not finite"] * (row.finite is False) + [row.remark] * bool(row.remark))
-    remark = textwrap.wrap(told, 80, initial_indent=" " * 4, subsequent_indent=" " * 4)
+    remarks = "; ".join(["not finite"] * (row.finite is False) + [row.remark] * bool(row.remark))
+    remark = textwrap.wrap(remarks, 80, initial_indent=" " * 4, subsequent_indent=" " * 4)
     return "\n".join([_line(row.traversal, row.verdict, _number(row.image), gradient, *others), *remark])
 
 

@@ -3,7 +3,7 @@
 Everything is written into the data set's own folder, beside its photographs, where the loader and Feature 3DGS look:
 `rgb_feature_langseg/NAME_fmap_CxHxW.pt` for each photograph, `text_embeddings.npy` and, where the data set names no
 classes yet, `classes.json`. Nothing that is there is replaced but what this command wrote: a teacher's maps or
-embeddings of somebody else are refused. An interrupted command goes on where it stopped; with another model or other
+embeddings of somebody else are refused. An interrupted command is resumed where it stopped; with another model or other
 options all maps of this command are made anew.
 """
 

@@ -100,7 +100,7 @@ def _stamps(paths: list[Path]) -> dict[Path, tuple[int, int, int]]:
     return stamps
 
 
-# ---------------------------------------------------------------------------------------------------- what is looked at
+# ---------------------------------------------------------------------------------------------------- the subject
 
 
 _FIRST_SIZE = 640, 480  # pixels of the view that a browser begins with: its shape says how much of the scene is in it
@@ -121,7 +121,7 @@ def subject_of(args: View, given: SceneInput, before: Subject | None = None) -> 
     Args:
         args: The options of the command line.
         given: The scene that they name.
-        before: What was looked at, where a file has changed: browsers stay where they are.
+        before: The subject before a file changed: browsers keep their places.
     Raises:
         FileNotFoundError, ValueError: If a file that was named is not there or damaged.
     """

@@ -4,7 +4,7 @@
     a cameras.json  its list; a model folder of INRIA's stands for the one in it; a selection.json or another file of a
                     command, its picks or views
     a run           the views of its data set, split as for its fit; as known views, those that it was fitted to
-    a data set      its views, split as for the fit of the run that is looked at, if it is one
+    a data set      its views, split as for the fit of the command's run, if there is one
 
 No image is decoded. Where views are compared with known ones none is even opened: their size is what the camera file
 states (that of a known view of a run: of its image file).

@@ -1,7 +1,7 @@
 """Active views: fit to a few photographs, and choose one more every so often by its information.
 
 The loops of [1]: two views, then one more every 200 steps, or, where things move, all cameras at the first time, then
-one camera at each later time (timetable.py). The optimization goes on with the Gaussians there are.
+one camera at each later time (timetable.py). The optimization continues with the present Gaussians.
 The camera file gives the poses and image sizes of all candidates. Nothing else of a view is read before it is picked:
 not its pixels, mask, depth or size on disk, no points or observations that it took part in; the extent of the scene
 and the initial points come from the initial views. (`--init-points all`, the rule of [1], breaks this and says so.)

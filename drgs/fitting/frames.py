@@ -45,7 +45,7 @@ class Frame:
         mask: (H, W) float32 in [0, 1], or None.
         is_object: Whether nothing but background is outside the mask.
         alpha: (H, W), as `pixels`, how much of each pixel the photograph's own alpha channel covers: nothing but
-            background is where it does not; None: there is no such channel, or it is not asked.
+            background is where it does not; None: there is no such channel, or it is not used.
         transient: (H, W) bool, what no other photograph shows, and the photometric term leaves out; None: nothing.
         teacher: Reads the (C, h, w) map of a teacher, which covers the view at a size of its own; None: there is none.
         labels: Reads the (H, W) int64 labels of the pixels, 0 for none; None: there are none.
@@ -110,7 +110,7 @@ def frames_for(views: list[View], data: DataConfig, max_pixels: int | None = Non
     """Photographs as a fit with this configuration sees them.
 
     Args:
-        views: Whatever their sizes; those whose image has not been looked at yet are checked now.
+        views: Whatever their sizes; those whose image has not been opened yet are checked now.
         data: What of photographs is used, and how.
         max_pixels: Pixels of one image at most, if others than those of the fit.
     """
@@ -151,7 +151,7 @@ def load_frames(
     """Decode, undistort and reduce photographs (area average) to at most `max_pixels` pixels each.
 
     Args:
-        views: Whatever their sizes; those whose image has not been looked at yet are checked now.
+        views: Whatever their sizes; those whose image has not been opened yet are checked now.
         max_pixels: Pixels of one image at most; smaller ones keep their size.
         mask: Use of masks, as `DataConfig` has it.
         undistort: Whether lenses are taken out, likewise; `auto`, which a fit decides, is on.

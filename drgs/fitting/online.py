@@ -189,7 +189,7 @@ class OnlineFit:
         seen = frame.camera
         with torch.no_grad():
             out = render(self.trainer.gaussians(), seen, self.config.settings, outputs=("median_depth",))
-        assert out.median_depth is not None  # it was asked for
+        assert out.median_depth is not None  # an output of this rendering
         alpha, known = (resize_area(x.cpu().numpy(), *depth.shape[::-1]) for x in (out.alpha, out.median_depth))
         wanted = (alpha < _OPEN_OPACITY) | ((depth > 0) & (depth < (1 - _BEHIND) * known))
         share = wanted.mean()

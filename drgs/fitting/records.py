@@ -181,7 +181,7 @@ def load_run(run: Run | str | os.PathLike) -> LoadedRun:
         tensors, header = load_state(run.state)
         check_checkpoint(run.state, tensors, header)
         checkpoint = Checkpoint(tensors, header, str(run.state))
-        gaussians = GaussianRows.from_state(tensors).gaussians().detach()  # to be looked at, not to be fitted
+        gaussians = GaussianRows.from_state(tensors).gaussians().detach()  # for rendering, not to be fitted
         for component in COMPONENTS.values():
             gaussians = component.load_gaussians(gaussians, checkpoint)
         gaussians.validate(str(run.state))

@@ -101,25 +101,25 @@ def planar_of(names: Sequence[str], settings: RenderSettings) -> list[str]:
 
 
 def renderers_to_measure(
-    names: Sequence[str], settings: RenderSettings, asked: str | None = None, lenses: bool = False
+    names: Sequence[str], settings: RenderSettings, wanted_preset: str | None = None, lenses: bool = False
 ) -> dict:
     """Name -> settings of the renderers that a fit is measured with, beside its own.
 
     Args:
         names: The fit's `renderers`.
         settings: Its own settings; all have their background.
-        asked: A preset, or `all`; None: those that the fit is for, and what viewers draw with.
-        lenses: Photographs have lenses: without models of a pinhole's image plane, unless it is one that was asked for.
+        wanted_preset: A preset, or `all`; None: those that the fit is for, and what viewers draw with.
+        lenses: Photographs have lenses: without models of a pinhole's image plane, unless it is `wanted_preset`.
     """
     background = settings.background
-    if asked is None:
+    if wanted_preset is None:
         named = named_renderers(names, settings)
         wanted = () if _is_single(named) else _MEANINGS.get(named[0], named)
         wanted = tuple(dict.fromkeys([*wanted, VIEWERS]))
     else:
-        wanted = ANY if asked == "all" else (asked,)
+        wanted = ANY if wanted_preset == "all" else (wanted_preset,)
     found = {name: RenderSettings.preset(name, background=background) for name in wanted}
-    if lenses and asked in (None, "all"):
+    if lenses and wanted_preset in (None, "all"):
         found = {name: x for name, x in found.items() if not x.planar}
     if settings in found.values():
         return found

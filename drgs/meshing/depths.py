@@ -132,7 +132,7 @@ def seen_distance(gaussians: Gaussians) -> Callable[[Camera], float | None]:
 
     def distance(camera: Camera) -> float | None:
         small = at_most(camera.undistorted(), _PROBE_PIXELS)
-        with torch.no_grad():  # looked at, not optimized
+        with torch.no_grad():  # measured, not optimized
             out = render(gaussians, small, fast, ("depth",))
         assert out.depth is not None
         rows, columns = (slice(n // 4, n - n // 4) for n in (small.height, small.width))

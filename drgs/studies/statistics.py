@@ -14,7 +14,7 @@ keeps its 5 % of false alarms however few scenes there are.
 
 A race of policies [1]: the machine's hours go to pairs that are still open. A policy leaves when the interval of its
 difference from the reference excludes 0: PSNR, averaged over all numbers of views that were measured, in at least six
-units. The interval is looked at after every fit, so it is a wide one, 99 %; and as a policy leaves when its difference
+units. The interval is computed after every fit, so it is a wide one, 99 %; and as a policy leaves when its difference
 happens to look large, what is then known of it is on average too large. Units that are still to come are for those that
 stay.
 
@@ -69,7 +69,7 @@ class Effect:
 
     Attributes:
         mean: Mean of the scenes' means.
-        low, high: Its interval, of 95 % unless another share was asked for.
+        low, high: Its interval, of 95 % by default.
         detectable: How large a true difference has to be for a t test of so many scenes' means (of one scene: of its
             units) to tell it from 0 in 4 of 5 studies, with 5 % of false alarms; None with a single mean.
         units, scenes: How many there are.
@@ -191,7 +191,9 @@ def _detectable(means: Sequence[float]) -> float | None:
 
 # ------------------------------------------------------------------------------------------------------------- the race
 
-_RACE_SHARE = 0.99  # of the interval that must exclude 0: looked at after every fit, 95 % would be chance too often
+_RACE_SHARE = (
+    0.99  # coverage of the interval that must exclude 0: with 95 %, computed after every fit, chance decides too often
+)
 _RACE_METRIC = "psnr"
 
 

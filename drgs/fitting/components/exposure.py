@@ -168,11 +168,11 @@ def estimate_exposure(
     gauge is a zero mean. All channels of an observation have one weight: what hides a point changes all of them.
 
     Args:
-        frames: V photographs with their cameras; nothing outside of masks is looked at.
+        frames: V photographs with their cameras; pixels outside of masks are not used.
         points: (P, 3) world points, of which as many are drawn as memory has room for.
         seed: Seed of this draw.
-        shown: (V, P) bool, which photographs were found to show which points; None: nobody knows, and every photograph
-            into which a point is projected may.
+        shown: (V, P) bool, which photographs were found to show which points; None: unknown, and every photograph into
+            which a point is projected may.
     """
     most = max(1, _MOST_OBSERVATIONS // max(1, len(frames)))
     if len(points) > most:
@@ -419,7 +419,7 @@ class ExposureComponent(Component):
         return None if use == "off" else use
 
     def start(self, fit: Fit, setup: Setup) -> None:
-        """See `Component`: gains from the points that photographs share, if they are asked for or of use."""
+        """See `Component`: gains from the points that photographs share, if the option or their use says so."""
         config, use = fit.config, fit.config.data.exposure
         compared = _compared(setup, config)
         if use == "off":
@@ -466,7 +466,7 @@ class ExposureComponent(Component):
         return out if self.module is None else self.module(out, frame)
 
     def join(self, fit: Fit, frame: Frame, setup: Setup) -> list[dict]:
-        """See `Component`: points are looked at again, which the new photograph shows, too."""
+        """See `Component`: gains are estimated again, with the points of the new photograph."""
         use = fit.config.data.exposure
         if use == "off" or setup.picked_points is None:
             return []

@@ -93,7 +93,7 @@ class LensComponent(Component):
     undistorting would lose much.
 
     Attributes:
-        choice: What `auto` means; None where it was not asked.
+        choice: The choice of `auto`; None where it is not `auto`.
     """
 
     name = "lens"

@@ -154,7 +154,7 @@ class Search:
 
 
 class LifespansComponent(Component):
-    """Gaussians with a limited lifetime as a part of a fit to what moves: `lives` auto.
+    """Gaussians with a limited lifetime in a dynamic fit: `lives` auto.
 
     Attributes:
         times: Times of all photographs, sorted; none in a fit without.
@@ -172,7 +172,7 @@ class LifespansComponent(Component):
         self.times = setup.times if setup.config.motion.lives == "auto" else ()
 
     def before_density(self, fit: Fit) -> list[dict]:
-        """See `Component`: once, looks for what photographs show and the scene does not.
+        """See `Component`: once, search for what photographs show and the scene does not.
 
         Where the static stage was fitted to all times it shows nothing that moves, and this is at once. Where it shows
         the first time, the field may carry what it shows to the others, and is given the time for it.
@@ -218,7 +218,7 @@ class LifespansComponent(Component):
         return _with_lifespans(scene, lifespans_of(fit.rows.tensors))
 
     def after_backward(self, fit: Fit) -> None:
-        """See `Component`: what has a limited lifetime keeps one color in all directions.
+        """See `Component`: Gaussians with a limited lifetime keep one color in all directions.
 
         The few photographs that see it would each have a color of their own, wherever it is.
         """
@@ -229,7 +229,7 @@ class LifespansComponent(Component):
                 rest[limited] = 0
 
     def new_rows(self, fit: Fit, count: int) -> dict[str, torch.Tensor]:
-        """See `Component`: what is added is always there."""
+        """See `Component`: Gaussians that are added are visible at all times."""
         return _unlimited(count, self.times) if REFERENCE_TIMES in fit.rows.tensors else {}
 
     def describe(self, event: Mapping[str, Any]) -> str | None:
@@ -253,7 +253,7 @@ class LifespansComponent(Component):
 
 
 def _with_lifespans(scene: Scene, lifespans: Lifespans | None) -> Scene:
-    """A scene that moves, whose Gaussians have lifetimes."""
+    """A `DynamicGaussians` with these lifespans."""
     if lifespans is None:
         return scene
     from drgs.deform import DynamicGaussians
@@ -322,7 +322,7 @@ def add_new_gaussians(rows: GaussianRows, places: NewGaussians, times: Sequence[
     """Add Gaussians with a limited lifetime; where there are `most` already, they take the place of the faintest.
 
     Args:
-        rows: Changed in place; get tensors of lifetimes, by which those that are there already are always there.
+        rows: Changed in place; get tensors of lifetimes, by which the present ones are visible at all times.
         places: Places, times and velocities of theirs.
         times: Times of all photographs, sorted.
         gate: Logit of the gates of those that are added.
@@ -339,14 +339,14 @@ def add_new_gaussians(rows: GaussianRows, places: NewGaussians, times: Sequence[
     new = rows.from_points(places.points, places.colors, _OPACITY).take(torch.arange(count))
     new["log_scales"] = places.sizes.log()[:, None].repeat(1, 3)
     new["motion"] = torch.full((count,), gate)
-    moments = places.times.float()
-    began = (moments, _first_widths(places, times).log().float(), places.velocities, places.accelerations)
-    new |= dict(zip(LIFESPAN_PARAMETERS, began, strict=True))
-    new[REFERENCE_TIMES] = moments
+    centers = places.times.float()
+    start = (centers, _first_widths(places, times).log().float(), places.velocities, places.accelerations)
+    new |= dict(zip(LIFESPAN_PARAMETERS, start, strict=True))
+    new[REFERENCE_TIMES] = centers
     for name, x in rows.tensors.items():  # features and view-dependent colors begin at 0
         if name not in new or new[name].shape[1:] != x.shape[1:]:
             new[name] = x.new_zeros(count, *x.shape[1:])
-    # What hardly shows gives way. (A choice, which has no gradient.)
+    # The faintest give way. (A choice, which has no gradient.)
     faint = (rows.tensors["logit_opacities"].detach().sigmoid() < _FAINT_OPACITY).nonzero()[:, 0]
     room = max(0, min(count, most - len(rows)))
     taken = faint[: count - room]
@@ -366,7 +366,7 @@ def _unlimited(count: int, times: Sequence[float]) -> dict[str, torch.Tensor]:
 def _first_widths(places: NewGaussians, times: Sequence[float]) -> torch.Tensor:
     """(M,) first widths of lifetimes: standard deviations in time.
 
-    What other times have not confirmed is there at its own; else a time without photographs is to be bridged.
+    Gaussians that other times do not confirm are visible at their own; others bridge times without photographs.
     """
     known = torch.tensor(times, dtype=torch.float64)
     at = (known[None] - places.times.double()[:, None]).abs().argmin(1)
@@ -379,8 +379,8 @@ def _first_widths(places: NewGaussians, times: Sequence[float]) -> torch.Tensor:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LifetimeTerm:
-    """What keeps lifetimes long: the mean over Gaussians of the time between photographs over the width of a lifetime,
-    where that is below 1.
+    """Term of the loss that keeps lifetimes long: the mean over Gaussians of the time between photographs over the width
+    of a lifetime, where that is below 1.
     """
 
     rows: GaussianRows
@@ -608,13 +608,13 @@ def _compared(
     """A photograph beside its rendering, and the pixels whose depth is to be searched."""
     width, height = reduced_size(frame.camera, search.pixels)
     camera = frame.camera.resized(width, height)
-    with torch.no_grad():  # looked at
+    with torch.no_grad():  # compared, not optimized
         out = render(colors_only(scene, camera.time), camera, settings, outputs=("depth",))
         if shown is not None:
             out = shown(out, frame)
     rgb = out.rgb.cpu().clamp(0, 1).permute(2, 0, 1)
     image = _reduced(frame, search)
-    assert out.depth is not None  # asked for
+    assert out.depth is not None  # an output of this rendering
     assert camera.time is not None  # a fit to what moves
     distance = torch.where(out.alpha.cpu() > _SOLID, out.depth.cpu(), torch.inf)
     rays = torch.from_numpy(camera.pixel_directions()).reshape(height, width, 3).float()

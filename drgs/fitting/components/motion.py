@@ -111,7 +111,7 @@ class MotionComponent(Component):
     # --------------------------------------------------------------------------------------------------- stages
 
     def before_density(self, fit: Fit) -> list[dict]:
-        """See `Component`: goes on to the dynamic stage when that is due."""
+        """See `Component`: begins the dynamic stage when that is due."""
         if not self.times or self.field is not None or fit.step_index < dynamic_stage(fit.config).begin:
             return []
         self.begin_field(fit.config, fit.rows, fit.extent)
@@ -295,7 +295,7 @@ def _reopening(config: FitConfig) -> int:
 
 def moving_share(rows: GaussianRows) -> float:
     """Part of the Gaussians that move."""
-    # Looked at, not optimized.
+    # Counted, not optimized.
     return float((rows.tensors["motion"].detach() >= 0).float().mean()) if len(rows) else 0.0
 
 
@@ -359,7 +359,7 @@ class Rest:
 
 
 def _moving_scene(gaussians: Gaussians, checkpoint: Checkpoint) -> DynamicGaussians:
-    """The scene of a checkpoint of the dynamic stage, to be looked at.
+    """The scene of a checkpoint of the dynamic stage, for rendering.
 
     Args:
         gaussians: Its canonical Gaussians.

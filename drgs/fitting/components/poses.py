@@ -146,7 +146,7 @@ class Poses(torch.nn.Module):
             cameras: V pinhole cameras of the photographs, named as these, as the data set states them.
             extent: Extent of the scene, its unit of length.
             settings: What information is computed with.
-            reach: The reach; of a fit that goes on it is the checkpoint's.
+            reach: The reach; of a resumed fit it is the checkpoint's.
         """
         super().__init__()
         self.names = [camera.name for camera in cameras]
@@ -208,7 +208,7 @@ class Poses(torch.nn.Module):
 
         Args:
             camera: Its pinhole camera, named as it.
-            gaussians: The Gaussians, which are looked at only once refinement has begun.
+            gaussians: The Gaussians, which are used only once refinement has begun.
             far: How many of the first are far away, as of `begin`.
         """
         begun = self.has_begun
@@ -357,7 +357,7 @@ def refined_against(scene: Scene, frame: Frame, settings: RenderSettings) -> Cam
 
 def _difference(scene: Scene, frame: Frame, camera: Camera, settings: RenderSettings) -> tuple[float, torch.Tensor]:
     """The squared error of a photograph, and what its pixels lack."""
-    with torch.no_grad():  # derivatives are asked for forward
+    with torch.no_grad():  # derivatives are computed in forward mode
         image = render(scene, camera, settings).rgb.cpu()
     left = _inside((frame.image() - image).double(), frame).reshape(-1)
     return float(left @ left), left
@@ -510,7 +510,7 @@ class PosesComponent(Component):
         if use == "fixed":
             return
         with Bar("poses") as bar:
-            # Observations of views that are not chosen yet are not looked at.
+            # Observations of views that are not picked yet are not used.
             all_seen = not setup.is_active or fit.config.data.init_points == "all"
             self.evidence = PoseEvidence.of(setup.dataset.reprojection if all_seen else None, fit.frames)
             is_on = use == "refined" or self.evidence.is_clear

@@ -91,7 +91,7 @@ class SemanticRecord:
         Args:
             dataset: Data set that was loaded.
             config: Configuration of the fit.
-            views: Those that may be read at the start: no other's map is looked at, as long as one of them has a map,
+            views: Those that may be read at the start: no other's map is opened, as long as one of them has a map,
                 and never that of a held-out view.
         """
         known = dataset.semantics if config.features.semantics == "auto" else None
@@ -276,7 +276,7 @@ class FeatureDistance:
     def _shown(self, output: Output, frame: Frame, gaussians: Gaussians, width: int, height: int) -> torch.Tensor:
         """(h, w, D) features at the size of the teacher's map."""
         if self.size == "image":
-            assert output.features is not None  # `is_shown` asked for them
+            assert output.features is not None  # `is_shown`: they are an output
             planes = output.features.permute(2, 0, 1)[None]  # as it lies, channels last
             small = torch.nn.functional.interpolate(planes, (height, width), mode="bilinear", align_corners=True)
             return small[0].permute(1, 2, 0)
@@ -361,7 +361,7 @@ class SemanticsComponent(Component):
         self._folder: Path | None = None
 
     def prepare(self, setup: Setup) -> None:
-        """See `Component`: one map of the views that may be read is looked at."""
+        """See `Component`: one map of the views that may be read is opened."""
         self.known = SemanticRecord.of(setup.dataset, setup.config, setup.views)
         self._semantics = setup.dataset.semantics
         self.pictures = ("semantics.png",) if self.known else ()

@@ -197,7 +197,7 @@ class SkyboxChoice:
 
     Attributes:
         reason: Why there is none, in words; None where there is one.
-        evidence: What photographs say of it; None where they were not asked.
+        evidence: Agreement of the photographs; None where they were not compared.
     """
 
     reason: str | None
@@ -216,7 +216,7 @@ def far_evidence(frames: list[Frame], extent: float, seed: int = 0) -> FarEviden
     """Whether photographs show the same color wherever they look in one direction.
 
     Args:
-        frames: Training photographs, at least one; nothing outside of their masks is looked at.
+        frames: Training photographs, at least one; pixels outside of their masks are not used.
         extent: Extent of the scene.
         seed: Seed of the shuffling that shows what chance is.
     """
@@ -245,7 +245,7 @@ def visible_share(gaussians: Gaussians, far: int, frames: list[Frame], settings:
     """
     others = gaussians.detach().take(slice(far, None)).replace(features=None)
     shown = total = 0.0
-    with torch.no_grad(), Bar("what shows of the skybox", len(frames)) as bar:  # looked at, not optimized
+    with torch.no_grad(), Bar("what shows of the skybox", len(frames)) as bar:  # measured, not optimized
         for frame in frames:
             alpha = render(others, frame.camera, settings, outputs=()).alpha.cpu()
             mask = torch.ones_like(alpha) if frame.mask is None else frame.mask
@@ -389,11 +389,11 @@ class SkyboxComponent(Component):
         """By what is fitted, by what data say is behind everything, and by what photographs show.
 
         Raises:
-            ValueError: If a skybox is asked for where data say what is behind everything.
+            ValueError: If skybox is on where the data say what is behind everything.
         """
         config, frames = setup.config, setup.frames
         if "begin" in setup.modes:
-            return SkyboxChoice("the fit goes on from Gaussians of another one")
+            return SkyboxChoice("the fit continues from Gaussians of another one")
         if config.data.skybox == "off":
             return SkyboxChoice("skybox is off")
         if clash := setup.conflict(self):

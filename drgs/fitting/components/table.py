@@ -16,7 +16,7 @@ COMPONENTS: Registry[type[Component]] = Registry(
     "drgs.components",
     {
         # In the order in which their methods are called. The lens says what photographs are; terms of the loss are
-        # added up in this order; a pose is looked at with the colors that an exposure then scales; lifespans belong to
+        # added up in this order; a pose is rendered before an exposure scales the colors; lifespans belong to
         # what motion has begun.
         "lens": f"{_HERE}.lens:LensComponent",
         "filter_3d": f"{_HERE}.filter_3d:Filter3DComponent",

@@ -256,14 +256,14 @@ def _compared(frame: Frame, gaussians: Gaussians, settings: RenderSettings) -> _
     """A photograph beside its rendering."""
     width, height = reduced_size(frame.camera, _COMPARED_PIXELS)
     camera = frame.camera.resized(width, height)
-    with torch.no_grad():  # looked at
+    with torch.no_grad():  # compared, not optimized
         out = render(colors_only(gaussians, camera.time), camera, settings, outputs=("depth",))
     rgb = out.rgb.cpu().clamp(0, 1).permute(2, 0, 1)
     image = _reduced(frame.image().permute(2, 0, 1), height, width)
     valid = out.alpha.cpu() > _SOLID
     if frame.mask is not None:
         valid &= _reduced(frame.mask[None], height, width)[0] > 0.5
-    assert out.depth is not None  # asked for
+    assert out.depth is not None  # an output of this rendering
     distance = out.depth.cpu()
     if settings.planar and settings.depth_key == "z":
         # Depths are along the axis of the camera, rays are followed along themselves.

@@ -73,7 +73,7 @@ class Account:
         steps = f"{self.step:,} of {self.record.config.max_steps:,} steps"
         if last == "done":
             return f"finished, {steps}"
-        return f"stopped at {steps}, --resume goes on" if last == "interrupted" else f"at {steps}"
+        return f"stopped at {steps}, --resume continues" if last == "interrupted" else f"at {steps}"
 
 
 def account_of(run: Run) -> Account:

@@ -59,7 +59,7 @@ def uncertainty_of(
 
     Args:
         scene: What was fitted.
-        cameras: Cameras of the photographs, as large as they are to be asked.
+        cameras: Cameras of the photographs, at the size at which information is computed.
         settings: How it is drawn.
         nuisances: Unknowns of the photographs, eliminated from what they say.
     """

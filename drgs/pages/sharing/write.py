@@ -39,7 +39,7 @@ class Shared:
         lines: Sentences about it.
         gaussians: Gaussians, at least one; of a scene that moves, as they are at the first of `times`.
         cameras: Cameras with what they are of; at least one, pinholes.
-        target: (3,) point of the world that is looked at.
+        target: (3,) point of the world that the first camera looks at.
         up: (3,) direction of the world that is up, of length 1.
         background: RGB in [0, 1].
         uncertainty: (N,) standard deviation of each Gaussian's center; None: no such layer.
