@@ -338,7 +338,7 @@ def test_a_data_set_that_another_process_makes_is_waited_for(still, faked, tmp_p
             raise InUse(f"{still}: must not be written by two commands at once")
         return still
 
-    monkeypatch.setattr(engine, "_PATIENCE", 0.0)
+    monkeypatch.setattr(engine, "_RETRY_SECONDS", 0.0)
     study = dataclasses.replace(small(still), folder=folder)
     assert run_cells(study, study.cells(units((0,)))[:1], tmp_path, tmp_path / "rows.jsonl", str) == ([], {})
     assert len(calls) == 3

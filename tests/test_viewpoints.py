@@ -96,7 +96,7 @@ def test_kinds_of_sources(place):
     kinds = {"run": "run", "data": "data", "list.json": "list", "data/transforms.json": "data", "gone": "data"}
     for text, kind in kinds.items():
         assert Source.of("--cameras", str(place / text), generated=("orbit",)).kind == kind
-    assert [Source.of("--cameras", "dome", made=made).kind for made in ((), ("orbit",), ("dome",))] == [
+    assert [Source.of("--cameras", "dome", generated=generated).kind for generated in ((), ("orbit",), ("dome",))] == [
         "data",
         "data",
         "dome",

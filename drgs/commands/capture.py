@@ -70,7 +70,7 @@ def _print_next(args: Capture) -> None:
     if args.length is None:
         print("lengths are shares of the way from a photograph to what it shows; with --length they are in meters")
     for pick in picks:
-        worth = "" if pick["gain"] is None else f" (tells {_times(pick['gain'])})"
+        worth = "" if pick["gain"] is None else f" (adds {_times(pick['gain'])})"
         print(f"{pick['rank']}. {pick['text']}{worth}")
     print(f"arrows on the map: drgs report {shlex.quote(str(args.output))}; in the browser: drgs view")
 

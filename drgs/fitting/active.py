@@ -50,13 +50,11 @@ __all__ = ["SELECTION", "ActiveViews"]
 
 SELECTION = "selection.json"
 _COVERED = 0.5  # opacity from which on a pixel needs no new points: more of it is Gaussians than background
-_LEAST_OPEN_SHARE = (
-    0.01  # share of a view's pixels that are open, below which no new points are sought; chosen, not tuned
-)
+# Share of a view's pixels that are open, below which no new points are sought; chosen, not tuned.
+_LEAST_OPEN_SHARE = 0.01
 _MOST_DRAWN = 20  # times a view's share of the budget: most points drawn from its depth map; chosen, not tuned
-_ENOUGH_TRIANGULATED = (
-    1000  # triangulated points from which on `--restart auto` keeps the Gaussians; see docs/active-static.md
-)
+# Triangulated points from which on `--restart auto` keeps the Gaussians; see docs/active-static.md.
+_ENOUGH_TRIANGULATED = 1000
 _FEWEST_POINTS = 4  # points: each Gaussian's width is of its distances to the three nearest others
 
 

@@ -191,9 +191,8 @@ def _detectable(means: Sequence[float]) -> float | None:
 
 # ------------------------------------------------------------------------------------------------------------- the race
 
-_RACE_SHARE = (
-    0.99  # coverage of the interval that must exclude 0: with 95 %, computed after every fit, chance decides too often
-)
+# Coverage of the interval that must exclude 0: with 95 %, computed after every fit, chance decides too often.
+_RACE_SHARE = 0.99
 _RACE_METRIC = "psnr"
 
 

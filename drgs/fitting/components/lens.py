@@ -27,9 +27,8 @@ if TYPE_CHECKING:
 
 __all__ = ["LensChoice", "LensComponent", "lens_choice", "lost_share"]
 
-_MOST_LOST = (
-    0.2  # share of the rays that undistorting may crop; ordinary lenses lose 0.05, a fisheye of 180 degrees most
-)
+# Share of the rays that undistorting may crop; ordinary lenses lose 0.05, a fisheye of 180 degrees most.
+_MOST_LOST = 0.2
 _COUNTED_PIXELS = 10_000  # pixels of a camera by which the share is counted: right within 1 %
 
 

@@ -379,8 +379,8 @@ def _first_widths(places: NewGaussians, times: Sequence[float]) -> torch.Tensor:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LifetimeTerm:
-    """Term of the loss that keeps lifetimes long: the mean over Gaussians of the time between photographs over the width
-    of a lifetime, where that is below 1.
+    """Term of the loss that keeps lifetimes long: the mean over Gaussians of the time between photographs over
+    the width of a lifetime, where that is below 1.
     """
 
     rows: GaussianRows

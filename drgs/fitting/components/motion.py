@@ -58,13 +58,11 @@ _UNPENALIZED_LOGIT = -1.0  # logit below which a gate has no penalty, so that it
 # back at 35.7 at the end (docs/data/moving-trials.csv).
 _REOPENED_AT = 0.6  # when all gates open again, as at the start: closed ones have no gradient
 _REOPENED_FOR = 0.05  # how long they are then held open
-_GATE_EPSILON = (
-    0.3  # Adam's epsilon of gates over the gradient of their penalty: below it steps are in proportion; chosen
-)
+# Adam's epsilon of gates over the gradient of their penalty: below it steps are in proportion; chosen.
+_GATE_EPSILON = 0.3
 _MOST_LOGIT_CHANGE = 0.5  # change of a gate's logit in a step, at most, however short the fit; chosen
-_OUTSIDE_SHARE = (
-    0.005  # quantile of the means along each axis, at both ends, that bounds the field: floaters are outside; chosen
-)
+# Quantile of the means along each axis, at both ends, that bounds the field: floaters are outside; chosen.
+_OUTSIDE_SHARE = 0.005
 _MARGIN = 0.1  # of the size within these bounds, added on each side: Gaussians of the scene may move there; chosen
 _TIMED_RUNS = 5  # runs whose median is the measured time: odd; chosen
 _ADVICE = "restore the file, or fit again in another folder"

@@ -70,20 +70,17 @@ SHARE = 0.1
 
 _FARTHEST_RATIO = 2.0  # distance of the farthest over that of the nearest: neighbors keep their order in depth; chosen
 _OPACITY = 0.9  # at the start: nothing is behind them; below 1, so that its logit has a gradient; chosen
-_SCALE_RATIO = (
-    0.75  # standard deviation over the mean distance of neighbors: some percent of the light pass between them
-)
+# Standard deviation over the mean distance of neighbors: some percent of the light pass between them.
+_SCALE_RATIO = 0.75
 _MARGIN = 0.05  # of the longer side of a picture, beyond its border: directions that held-out views may look in
-_DIRECTIONS_FIRST = (
-    4_000  # directions over the sphere whose share in photographs is counted; four times as many until enough are
-)
+# Directions over the sphere whose share in photographs is counted; four times as many until enough are.
+_DIRECTIONS_FIRST = 4_000
 _MOST_DIRECTIONS = 1 << 20  # of these: 25 a square degree; chosen
 _POINTS_AT_ONCE = 1 << 18  # directions that are projected at once: 6 MB of float64 points
 _COLORS_AT_ONCE = 1 << 25  # bytes of the colors of all photographs at some points; a median takes several times that
 _ENOUGH_DIRECTIONS = 200  # directions in photographs for which their share is right within some percent
-_FEWEST_DIRECTIONS = (
-    20  # the same, where even the most directions do not suffice; bounds the number that are drawn then
-)
+# Directions in photographs that are assumed, at least, where even the most drawn ones give fewer.
+_FEWEST_DIRECTIONS = 20
 _MEASURED_VIEWS = 8  # photographs, at most, whose share of skybox is measured at the end; chosen for its seconds
 _OPEN_TRANSMITTANCE = 0.5  # transmittance of the other Gaussians from which on a pixel shows mostly the shell
 _COMPARED_DIRECTIONS = 800  # directions in which colors are compared: the share is right within 2 %

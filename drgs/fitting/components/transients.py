@@ -44,13 +44,7 @@ TENSOR = "transient."
 """What names of masks in a checkpoint begin with; the number of the photograph follows."""
 
 # Where nothing measured is named: chosen, not tuned.
-_COMPARED_AT = (
-    3 / 8,
-    1 / 2,
-    5 / 8,
-    3 / 4,
-    7 / 8,
-)  # parts of the steps at which masks are made anew; until the first, all pixels count
+_COMPARED_AT = (0.375, 0.5, 0.625, 0.75, 0.875)  # of the steps: masks are made anew; until the first, all pixels count
 _LEAST_VISITS = 4  # steps that a photograph must have had on average; fewer leave residuals of what is not fitted yet
 _FEWEST_PHOTOGRAPHS = 4  # photographs of a fit: one, and three that it is compared with
 _COMPARED_PIXELS = 6_000  # pixels of a picture that is compared: 20,000 give the same masks in twice the time
@@ -63,9 +57,8 @@ _DARK = 0.05  # of the range of colors, below which the ratio of two is noise
 _SPREADS = 2.0  # times the spread of the neighbors' own colors, which a difference must exceed
 _CLEAR, _EDGE = 0.1, 0.05  # of the range of colors: what exceeds the spread where a mask begins, and where it ends
 _GROWTH = 0.08  # widths of the picture: how far a mask grows from where it begins, at most
-_DECISIVE_SHARE = (
-    0.025  # of a photograph's pixels that clearly differ, above which masks are used. Clean captures: at most 0.017
-)
+# Share of a photograph's pixels that clearly differ, above which masks are used. Clean captures: at most 0.017.
+_DECISIVE_SHARE = 0.025
 _MASKED_SHARE = 0.01  # the same, from which on a photograph has a mask once that is decided; less are specks
 _TIMES_MEDIAN = 4.0  # times the median over photographs, which wrong poses and mirrors raise in all of them
 

@@ -37,9 +37,8 @@ STORED_TIMES = 12
 """Times at which a moving scene is stored, by default; the size of the page grows with it. Chosen, not tuned."""
 
 _UP = np.array((0.0, -1.0, 0.0))  # as COLMAP's worlds stand, where no photographs say
-_MOST_PHOTOGRAPHS = (
-    24  # photographs whose information is summed, spread evenly over more; chosen for its seconds, as in the report
-)
+# Photographs whose information is summed, spread evenly over more; chosen for its seconds, as in the report.
+_MOST_PHOTOGRAPHS = 24
 _INFORMATION_PIXELS = 30_000  # pixels of each of these photographs, at most; chosen for its seconds
 
 _log = logging.getLogger(__name__)
