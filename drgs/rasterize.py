@@ -22,6 +22,7 @@ import torch
 from drgs.cameras import Camera
 from drgs.cameras.shutters import SHUTTERS
 from drgs.checks.arguments import ArgumentError
+from drgs.checks.torch_func import is_wrapped
 from drgs.ellipsoids import Y_00, semi_axes
 from drgs.integrator import render_normals, render_with_offsets
 from drgs.runtime import uncompiled
@@ -505,7 +506,7 @@ def _leaf(
 ) -> torch.Tensor | None:
     """(..., C, N, 2) what becomes `meta["means2d"]`, where a backward pass may ask for its gradient."""
     wanted = torch.is_grad_enabled() and any(x.requires_grad for x in (means, viewmats, opacities))
-    if not wanted or not settings.planar or torch._C._functorch.is_functorch_wrapped_tensor(means):
+    if not wanted or not settings.planar or is_wrapped(means):
         return None
     return means.new_zeros(*lead, count, means.shape[-2], 2).requires_grad_()
 

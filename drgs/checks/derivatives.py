@@ -1,4 +1,4 @@
-"""What torch asks of a derivative that has none of its own, and of tensors that have no numbers: refused in a sentence.
+"""Refuse second derivatives, batches of `torch.func.vmap` and tensors without numbers, each in one sentence.
 
 The renderer's derivatives are computed by Dr.Jit, once: torch sees numbers, not the functions that they are. Without
 `first_only` it would take them for constants, and whatever is built on a second derivative would vanish.
@@ -12,12 +12,14 @@ from typing import Any, NoReturn, TypeVar
 import torch
 
 from drgs.checks.arguments import ArgumentError
+from drgs.checks.torch_func import is_batched, is_wrapped, without_wrappers
 
 __all__ = [
     "check_has_numbers",
     "check_unbatched",
     "ends_of",
     "first_only",
+    "is_functional",
     "refuse_batched",
     "refuse_meta",
     "unwrapped",
@@ -29,34 +31,35 @@ Derivatives = tuple[torch.Tensor | None, ...]
 
 
 def first_only(where: str, derivatives: Derivatives, by: Sequence[torch.Tensor | None]) -> Derivatives:
-    """First derivatives that cannot be differentiated: asking for a second one raises NotImplementedError.
+    """First derivatives that cannot be differentiated again: a second derivative raises NotImplementedError.
 
-    Unlike `torch.autograd.function.once_differentiable`, which marks them only where the cotangents have a graph: of a
-    loss that is linear in the image they have none, and its second derivative would be 0 without a word. What asks for
-    a graph and never uses it (`create_graph=True`) gets the first derivatives as they are.
+    Unlike `torch.autograd.function.once_differentiable`, which marks them only where the cotangents have a graph: those
+    of a loss that is linear in the image have none, and its second derivative would silently be 0. A graph that is
+    built and never used (`create_graph=True`) changes nothing.
 
     Args:
         where: The function, for the message.
         derivatives: Derivatives, None where there is none.
         by: What they depend on: the point and the cotangents, or tangents.
     """
-    if not any(_watched(x) for x in by if x is not None):
+    if not any(_is_differentiated(x) for x in by if x is not None):
         return derivatives
-    made = [x for x in derivatives if x is not None]
-    known = iter(_Last.apply(where, len(made), *made, *(x for x in by if x is not None)))
-    return tuple(None if x is None else next(known) for x in derivatives)
+    present = [x for x in derivatives if x is not None]
+    marked = iter(_NoSecond.apply(where, len(present), *present, *(x for x in by if x is not None)))
+    return tuple(None if x is None else next(marked) for x in derivatives)
 
 
-def _watched(x: torch.Tensor) -> bool:
+def is_functional(x: torch.Tensor) -> bool:
+    """Whether torch differentiates without a graph here: a dual number of forward mode, or within `torch.func`."""
+    return is_wrapped(x) or torch.autograd.forward_ad.unpack_dual(x).tangent is not None
+
+
+def _is_differentiated(x: torch.Tensor) -> bool:
     """Whether torch would differentiate what is computed from it: by a graph, a dual number or `torch.func`."""
-    return (
-        (torch.is_grad_enabled() and x.requires_grad)
-        or torch._C._functorch.is_functorch_wrapped_tensor(x)
-        or torch.autograd.forward_ad.unpack_dual(x).tangent is not None
-    )
+    return (torch.is_grad_enabled() and x.requires_grad) or is_functional(x)
 
 
-class _Last(torch.autograd.Function):
+class _NoSecond(torch.autograd.Function):
     """The first `count` tensors, tied to all of them by a derivative that raises."""
 
     @staticmethod
@@ -88,14 +91,9 @@ def _refuse_second(where: str) -> NoReturn:
 
 
 def check_unbatched(where: str, x: torch.Tensor) -> None:
-    """Raise NotImplementedError for a tensor that `torch.func.vmap` or `is_grads_batched` made."""
-    functorch = torch._C._functorch
-    if functorch.is_legacy_batchedtensor(x):
+    """Raise NotImplementedError for a batch of `torch.func.vmap` or `is_grads_batched`."""
+    if is_batched(x):
         refuse_batched(where)
-    while functorch.is_functorch_wrapped_tensor(x):
-        if functorch.is_batchedtensor(x):
-            refuse_batched(where)
-        x = functorch.get_unwrapped(x)
 
 
 def unwrapped(x: torch.Tensor, convert: Callable[[torch.Tensor], _Result]) -> _Result:
@@ -105,12 +103,7 @@ def unwrapped(x: torch.Tensor, convert: Callable[[torch.Tensor], _Result]) -> _R
         NotImplementedError: If one of the wrappers is a batch of `torch.func.vmap`.
     """
     check_unbatched("render", x)
-    functorch = torch._C._functorch
-    # Otherwise every operation wraps its result again.
-    with torch._C._DisableFuncTorch():
-        while functorch.is_functorch_wrapped_tensor(x):
-            x = functorch.get_unwrapped(x)
-        return convert(x.detach())  # numpy takes no tensor with a graph
+    return without_wrappers(x, convert)
 
 
 def refuse_batched(where: str) -> NoReturn:
@@ -122,7 +115,7 @@ def refuse_batched(where: str) -> NoReturn:
 
 
 def check_has_numbers(where: str, name: str, x: torch.Tensor) -> None:
-    """Raise unless a tensor has numbers that can be looked at: on the device `meta` it has none, in a vmap many.
+    """Raise unless a tensor's values can be read: on the device `meta` it has none, in a vmap several sets.
 
     Raises:
         ArgumentError: On `meta`.
@@ -133,7 +126,7 @@ def check_has_numbers(where: str, name: str, x: torch.Tensor) -> None:
 
 
 def ends_of(x: torch.Tensor) -> tuple[float, float]:
-    """The least and the largest entry of a tensor that has some: NaN if one is. Also of a dual number."""
+    """The least and the largest entry of a tensor that is not empty; NaN if an entry is. Works for dual numbers, too."""
     low, high = torch.stack((x.amin(), x.amax())).tolist()  # `aminmax` has no forward mode in all of torch's releases
     return low, high
 

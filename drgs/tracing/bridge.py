@@ -13,7 +13,7 @@ import drjit as dr
 import torch
 
 from drgs import runtime
-from drgs.checks.derivatives import first_only, refuse_batched, unwrapped
+from drgs.checks.derivatives import first_only, is_functional, refuse_batched, unwrapped
 
 if TYPE_CHECKING:
     from drgs.tracing.call import Call
@@ -31,21 +31,12 @@ def differentiable(call: Call) -> dict[str, torch.Tensor]:
     values = call.inputs.values()
     if call.count == 0 or call.pixels == 0:
         return call.nothing()
-    if _forward_ad(values):
+    if any(is_functional(x) for x in values):
         return dict(zip(call.image_names, _Functional.apply(call, *values), strict=True))
     if torch.is_grad_enabled() and any(x.requires_grad for x in values):
         return dict(zip(call.image_names, _Reverse.apply(call, *values), strict=True))
     images = call.trace(**{name: to_drjit(call.lib, x) for name, x in call.inputs.items()})
     return {name: x.torch() for name, x in images.items()}
-
-
-def _forward_ad(values: Iterable[torch.Tensor]) -> bool:
-    """Whether a tensor is a dual number or belongs to a `torch.func` transform."""
-    return any(
-        torch._C._functorch.is_functorch_wrapped_tensor(x)
-        or torch.autograd.forward_ad.unpack_dual(x).tangent is not None
-        for x in values
-    )
 
 
 class _Reverse(torch.autograd.Function):
@@ -70,8 +61,8 @@ class _Reverse(torch.autograd.Function):
             dr.set_grad(image, _plain(ctx.call.lib, g).array)
         needed = [k for k, x in enumerate(inputs) if x is not None]
         slopes: dict[int, Any] = dict(zip(needed, dr.backward_to([inputs[k] for k in needed]), strict=True))
-        found = tuple(slopes[k].torch() if k in slopes else None for k in range(len(inputs)))
-        return None, *first_only("render", found, (*values, *cotangents))
+        gradients = tuple(slopes[k].torch() if k in slopes else None for k in range(len(inputs)))
+        return None, *first_only("render", gradients, (*values, *cotangents))
 
 
 def _traced(call: Call, values: Iterable[torch.Tensor], needed: Iterable[bool]) -> tuple[list, list]:
@@ -108,8 +99,8 @@ class _Functional(torch.autograd.Function):
             dr.set_grad(images[name], _plain(lib, g).array)
         dr.enqueue(dr.ADMode.Backward, images)
         dr.traverse(dr.ADMode.Backward)
-        found = tuple(dr.grad(x).torch().clone() for x in inputs.values())
-        return None, *first_only("render", found, (*ctx.saved_tensors, *cotangents))
+        gradients = tuple(dr.grad(x).torch().clone() for x in inputs.values())
+        return None, *first_only("render", gradients, (*ctx.saved_tensors, *cotangents))
 
     @staticmethod
     @runtime.alone
@@ -123,8 +114,8 @@ class _Functional(torch.autograd.Function):
                 dr.set_grad(x, _plain(lib, v))
         dr.enqueue(dr.ADMode.Forward, inputs)
         dr.traverse(dr.ADMode.Forward)
-        found = tuple(dr.grad(images[name]).torch().clone() for name in call.image_names)
-        return first_only("render", found, (*ctx.saved_tensors, *tangents))
+        image_tangents = tuple(dr.grad(images[name]).torch().clone() for name in call.image_names)
+        return first_only("render", image_tangents, (*ctx.saved_tensors, *tangents))
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *_: Any) -> NoReturn:
