@@ -81,9 +81,9 @@ def render(
     """
     if isinstance(camera, list | tuple):
         cameras = cameras_of_one_size("render", camera)
-        wanted = _wanted(outputs)
+        wanted = _checked_outputs(outputs)
         return _batch([_view(gaussians, each, settings, wanted, couple_features, lens, rays) for each in cameras])
-    return _view(gaussians, camera, settings, _wanted(outputs), couple_features, lens, rays)
+    return _view(gaussians, camera, settings, _checked_outputs(outputs), couple_features, lens, rays)
 
 
 def _view(
@@ -159,7 +159,7 @@ def render_jvp(
         tangents |= {f"phi.{name}": x for name, x in phi.items()}
     settings = settings or RenderSettings.preset("exact")
     # The tangents are given: a graph of torch would lead nowhere.
-    want = _wanted(outputs) & {"depth"}
+    want = _checked_outputs(outputs) & {"depth"}
     timed = "time" in tangents and camera.time is not None
     lens = torch.from_numpy(camera.lens_parameters) if "lens" in tangents else None
     call = Call(
@@ -205,7 +205,7 @@ def render_with_offsets(
         gaussians,
         camera,
         settings,
-        _wanted(outputs),
+        _checked_outputs(outputs),
         pixel_rays=rays,
         mean_offsets=mean_offsets,
         mean_absolute=mean_absolute,
@@ -282,12 +282,14 @@ def render_rays(
     settings = settings or RenderSettings.preset("exact", traversal="bvh")
     if settings.traversal != "bvh":
         raise NotImplementedError("render_rays: arbitrary rays must have traversal='bvh', got 'tiles'")
-    call = Call(gaussians, None, settings, _wanted(outputs), rays=(origins, directions), couple=couple_features)
+    call = Call(
+        gaussians, None, settings, _checked_outputs(outputs), rays=(origins, directions), couple=couple_features
+    )
     with own_errors():
         return call.output(differentiable(call))
 
 
-def _wanted(outputs: Iterable[str]) -> frozenset[str]:
+def _checked_outputs(outputs: Iterable[str]) -> frozenset[str]:
     if outputs == "all":
         outputs = OUTPUTS
     if isinstance(outputs, str):

@@ -52,7 +52,7 @@ from drgs.io import atomic
 from drgs.io.checkpoint import load_state, save_state, state_header
 from drgs.io.json_files import check_json, parse_json
 from drgs.select import Scoring, select
-from drgs.selection.cache import Cache, NotKept, named_by
+from drgs.selection.cache import Cache, NotCached, named_by
 from drgs.selection.informed import compute_candidates
 from drgs.selection.pool import Pick, Pool, Selection
 from drgs.selection.refining import Refine
@@ -482,9 +482,9 @@ class Planner:
         """Coverage of a view, as policy `coverage` takes it; computed where it is not known yet."""
 
         def coverage(camera: Camera) -> Information:
-            if self._cache.seen(scene, camera) is None:
+            if self._cache.image_weights(scene, camera) is None:
                 self._evaluate(scene, camera)
-            return {"coverage": self._cache.seen(scene, camera)}
+            return {"coverage": self._cache.image_weights(scene, camera)}
 
         return coverage
 
@@ -591,7 +591,7 @@ class Planner:
             pool = [self._pool[i] for i in places]
             try:
                 selection = select(scene, pool, known, min(k, len(pool)), scoring=self._scoring, cache=self._cache)
-            except NotKept as lacking:
+            except NotCached as lacking:
                 places = [i for i in places if self._cache.keeps(lacking.quantity, self._pool[i])]
                 known = [camera for camera in known if self._cache.keeps(lacking.quantity, camera)]
             else:

@@ -239,7 +239,7 @@ def rasterization(
     if colors is None or not mode.color:
         colors, sh_degree, backgrounds = torch.zeros_like(means[..., :1]), None, None
     lead = tuple(means.shape[:-2])
-    colors = _for_batches(colors, sh_degree, lead)
+    colors = _expanded_to_batches(colors, sh_degree, lead)
     shown = colors
     if sh_degree is not None and colors.ndim and colors.shape[-1] != 3:
         shown = colors[..., :1].expand(*colors.shape[:-1], 3)  # SH of other channels: evaluated by `_View`
@@ -258,7 +258,7 @@ def rasterization(
     lenses = _lenses_of(camera_model, lead, count, *coefficients, Ks)
     _check_along_rays(settings, shutter != "global", bool(lenses[0][0]), rays, mode, return_normals)
     _check_rays(rays, (*lead, count, height, width, 6))
-    extra = None if extra_signals is None else _for_batches(extra_signals, extra_signals_sh_degree, lead)
+    extra = None if extra_signals is None else _expanded_to_batches(extra_signals, extra_signals_sh_degree, lead)
     _check_extra(extra, extra_signals_sh_degree, lead, count, means.shape[-2])
     options = _Options(
         settings=settings,
@@ -272,8 +272,8 @@ def rasterization(
         extra_degree=extra_signals_sh_degree,
         normals=return_normals,
     )
-    leaf = _leaf(means, viewmats, opacities, settings, lead, count)
-    absolute = _absolute(leaf) if absgrad else None
+    leaf = _means2d_leaf(means, viewmats, opacities, settings, lead, count)
+    absolute = _absgrad_leaf(leaf) if absgrad else None
 
     def by_batch(x: Any) -> Any:
         """All leading axes as one; None stays None."""
@@ -297,11 +297,11 @@ def rasterization(
                 quats=quats_[b],
                 scales=scales_[b],
                 opacities=opacities_[b],
-                colors=_of_view(by_batch(colors), b, c, sh_degree),
+                colors=_colors_of_view(by_batch(colors), b, c, sh_degree),
                 degree=sh_degree,
                 strains=None if strains_ is None else strains_[b],
             )
-            signals = None if extra is None else _of_view(by_batch(extra), b, c, extra_signals_sh_degree)
+            signals = None if extra is None else _colors_of_view(by_batch(extra), b, c, extra_signals_sh_degree)
             views.append(_View(options, splats, camera, signals, *(at(x, b, c) for x in by_view)))
     drawn = [view.draw() for view in views]
 
@@ -374,10 +374,10 @@ class _View:
         """The image (H, W, X), its alpha (H, W, 1), and the arrays of `meta`."""
         o, camera, splats = self.options, self.camera, self.splats
         settings = o.settings
-        local, center = self._seen()
+        local, center = self._means_in_camera()
         own = local[:, 2:] if settings.depth_key == "z" else local.norm(dim=1, keepdim=True)
         cut = (own[:, 0] if o.gsplat_depth else local[:, 2]).detach()  # what near and far planes look at
-        meta, compensation = self._on_image(cut)
+        meta, compensation = self._projected(cut)
         if compensation is not None:
             splats = dataclasses.replace(splats, opacities=inside_opacities(splats.opacities * compensation))
         # `meta` is for reading: no gradient passes through it.
@@ -395,7 +395,7 @@ class _View:
             added.append(own.to(splats.means.dtype))
         offsets = None if self.leaf is None else self.leaf - self.leaf.detach()  # zeros with its derivative
         absolute = self.absolute
-        kept = self._kept(meta, cut)
+        kept = self._is_drawn(meta, cut)
         meta["radii"] = meta["radii"] * kept[:, None]
         if not bool(kept.all()) and (o.far < _FAR or o.clip > 0 or o.near > settings.near):
             index = kept.nonzero()[:, 0]
@@ -444,7 +444,7 @@ class _View:
             channels.append(depth)
         return torch.cat(channels, -1)
 
-    def _seen(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def _means_in_camera(self) -> tuple[torch.Tensor, torch.Tensor]:
         """(N, 3) means in the axes of the camera whose depths count, and where colors are seen from, (3,)."""
         camera = self.camera
         means = self.splats.means.double()
@@ -456,13 +456,13 @@ class _View:
             center = 0.5 * (center - end[:, 3] @ end[:, :3])
         return means @ pose[:, :3].T + pose[:, 3], center.to(self.splats.means.dtype)
 
-    def _on_image(self, depths: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor | None]:
+    def _projected(self, depths: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor | None]:
         """`meta`, and what opacities are multiplied with."""
         if self.options.with_ut or self.camera.is_distorted or self.camera.is_rolling:
             return _projected_by_points(self.splats, self.camera, depths, self.options.near), None
         return _projected_by_jacobian(self.splats, self.camera, self.options.settings, self.options.antialiased)
 
-    def _kept(self, meta: dict[str, torch.Tensor], depths: torch.Tensor) -> torch.Tensor:
+    def _is_drawn(self, meta: dict[str, torch.Tensor], depths: torch.Tensor) -> torch.Tensor:
         """(N,) which Gaussians are drawn: the renderer itself knows no far plane and no smallest radius."""
         depths = meta["depths"] if self.options.settings.planar else depths
         kept = depths <= self.options.far
@@ -483,20 +483,20 @@ def _evaluated(coefficients: torch.Tensor, degree: int, towards: torch.Tensor) -
     return 0.5 + torch.einsum("nk,nkd->nd", torch.stack(x, 1), coefficients[:, :used])
 
 
-def _for_batches(x: torch.Tensor, degree: int | None, lead: tuple[int, ...]) -> torch.Tensor:
+def _expanded_to_batches(x: torch.Tensor, degree: int | None, lead: tuple[int, ...]) -> torch.Tensor:
     """Coefficients (N, K, D) that all batches share, for each of them; others as they are."""
     if degree is not None and lead and isinstance(x, torch.Tensor) and x.ndim == 3:
         return x.expand(*lead, *x.shape)
     return x
 
 
-def _of_view(x: torch.Tensor, batch: int, camera: int, degree: int | None) -> torch.Tensor:
+def _colors_of_view(x: torch.Tensor, batch: int, camera: int, degree: int | None) -> torch.Tensor:
     """Colors of one view, of those by batch, or by batch and camera."""
     by_camera = x.ndim == (4 if degree is None else 5)
     return x[batch, camera] if by_camera else x[batch]
 
 
-def _leaf(
+def _means2d_leaf(
     means: torch.Tensor,
     viewmats: torch.Tensor,
     opacities: torch.Tensor,
@@ -511,7 +511,7 @@ def _leaf(
     return means.new_zeros(*lead, count, means.shape[-2], 2).requires_grad_()
 
 
-def _absolute(leaf: torch.Tensor | None) -> torch.Tensor | None:
+def _absgrad_leaf(leaf: torch.Tensor | None) -> torch.Tensor | None:
     """Zeros like the leaf, whose gradient becomes its `absgrad` after each backward pass."""
     if leaf is None:
         return None

@@ -197,7 +197,7 @@ class _Recording:
         image_path, label_path, feature_path = self.paths(camera, k)
         c2w = self.poses[camera]
         number = k * len(self.poses) + camera
-        labels, points, _ = self._seen(camera)
+        labels, points, _ = self._visible_surfaces(camera)
         feature = teacher.feature_map(
             labels, points, self.play.classes, self.teacher_size, self.seed, number, self.play.confusions
         )
@@ -211,7 +211,7 @@ class _Recording:
         image = scenes.encode_srgb(np.asarray(image) * self.play.exposure)
         output.write_png(image_path, image[..., ::-1])  # as BGR; last, since with it the frame is finished
 
-    def _seen(self, camera):
+    def _visible_surfaces(self, camera):
         """(labels, world points, depth) of the surfaces at a camera's pixel centers."""
         c2w = self.poses[camera]
         depth, numbers = scenes.first_hits(self.stage.scene, self.K, c2w, self.width, self.height)
@@ -231,7 +231,7 @@ class _Recording:
         for c in range(len(self.poses)):
             image = cv2.imread(str(self.paths(c, 0)[0]))
             output.write_png(folder / "frame0" / "images" / f"{self.names[c]}.png", image)
-            labels, _, depth = self._seen(c)
+            labels, _, depth = self._visible_surfaces(c)
             first.append((image[..., ::-1].copy(), depth, labels))
         self._write_frame0(first)
         for name in self.names:

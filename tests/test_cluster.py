@@ -289,8 +289,8 @@ def test_payloads_bring_closures_and_tensors():
 
 def test_a_worker_keeps_the_last_few(monkeypatch):
     """Payloads come in pieces, in any order; those that were not used for longest make room, and are missing then."""
-    monkeypatch.setattr(payloads, "_PIECE", 10)
-    made = [Payload.of(f"payload {i}") for i in range(payloads._KEPT + 1)]
+    monkeypatch.setattr(payloads, "_PIECE_BYTES", 10)
+    made = [Payload.of(f"payload {i}") for i in range(payloads._MAX_PAYLOADS + 1)]
     assert len(made[0].pieces()) > 1
     for i, payload in enumerate(made):
         for piece in reversed(payload.pieces()):

@@ -271,7 +271,7 @@ def test_points_do_not_depend_on_how_many_views_came_at_once(tmp_path, rng, monk
     """Where cameras are matched with the nearest ones only, those that were nearest before others came do not count:
     a fit that was killed and resumed, which matches all views at once, has the points of one that was not.
     """
-    monkeypatch.setattr("drgs.sfm.points._NEIGHBORS", 1)
+    monkeypatch.setattr("drgs.sfm.points._MATCHED_NEIGHBORS", 1)
     views, matches = plane_views(tmp_path, rng, count=5), Matches()
     for count in (2, 4):
         added_points([views[i] for i in (0, 4, 1, 3, 2)[:count]], 0, matches)

@@ -12,7 +12,7 @@ from scenes_random import gaussians
 
 from drgs.cameras import orbit
 from drgs.ellipsoids import Gaussians
-from drgs.selection.cache import Cache, NotKept, view_key
+from drgs.selection.cache import Cache, NotCached, view_key
 from drgs.selection.drift import Shapes
 
 pytestmark = pytest.mark.core
@@ -106,7 +106,7 @@ def test_an_answer_lasts_while_little_changes():
     assert cache.find(much, key) is None
     cache.computes = False
     assert cache.find(much, key) is not None
-    with pytest.raises(NotKept) as lacking:
+    with pytest.raises(NotCached) as lacking:
         cache.find(much, key_of(camera, "something else"))
     assert lacking.value.quantity == "something else"
     assert cache.keeps("what", camera)
@@ -128,7 +128,7 @@ def test_what_a_view_does_not_see_may_change():
     told["sh"][1, 0] = 3.0
     cache.keep(g, key_of(camera), told)
     assert cache.change(g.replace(log_scales=scales), camera) == pytest.approx(0.375, rel=1e-4)
-    assert cache.seen(g, camera)[:3].tolist() == [3.0, 9.0, 0.0]
+    assert cache.image_weights(g, camera)[:3].tolist() == [3.0, 9.0, 0.0]
 
 
 def test_new_gaussians_count_where_they_are_seen():
@@ -170,7 +170,7 @@ def test_only_what_is_expected_is_kept():
     assert cache.find(g, key_of(views[3])) is None
     cache.expect(views[2:])
     assert (len(cache), cache.bytes) == (1, size)
-    assert cache.seen(g, views[1]) is None
+    assert cache.image_weights(g, views[1]) is None
     cache.invalidate()
     assert (len(cache), cache.bytes, cache.change(g, views[2])) == (0, 0, math.inf)
 
@@ -183,7 +183,7 @@ def test_a_shorter_list_is_another_scene():
     cache.keep(g, key_of(camera), information(g))
     fewer = g.replace(**{name: x[:7] for name, x in g.parameters().items()})
     assert cache.find(fewer, key_of(camera)) is None
-    assert cache.seen(fewer, camera) is None
+    assert cache.image_weights(fewer, camera) is None
     cache.keep(fewer, key_of(camera), information(fewer))
     assert cache.find(g, key_of(camera))["means"].shape == (12, 3)
     flat = g.replace(sh=g.sh[:, :1])

@@ -126,7 +126,7 @@ def test_bvh_finds_the_hits(rng, name):
 @pytest.mark.parametrize("listed", [0, 3, 1000])
 def test_rays_that_start_inside(rng, monkeypatch, listed, order):
     """Origins in the midst of Gaussians see those they are inside of, be these listed, moved back behind or both."""
-    monkeypatch.setattr(bvh, "_LISTED", listed)
+    monkeypatch.setattr(bvh, "_MAX_LISTED", listed)
     g = gaussians(rng, 30, 1, scale=0.4, anisotropy=0.3).detach()
     origins, directions = rng.uniform(-0.7, 0.7, (40, 3)), rng.normal(size=(40, 3))
     settings = RenderSettings.preset("exact", traversal="bvh", order=order)

@@ -149,7 +149,7 @@ def test_blocks_of_weights(rng, width, monkeypatch):
         whole = everything(g, cam, settings, couple_features=couple)
         with monkeypatch.context() as small:
             small.setattr(composite, "MATRIX", 12 << 10)
-            small.setattr(weights, "_WORK", 1 << 10)
+            small.setattr(weights, "_PRODUCT_BYTES", 1 << 10)
             small.setattr(weights.Weights, "zeros", noted)
             parts = everything(g, cam, settings, couple_features=couple)
         for name, x in whole.items():
@@ -182,7 +182,7 @@ def test_products_are_bounded(rng, monkeypatch):
         sizes.append(gathered(cotangent, group))
         return sizes[-1]
 
-    monkeypatch.setattr(weights, "_WORK", 4 * 24 * 64 * 2)  # bytes of the pixels of two tiles
+    monkeypatch.setattr(weights, "_PRODUCT_BYTES", 4 * 24 * 64 * 2)  # bytes of the pixels of two tiles
     monkeypatch.setattr(weights, "_gathered", noted)
     g, cam = gaussians(rng, 40, 4, 24), camera(rng, (29, 21))
     render(g, cam, settings_of(128)).features.square().sum().backward()

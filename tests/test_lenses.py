@@ -95,7 +95,7 @@ def _everywhere(self, guides):
 @pytest.mark.parametrize("name", LENSES)
 def test_what_bounds_leave_out_changes_nothing(rng, monkeypatch, name, anisotropy):
     """Listing a Gaussian only where it may be seen gives the same bits as listing it everywhere."""
-    monkeypatch.setattr(tiles, "_LARGE", 0)
+    monkeypatch.setattr(tiles, "_TEST_TILES_FROM", 0)
     pairs = []
     for spread in (1.0, 8.0):
         cam = lens_camera(rng, name, (61, 45), turn=1.0)

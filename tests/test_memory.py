@@ -138,8 +138,8 @@ def test_render_refuses_what_does_not_fit(gaussians, one_gigabyte):
 
 def test_tile_lists_that_do_not_fit(gaussians, monkeypatch):
     """Many wide Gaussians on an image that would fit by itself: counted before they are listed."""
-    monkeypatch.setattr(memory, "_SMALL", 0)
-    monkeypatch.setattr(memory, "_OTHER", 0)
+    monkeypatch.setattr(memory, "_UNCHECKED_BYTES", 0)
+    monkeypatch.setattr(memory, "_RESERVE_BYTES", 0)
     where = "_device" if runtime.backend().name == "cuda" else "available"
     monkeypatch.setattr(memory, where, lambda: memory.frame_bytes(64 * 64, TILES.traversal) + 1)
     wide = gaussians.replace(log_scales=gaussians.log_scales + 4).take(torch.arange(400) % 20)

@@ -162,7 +162,7 @@ def test_what_is_computed_once_is_the_scene(views, monkeypatch):
     assert torch.equal(once.moving, scene.moving)
     assert once.at(0.5) is once.at(0.5)
     assert not any(x.requires_grad for x in once.at(0.5).parameters().values())
-    monkeypatch.setattr(drgs.information.quantity, "_BYTES", 0)
+    monkeypatch.setattr(drgs.information.quantity, "_TIMES_BYTES", 0)
     seen = once.at(0.5)
     assert once.at(1.0) is not seen
     assert once.at(0.5) is not seen

@@ -21,7 +21,7 @@ from drgs.fisher import Nuisances
 from drgs.fitting.config import FitConfig, SelectionConfig
 from drgs.fitting.records import fit_record
 from drgs.gain import block_gain
-from drgs.information.complement import Eliminated, left
+from drgs.information.complement import Eliminated, remaining
 from drgs.information.scoring import Scoring
 from drgs.information.semantics import SemanticMetric
 from drgs.lab.accuracy import twist_basis
@@ -303,7 +303,7 @@ def test_backdrop(rng):
 def test_rounding_is_nothing():
     """A rest within rounding of both sums is 0, of either sign; more is kept."""
     told = torch.tensor([1.0, 1.0, 1.0, 0.0], dtype=torch.float64)
-    found = left(told, torch.tensor([1 - 1e-6, 1 + 1e-6, 0.9, 0.0], dtype=torch.float64))
+    found = remaining(told, torch.tensor([1 - 1e-6, 1 + 1e-6, 0.9, 0.0], dtype=torch.float64))
     assert found.tolist() == pytest.approx([0, 0, 0.1, 0])
 
 

@@ -25,8 +25,8 @@ RAYS = EXACT.replace(traversal="bvh")
 def shallow(monkeypatch):
     """Buffers so short that some rays are walked a second, and some a third time."""
     monkeypatch.setattr(walk, "BUFFER", 2)
-    monkeypatch.setattr(walk, "_DEEP", 5)
-    monkeypatch.setattr(walk, "_MANY", 1)
+    monkeypatch.setattr(walk, "_DEEP_BUFFER", 5)
+    monkeypatch.setattr(walk, "_DEEP_FROM", 1)
 
 
 @pytest.mark.every(3)
@@ -70,7 +70,7 @@ def test_tables_of_few_tiles(rng, monkeypatch, width):
     """Derivatives whose tables are filled for a few tiles at a time are the same, whatever orders are held."""
     cam, g = camera(rng, (37, 29)), gaussians(rng, 40, 4, width, scale=0.2)
     v = torch.tensor(rng.normal(size=(29, 37, 3)))
-    found, parts, room = [], [], tiles._HELD
+    found, parts, room = [], [], tiles._MAX_ORDER_BYTES
     bands = tiles.TileTraversal._bands
 
     def noted(view, *args):
@@ -81,8 +81,8 @@ def test_tables_of_few_tiles(rng, monkeypatch, width):
     monkeypatch.setattr(tiles.TileTraversal, "_bands", noted)
     for size, held in ((tiles.TABLES, room), (60 << 10, room), (60 << 10, 0), (60 << 10, 9000)):
         monkeypatch.setattr(tiles, "TABLES", size)
-        monkeypatch.setattr(tiles, "_HELD", held)
-        monkeypatch.setattr(tiles, "_CARD", 1)
+        monkeypatch.setattr(tiles, "_MAX_ORDER_BYTES", held)
+        monkeypatch.setattr(tiles, "_MAX_GPU_BANDS", 1)
         leaves = {name: x.clone().requires_grad_() for name, x in g.detach().parameters().items()}
         out = render(g.detach().replace(**leaves), cam, EXACT)
         ((out.rgb * v).sum() + (out.features.sum() if width else 0)).backward()
@@ -112,7 +112,7 @@ def test_words_of_hits(rng):
 @pytest.mark.parametrize("held", [0, 1 << 20])
 def test_rows_have_every_hit_in_order(rng, monkeypatch, held):
     """What the oracle finds at a pixel, one Gaussian at a time, is in its row, once, by (t*, index)."""
-    monkeypatch.setattr(tiles, "_HELD", held)
+    monkeypatch.setattr(tiles, "_MAX_ORDER_BYTES", held)
     cam, g, lib = camera(rng, (21, 13)), gaussians(rng, 25, 1, anisotropy=1.2).detach(), runtime.dr_types()
     for x in g.parameters().values():
         x[20:23] = x[20].clone()  # what has the same key goes by the index
@@ -146,7 +146,7 @@ def test_rows_have_every_hit_in_order(rng, monkeypatch, held):
 @pytest.mark.parametrize("threads", [1, 2])
 def test_both_ways_to_sort_rows(rng, monkeypatch, threads):
     """By tile, as processors do it, and all at once, as CUDA does."""
-    monkeypatch.setattr(rows, "_TILES", 2)
+    monkeypatch.setattr(rows, "_TILES_PER_TASK", 2)
     lengths = torch.tensor([3, 0, 7, 1, 0, 12])
     counts = torch.stack([torch.from_numpy(rng.integers(0, n + 1, 64)) for n in lengths.tolist()])
     flat, expected = [], []
@@ -179,7 +179,7 @@ def test_tails_left_out_of_tiles(rng, monkeypatch):
     for name, x, y in zip(leaves, found, true, strict=True):
         assert relative(x.double(), y.double()) < 1e-4, name
     diagonal = fisher.diagonal(g, cam, EXACT)
-    monkeypatch.setattr(tiles, "_TAILS", 1e-30)
+    monkeypatch.setattr(tiles, "_MAX_TAIL_SUM", 1e-30)
     for name, x in fisher.diagonal(g, cam, EXACT).items():
         assert relative(diagonal[name].double(), x.double()) < 1e-5, name
 
@@ -198,7 +198,7 @@ def test_what_tails_must_not_touch(rng, fields):
 def test_many_rays_in_lists_of_their_own(rng, monkeypatch):
     """Where a word has no room for all lanes beside a Gaussian's index, rays are sorted in several lots."""
     monkeypatch.setattr(walk, "BUFFER", 2)
-    monkeypatch.setattr(walk, "_WORD", 32 - 28)  # bits: 16 lanes of 1 Gaussian
+    monkeypatch.setattr(walk, "_WORD_BITS", 32 - 28)  # bits: 16 lanes of 1 Gaussian
     cam, g = camera(rng, (19, 13)), gaussians(rng, 6, 1, scale=0.4).detach()
     out = render(g, cam, RAYS)
     assert out.certificate["redone"] > 4

@@ -99,7 +99,7 @@ def test_an_embedding_competes_with_what_means_something_else():
     """Without a threshold, a text stands against the classes; the class of the same embedding is left out of them."""
     classes = Classes(NAMES, embeddings())
     query = TextQuery.of_vectors(2 * embeddings()[1], classes)
-    assert query.others.shape == (2, CHANNELS)
+    assert query.negatives.shape == (2, CHANNELS)
     assert query.score(embeddings())[1].tolist() == [False, True, False]
     torch.manual_seed(0)
     latent = torch.randn(6, WIDTH)

@@ -133,7 +133,7 @@ def _everywhere(self, guides):
 @pytest.mark.parametrize("kind", ["shutter", "fisheye shutter", "own rays", "parallel rays", "rays anywhere"])
 def test_what_bounds_leave_out_changes_nothing(rng, monkeypatch, kind, anisotropy):
     """Listing a Gaussian only where a ray may meet it gives the same bits as listing it everywhere."""
-    monkeypatch.setattr(tiles, "_LARGE", 0)
+    monkeypatch.setattr(tiles, "_TEST_TILES_FROM", 0)
     pairs = []
     for spread in (1.0, 8.0):
         fisheye = kind == "fisheye shutter"

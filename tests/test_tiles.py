@@ -157,7 +157,7 @@ _CUT = {"alpha_min": 1 / 255, "transmittance_min": 1e-4}
 def test_tiles_left_out_change_nothing(rng, monkeypatch, fields, anisotropy):
     """Listing a Gaussian only where a pixel may be hit gives the same bits as listing it in its whole box."""
     settings, pairs = RenderSettings(**fields), []
-    monkeypatch.setattr(tiles, "_LARGE", 0)
+    monkeypatch.setattr(tiles, "_TEST_TILES_FROM", 0)
     for _ in range(3):
         cam = camera(rng, (61, 45))
         g = around_camera(gaussians(rng, 40, 4, scale=0.1, anisotropy=anisotropy, opacity=2.5), cam)

@@ -32,7 +32,8 @@ def test_wrapped_tensors_are_known_and_give_their_values(transform):
     assert wrapped
     assert batched == (transform != "grad")
     assert (values == x.numpy()).all()
-    assert not is_wrapped(x) and not is_batched(x)
+    assert not is_wrapped(x)
+    assert not is_batched(x)
 
 
 def test_torch_has_no_public_name_for_this_yet():

@@ -32,7 +32,7 @@ def test_a_walk_gives_frames_in_even_steps(walk, tmp_path):
     told = []
     picked = pick_frames(path, 150, lambda done, total: told.append((done, total)))
     taken = indices(picked)
-    assert len(taken) == picked.wanted <= picked.looks == 30
+    assert len(taken) == picked.useful_frames <= picked.samples == 30
     assert len(taken) >= 6
     assert np.all(np.diff(taken) > 0)
     assert np.diff(taken).max() <= 3 * np.median(np.diff(taken))
@@ -46,7 +46,7 @@ def test_a_walk_gives_frames_in_even_steps(walk, tmp_path):
     assert told[-1] == (30, 30)
     few = pick_frames(path, 5)
     assert 4 <= len(few.frames) <= 5
-    assert few.wanted == picked.wanted
+    assert few.useful_frames == picked.useful_frames
     assert indices(few)[-1] - indices(few)[0] > 15
 
 
@@ -75,7 +75,7 @@ def test_frames_between_looks_are_compared(walk, tmp_path):
     for at, image in zip(sharp, walk, strict=True):
         images[at] = image
     picked = pick_frames(film(tmp_path / "walk.mp4", images, rate=30), 150)
-    assert picked.looks == len(walk)
+    assert picked.samples == len(walk)
     assert set(indices(picked).tolist()) <= set(sharp)
 
 
@@ -101,7 +101,7 @@ def test_a_turn_on_the_spot(tmp_path, focal):
     # Two frames of it would share little: more would do.
     found = [finding.line() for finding in looked.pick(2).findings if finding.kind == "overlap"]
     assert len(found) == 1
-    assert f"(--frames {looked.wanted})" in found[0]
+    assert f"(--frames {looked.useful_frames})" in found[0]
 
 
 def test_turns_at_the_end_are_left_out_and_those_between_bridged(tmp_path):

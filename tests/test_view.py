@@ -38,7 +38,7 @@ from drgs.display.pictures import map_colors
 from drgs.files import load_state, save_state
 from drgs.viewing import panel
 from drgs.viewing.client import ClientGaussians, Pose, camera_of, looking, pose_of
-from drgs.viewing.layers import Uncertainty, bands, drawn, layers_of, stages, tinted
+from drgs.viewing.layers import Uncertainty, bands, layers_of, rendered_in_bands, stages, tinted
 from drgs.viewing.placed_views import PlacedView, Ranking, Score, Sight, placed_views_of, read_ranking, score_colors
 from drgs.viewing.server import Viewer
 from drgs.viewing.session import Session
@@ -193,7 +193,10 @@ def test_bands_make_the_whole_picture():
     assert max(part.width * part.height for part in parts) <= 1000
     found = [drgs.render(g, part, FAST).rgb for part in parts]
     assert (torch.cat(found) - whole.rgb).abs().max() < 1e-5
-    assert np.abs(finished(drawn(g, camera, FAST, lambda out: out.depth.numpy())) - whole.depth.numpy()).max() < 1e-4
+    assert (
+        np.abs(finished(rendered_in_bands(g, camera, FAST, lambda out: out.depth.numpy())) - whole.depth.numpy()).max()
+        < 1e-4
+    )
 
 
 def test_a_small_picture_comes_first():

@@ -84,7 +84,7 @@ def main() -> None:
     warnings.simplefilter("ignore")
     # On LLVM, too, as on a card.
     sort_keys._by_torch = lambda: True
-    tiles._room = lambda size: tiles._CARD * size
+    tiles._room = lambda size: tiles._MAX_GPU_BANDS * size
     known = {**CASES, **FRAMES, **(OPTIX if os.environ.get("DRJIT_LIBOPTIX_PATH") else {})}
     rows = {}
     for name, case in known.items():

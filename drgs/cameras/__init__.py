@@ -44,7 +44,7 @@ from drgs.cameras.checks import (
     read_only,
 )
 from drgs.cameras.lenses import LENS_MODELS
-from drgs.cameras.shutters import BY_COLUMN, FORWARD, line_poses, line_times, points_seen, turn_between
+from drgs.cameras.shutters import BY_COLUMN, FORWARD, line_poses, line_times, points_in_moving_camera, turn_between
 from drgs.checks.arguments import ArgumentError, kind_of, must_be
 from drgs.runtime import uncompiled
 
@@ -253,7 +253,7 @@ class Camera:
             return self._project_local(local), local[:, 2]
         start, end = (_homogeneous(*self._rigid(name)) for name in ("w2c", "w2c_end"))
         axis, lines = (0, self.width) if self.shutter in BY_COLUMN else (1, self.height)
-        at = points_seen(start, end, points)
+        at = points_in_moving_camera(start, end, points)
         times = np.full(len(points), 0.5)
         for _ in range(_SHUTTER_ROUNDS):
             local = at(times)

@@ -29,9 +29,9 @@ __all__ = [
     "undistort_opencv",
 ]
 
-_STEPS = 30  # of Newton's, at most
-_FLAT = 1e-6  # smallest slope of a Newton step; `Camera` warns of a result that does not project back
-_CONVERGED = 1e-14  # radians; the next step of Newton's is far below the rounding of float64
+_NEWTON_STEPS = 30  # Newton steps, at most; each squares the error, so far fewer are usual
+_MIN_SLOPE = 1e-6  # smallest slope of a Newton step; `Camera` warns of a result that does not project back
+_CONVERGED_ANGLE = 1e-14  # radians; the next step of Newton's is far below the rounding of float64
 Guide = Literal["plane", "fisheye", "panorama"]
 """Where the silhouette of an ellipsoid is bounded (drgs/tracing/silhouettes.py): on the plane z = 1, under the
 equidistant fisheye, or in longitude and latitude."""
@@ -118,10 +118,10 @@ def angle_polynomial_inverse(angle: Any, distortion: tuple) -> tuple[Any, Any]:
     """
     known = [x.detach() if hasattr(x, "detach") else x for x in (angle, *distortion[:5])]
     r = known[0] / known[1]
-    for _ in range(_STEPS):
+    for _ in range(_NEWTON_STEPS):
         value, slope = angle_polynomial(r, tuple(known[1:]))
         # Where the polynomial turns back the slope is 0.
-        r = r - (value - known[0]) / (slope + _FLAT * (abs(slope) < _FLAT))
+        r = r - (value - known[0]) / (slope + _MIN_SLOPE * (abs(slope) < _MIN_SLOPE))
         r = r * (r > 0)
     value, slope = angle_polynomial(r, distortion)
     return r - (value - angle) / slope, 1 / slope
@@ -177,11 +177,11 @@ def _radial_unproject(plane: np.ndarray, distortion: tuple[float, ...], polynomi
     radius = np.linalg.norm(plane, axis=1)
     steepest = polynomial(np.zeros(1), distortion)[1][0]
     angle = np.clip(radius / (steepest if abs(steepest) > 1e-6 else 1.0), 0.0, np.pi)
-    for _ in range(_STEPS):
+    for _ in range(_NEWTON_STEPS):
         value, slope = polynomial(angle, distortion)
         # Where the lens turns back the slope is 0: a step that the clip ends stands for an infinite one.
         moved = np.clip(angle - (value - radius) / np.where(np.abs(slope) > 1e-6, slope, 1e-6), 0.0, np.pi)
-        is_there = np.abs(moved - angle).max(initial=0.0) < _CONVERGED
+        is_there = np.abs(moved - angle).max(initial=0.0) < _CONVERGED_ANGLE
         angle = moved
         if is_there:
             break

@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-__all__ = ["BY_COLUMN", "FORWARD", "SHUTTERS", "line_poses", "line_times", "points_seen", "turn_between"]
+__all__ = ["BY_COLUMN", "FORWARD", "SHUTTERS", "line_poses", "line_times", "points_in_moving_camera", "turn_between"]
 
 SHUTTERS = (
     "global",
@@ -61,7 +61,9 @@ def line_poses(start: np.ndarray, end: np.ndarray, times: np.ndarray) -> np.ndar
     return poses
 
 
-def points_seen(start: np.ndarray, end: np.ndarray, points: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+def points_in_moving_camera(
+    start: np.ndarray, end: np.ndarray, points: np.ndarray
+) -> Callable[[np.ndarray], np.ndarray]:
     """Function of times (P,) that gives points (P, 3) in the axes of the camera at each point's own time.
 
     Args:

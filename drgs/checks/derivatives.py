@@ -126,7 +126,7 @@ def check_has_numbers(where: str, name: str, x: torch.Tensor) -> None:
 
 
 def ends_of(x: torch.Tensor) -> tuple[float, float]:
-    """The least and the largest entry of a tensor that is not empty; NaN if an entry is. Works for dual numbers, too."""
+    """The least and the largest entry of a tensor that is not empty, NaN if one is. Works for dual numbers, too."""
     low, high = torch.stack((x.amin(), x.amax())).tolist()  # `aminmax` has no forward mode in all of torch's releases
     return low, high
 

@@ -1,11 +1,11 @@
-"""Tensors inside a transform of `torch.func` (grad, vjp, jvp, vmap): is it one, is it a batch, which values does it hold.
+"""Tensors inside a transform of `torch.func` (grad, vjp, jvp, vmap): are they wrapped, batched, and with which values.
 
 torch has no public function that says so, although code that hands a tensor's memory to another library must know: a
-wrapped tensor has no memory of its own. `torch.func.debug_unwrap` (torch 2.7 and later) gives values, but is meant for
-debuggers alone and is not in torch 2.6, the oldest that drgs takes. So this module, and no other, calls private names
-of torch: `torch._C._functorch.is_functorch_wrapped_tensor`, `is_batchedtensor`, `is_legacy_batchedtensor`,
-`get_unwrapped` and `torch._C._DisableFuncTorch`, which torch 2.6 to 2.13 have. tests/test_torch_func.py fails when torch
-drops one of them, and when `torch.func` gets a public name to use instead.
+wrapped tensor has no memory of its own. `torch.func.debug_unwrap` gives values, but by its documentation for debuggers
+alone, and does not say whether there is a batch. So this module, and no other, calls private names of torch:
+`torch._C._functorch.is_functorch_wrapped_tensor`, `is_batchedtensor`, `is_legacy_batchedtensor`, `get_unwrapped` and
+`torch._C._DisableFuncTorch`. They are there in torch 2.13, which this is tested with. tests/test_torch_func.py
+fails when torch drops one of them, and when `torch.func` gets a public name to use instead.
 """
 
 from __future__ import annotations

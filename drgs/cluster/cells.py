@@ -31,10 +31,12 @@ if TYPE_CHECKING:
 __all__ = ["do_cell", "run_cells_on"]
 
 _TOPIC = "drgs-cells-"
-_LOOK = 2.0  # seconds between two looks at the scheduler while nothing comes
-_ENDING = 10.0  # seconds that a process which was killed is given to be gone
-_APPEARING = 10.0  # seconds until a new file must be seen through a shared file system
-_TRIES = 20  # how often a cell is handed out again because its worker had not got the study, or could not take it
+_POLL_SECONDS = 2.0  # seconds between two polls of the scheduler while nothing comes; chosen
+_END_SECONDS = 10.0  # seconds within which a killed process must be gone; chosen
+# seconds within which a new file must appear through a shared file system; NFS caches attributes for a few. Chosen
+_SHARED_SECONDS = 10.0
+# times that a cell is handed out again because its worker had not got the study, or could not take it; chosen
+_MAX_TRIES = 20
 
 
 def run_cells_on(
@@ -152,12 +154,12 @@ class _Round:
                 self.hand_out(number, cell)
             while self.pending:
                 try:
-                    kind, what = self.news.get(timeout=_LOOK)
+                    kind, what = self.news.get(timeout=_POLL_SECONDS)
                 except queue.Empty:
                     self.cluster.check_alive()
                     continue
                 if kind == "begun":
-                    self.tell(what["number"], named[what["number"]], what["worker"], what["address"])
+                    self.report_start(what["number"], named[what["number"]], what["worker"], what["address"])
                 else:
                     self.take_in(what, named[what])
         finally:
@@ -176,7 +178,7 @@ class _Round:
         self.pending[number] = future
         future.add_done_callback(lambda _: self.news.put(("done", number)))
 
-    def tell(self, number: int, cell: Cell, worker: str, address: str) -> None:
+    def report_start(self, number: int, cell: Cell, worker: str, address: str) -> None:
         """Tell that a worker has begun with a cell, and whether it has the cell of one that is gone."""
         before = self.begun.get(number)
         self.begun[number] = (worker, address)
@@ -197,7 +199,7 @@ class _Round:
             return
         if "missing" in found:
             self.tries[number] = self.tries.get(number, 0) + 1
-            if self.tries[number] > _TRIES:
+            if self.tries[number] > _MAX_TRIES:
                 raise ConnectionError(f"cluster: worker {found['worker']} must keep what it is sent, but forgets it")
             self.cluster.send_again([self.payload], [found["address"]])
             self.hand_out(number, cell)
@@ -207,7 +209,7 @@ class _Round:
             # A worker that is far away may have it again, when all that are near are busy, or have gone.
             tried = self.moved.get(number, 0)
             far = found["host"] != found["taken"]
-            if far and tried < _TRIES and (near := self.cluster.workers_of(found["taken"])):
+            if far and tried < _MAX_TRIES and (near := self.cluster.workers_of(found["taken"])):
                 self.moved[number] = tried + 1
                 self.hand_out(number, cell, near)
             else:
@@ -261,13 +263,13 @@ def do_cell(
         whole = opened_payload(study)
     except Missing as missing:
         return said | {"missing": str(missing)}
-    until = time.monotonic() + _APPEARING
+    until = time.monotonic() + _SHARED_SECONDS
     while not sees(token):
         if time.monotonic() > until:
             return said | {"unseen": token}
         time.sleep(0.5)
     get_worker().log_event(topic, {"number": number, "worker": said["worker"], "address": said["address"]})
-    until = time.monotonic() + _ENDING
+    until = time.monotonic() + _END_SECONDS
     while True:
         try:
             return said | {"row": run_cell(whole, cell, Path(runs))}

@@ -34,7 +34,7 @@ __all__ = ["CONNECT_SECONDS", "WORKER_SECONDS", "Cluster", "opened"]
 CONNECT_SECONDS = 10.0
 """Time within which a scheduler must answer."""
 
-_START_SECONDS = 300  # seconds that a local worker takes at most to come up on a busy machine
+_START_SECONDS = 300  # seconds within which a local worker must be up, also on a busy machine; chosen
 _RUN_AGAIN = 64  # exit code of a worker that has found itself running its parent's script (EX_USAGE)
 
 

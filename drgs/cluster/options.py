@@ -7,7 +7,7 @@ import re
 
 __all__ = ["check_address", "check_options"]
 
-_MOST = 1024  # local workers
+_MAX_WORKERS = 1024  # local workers; chosen: more is a mistake
 _ADDRESS = re.compile(r"(?:tcp://)?(\[[0-9a-fA-F:.]+\]|[^\s:/\[\]]+):(\d{1,5})")
 
 
@@ -37,8 +37,10 @@ def check_options(scheduler: str | None, workers: int | None) -> str | None:
     if scheduler is not None and workers is not None:
         raise ValueError("cluster: --scheduler must be without --workers, got both; join a cluster, or start one here")
     address = None if scheduler is None else check_address(scheduler)
-    if workers is not None and not 1 <= workers <= _MOST:
-        raise ValueError(f"cluster: --workers must be in [1, {_MOST}], got {workers}; one for each core is most useful")
+    if workers is not None and not 1 <= workers <= _MAX_WORKERS:
+        raise ValueError(
+            f"cluster: --workers must be in [1, {_MAX_WORKERS}], got {workers}; one for each core is most useful"
+        )
     for package in ("dask", "distributed") if (scheduler, workers) != (None, None) else ():
         if importlib.util.find_spec(package) is None:
             raise ValueError(f"cluster: {package} must be installed, is not; pip install 'drgs[cluster]'")

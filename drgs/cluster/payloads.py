@@ -16,9 +16,9 @@ import torch
 
 __all__ = ["Missing", "Payload", "keep", "opened_payload"]
 
-_KEPT = 4  # payloads of a worker: one scene, the questions about its views, and a few of the call before
-_UNFINISHED = 8  # payloads that pieces are missing of
-_PIECE = 64 << 20  # bytes of a message
+_MAX_PAYLOADS = 4  # payloads that a worker keeps: a scene, the quantities of its views, and a few of the call before
+_MAX_UNFINISHED = 8  # payloads of which pieces are missing, at most; chosen
+_PIECE_BYTES = 64 << 20  # bytes of a message; chosen: none blocks the scheduler for long
 
 
 class Missing(LookupError):
@@ -57,8 +57,8 @@ class Payload:
 
     def pieces(self) -> list[tuple[str, int, int, bytes]]:
         """(digest, number, count, bytes) of each message: the arguments of `keep`."""
-        starts = range(0, max(len(self.data), 1), _PIECE)
-        return [(self.digest, i, len(starts), self.data[x : x + _PIECE]) for i, x in enumerate(starts)]
+        starts = range(0, max(len(self.data), 1), _PIECE_BYTES)
+        return [(self.digest, i, len(starts), self.data[x : x + _PIECE_BYTES]) for i, x in enumerate(starts)]
 
 
 def _pickler() -> type[pickle.Pickler]:
@@ -99,7 +99,7 @@ def keep(digest: str, number: int, count: int, data: bytes) -> None:
     if len(found) == count:
         _payloads[digest] = b"".join(found[i] for i in range(count))
         del _pieces[digest]
-    for old in list(_pieces)[:-_UNFINISHED]:  # of a client that has gone
+    for old in list(_pieces)[:-_MAX_UNFINISHED]:  # of a client that has gone
         del _pieces[old]
 
 
@@ -115,7 +115,7 @@ def opened_payload(digest: str) -> Any:
     data = _payloads.pop(digest, None)
     if data is None:
         raise Missing(digest)
-    for old in (*_opened, *_payloads)[: max(len(_opened) + len(_payloads) + 1 - _KEPT, 0)]:
+    for old in (*_opened, *_payloads)[: max(len(_opened) + len(_payloads) + 1 - _MAX_PAYLOADS, 0)]:
         _opened.pop(old, None)
         _payloads.pop(old, None)
     _opened[digest] = pickle.loads(data)

@@ -49,10 +49,10 @@ __all__ = ["WORKER_SECONDS", "Cluster", "compute_view"]
 WORKER_SECONDS = 60.0
 """Time that a cluster may be without any worker."""
 
-_LOOK = 2.0  # seconds between two looks at the scheduler while nothing comes
-_SPAWNED = 5.0  # seconds within which a process that is being started has a number
-_AHEAD = 2  # views on their way for each worker: one that it computes, and the next one
-_TRIES = 20  # how often a worker may say that it misses something
+_POLL_SECONDS = 2.0  # seconds between two polls of the scheduler while nothing comes; chosen
+_SPAWN_SECONDS = 5.0  # seconds within which a process that is being started has a number
+_VIEWS_PER_WORKER = 2  # views on their way for each worker: one that it computes, and the next one
+_MAX_TRIES = 20  # times that a worker may report missing data; chosen
 _log = logging.getLogger(__name__)
 
 
@@ -106,13 +106,13 @@ class Cluster:
             return self.submit(compute_view, self.ours, *payloads, number, Payload.of((camera, mask)).data)
 
         try:
-            ahead = max(1, len(self.workers())) * _AHEAD
+            ahead = max(1, len(self.workers())) * _VIEWS_PER_WORKER
             for i in range(len(requests)):
                 for j in range(i, min(i + ahead, len(requests))):
                     if j not in pending:
                         pending[j] = begin(j)
                 what = f"view {requests[i][1].name or i}"
-                for _ in range(_TRIES):
+                for _ in range(_MAX_TRIES):
                     reply = self.result(pending.pop(i), what)
                     if "missing" not in reply:
                         break
@@ -202,7 +202,7 @@ class Cluster:
         """
         done = threading.Event()
         future.add_done_callback(lambda _: done.set())
-        while not done.wait(_LOOK):
+        while not done.wait(_POLL_SECONDS):
             self.check_alive()
         return self.finished(future, what)
 
@@ -248,7 +248,7 @@ class Cluster:
             nannies = list(self._local.workers.values())
             for nanny in nannies:
                 nanny.status = Status.closing_gracefully  # else it would start another one
-            until = time.monotonic() + _SPAWNED
+            until = time.monotonic() + _SPAWN_SECONDS
             for nanny in nannies:
                 # One whose worker has died may be starting the next one, which has no number yet.
                 while not (pid := nanny.pid) and nanny.status != Status.closed and time.monotonic() < until:

@@ -38,9 +38,11 @@ if TYPE_CHECKING:
 __all__ = ["SOG", "load_sog"]
 
 _log = logging.getLogger(__name__)
-_META = 4 << 20  # bytes
-_THIN = 8.0  # of log scales below the largest: fits make disks whose thickness is 1e-9, and 256 entries are few
-_EACH = 3  # Gaussians a row of the palette, which has as many as its indices reach at most
+_MAX_META_BYTES = 4 << 20  # bytes
+_LOG_SCALE_RANGE = (
+    8.0  # of log scales below the largest: fits make disks whose thickness is 1e-9, and 256 entries are few
+)
+_GAUSSIANS_PER_ROW = 3  # Gaussians for each row of the palette; chosen
 _FEWEST_ROWS, _MOST_ROWS = 64, 1 << 16
 _PALETTE = 64  # rows of SH side by side
 _ADVICE = "export it again with splat-transform or SuperSplat"
@@ -65,7 +67,7 @@ def load_sog(path: Path) -> Gaussians:
     if path.name == "meta.json":
         path = path.parent
     with Archive(path) as files:
-        meta = parse_json(files.read("meta.json", _META), f"{path}: meta.json", _ADVICE)
+        meta = parse_json(files.read("meta.json", _MAX_META_BYTES), f"{path}: meta.json", _ADVICE)
         version = meta.get("version", 1) if isinstance(meta, dict) else 1
         if version not in (1, 2):
             raise ValueError(f"{path}: SOG must be of version 1 or 2, got {repr(version)[:40]}; {_ADVICE}")
@@ -244,11 +246,11 @@ def encode_sog(g: Gaussians) -> bytes:
     low, high = wide.min(0), wide.max(0)
     codes = np.rint((wide - low) / np.where(high > low, high - low, 1) * 65535).astype(np.int64)
     log_scales = g.log_scales.numpy()[order]
-    thin = log_scales < log_scales.max(1, keepdims=True) - _THIN
+    thin = log_scales < log_scales.max(1, keepdims=True) - _LOG_SCALE_RANGE
     if thin.any():
         _log.info("SOG: %d scales were below 1/3000 of the largest of their Gaussian and went there", int(thin.sum()))
     weights = _weights(g)[order]
-    scale_book, scales = codebook(np.maximum(log_scales, log_scales.max(1, keepdims=True) - _THIN), weights)
+    scale_book, scales = codebook(np.maximum(log_scales, log_scales.max(1, keepdims=True) - _LOG_SCALE_RANGE), weights)
     sh = g.sh.numpy()[order]
     color_book, colors = codebook(sh[:, 0], weights)
     # float64: a logit that was read from a byte must go back to that byte.
@@ -271,7 +273,7 @@ def encode_sog(g: Gaussians) -> bytes:
         "sh0": {"codebook": color_book.tolist(), "files": ["sh0.webp"]},
     }
     if g.sh_degree:
-        size = min(_MOST_ROWS, max(_FEWEST_ROWS, len(g) // _EACH))
+        size = min(_MOST_ROWS, max(_FEWEST_ROWS, len(g) // _GAUSSIANS_PER_ROW))
         rows, labels = palette(sh[:, 1:].reshape(len(g), -1), weights, size)
         book, entries = codebook(rows)
         each = sh.shape[1] - 1

@@ -37,12 +37,12 @@ if TYPE_CHECKING:
 __all__ = ["SPZ", "encode_spz", "load_spz"]
 
 _AXES = (1, -1, -1)  # signs of x, y and z between SPZ and PLY
-_COLOR = 0.15
+_COLOR_SCALE = 0.15  # SPZ stores f_dc times 0.15, as Niantic's writer
 _ANTIALIASED, _EXTENDED = 1, 2  # flags
 _HARMLESS = {0xADBE0002}  # extensions that change no value: limits of an orbit
-_BITS = 12  # of a position behind the point, as Niantic's writer has it; readers exist that take no more
-_SMALLEST = 511 * 2**0.5  # a component of at most sqrt(1/2), in 9 bits
-_WHOLE = 1e-4  # of a step: what float32 rounds off at most, some times over
+_POSITION_BITS = 12  # of a position behind the point, as Niantic's writer has it; readers exist that take no more
+_QUAT_SCALE = 511 * 2**0.5  # a component of at most sqrt(1/2), in 9 bits
+_STEP_TOLERANCE = 1e-4  # of a step: what float32 rounds off at most, some times over
 _log = logging.getLogger(__name__)
 _DAMAGED = "it is truncated or damaged, copy it again"
 
@@ -70,7 +70,7 @@ def load_spz(path: Path, as_stored: bool = False) -> Gaussians:
     fixed = bytes_of["p"].reshape(count, 3, 3).astype(np.int32)
     fixed = fixed[..., 0] | fixed[..., 1] << 8 | fixed[..., 2] << 16
     means = np.where(fixed >= 1 << 23, fixed - (1 << 24), fixed) / 2.0**bits
-    dc = (bytes_of["c"].reshape(count, 1, 3) / 255.0 - 0.5) / _COLOR
+    dc = (bytes_of["c"].reshape(count, 1, 3) / 255.0 - 0.5) / _COLOR_SCALE
     stored = np.frombuffer(sh, np.uint8).reshape(count, (degree + 1) ** 2 - 1, 3)
     higher = (stored[:, : SH_COUNTS[min(degree, 3)] - 1].astype(np.float32) - 128) / 128
     quats = _first_three(rotations) if version == 2 else _smallest_three(rotations)
@@ -188,7 +188,7 @@ def _smallest_three(data: bytes) -> np.ndarray:
     """(N, 4) wxyz of 2 bits for the largest of x, y, z, w, and sign and 9 bits for each of the others."""
     packed = np.frombuffer(data, "<u4")
     others = np.stack([packed >> 20, packed >> 10, packed], axis=1) & 1023
-    values = (others & 511) / _SMALLEST * np.where(others & 512, -1, 1)
+    values = (others & 511) / _QUAT_SCALE * np.where(others & 512, -1, 1)
     return quats_of_smallest((packed >> 30).astype(int), values)[:, [3, 0, 1, 2]]
 
 
@@ -204,7 +204,7 @@ def encode_spz(g: Gaussians) -> bytes:
     g = flipped(g, _AXES)
     means = g.means.numpy().astype(np.float64)
     far = float(np.abs(means).max(initial=0.0))
-    bits = next((b for b in range(_BITS, -1, -1) if round(far * 2**b) < 1 << 23), None)
+    bits = next((b for b in range(_POSITION_BITS, -1, -1) if round(far * 2**b) < 1 << 23), None)
     if bits is None:
         raise ValueError(f"save_gaussians: SPZ holds means up to 2^23 from 0, got {far:g}; scale them or write a PLY")
     fixed = np.rint(means * 2.0**bits).astype("<i4")
@@ -216,7 +216,7 @@ def encode_spz(g: Gaussians) -> bytes:
     parts = (
         positions,
         _bytes("", opacities, clipped),
-        _bytes("colors", (sh[:, 0] * _COLOR + 0.5) * 255, clipped),
+        _bytes("colors", (sh[:, 0] * _COLOR_SCALE + 0.5) * 255, clipped),
         _bytes("log scales", (g.log_scales.numpy().astype(np.float64) + 10) * 16, clipped),
         _packed_quats(g.quats.numpy().astype(np.float64)),
         _bytes("SH coefficients", sh[:, 1:] * 128 + 128, clipped),
@@ -245,16 +245,16 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
     """
     q = quats / np.abs(quats).max(axis=1, keepdims=True, initial=0.0)  # first, so that no square under- or overflows
     q = (q / np.linalg.norm(q, axis=1, keepdims=True))[:, [1, 2, 3, 0]]
-    steps = np.abs(q) * _SMALLEST
+    steps = np.abs(q) * _QUAT_SCALE
     largest = steps.argmax(1)
     uneven = np.abs(steps - np.rint(steps))
     for i in range(4):
-        is_stored = np.delete(uneven, i, axis=1).max(1) < _WHOLE
+        is_stored = np.delete(uneven, i, axis=1).max(1) < _STEP_TOLERANCE
         largest = np.where(is_stored & (steps[:, i] > steps.max(1) - 2), i, largest)
     q *= np.where(np.take_along_axis(q, largest[:, None], 1) < 0, -1, 1)
     others = q[np.arange(4)[None, :] != largest[:, None]].reshape(-1, 3)
     # Where the component left out is second by a step, the largest is above sqrt(1/2), and 9 bits end at 511.
-    magnitude = np.minimum(np.floor(np.abs(others) * _SMALLEST + 0.5), 511).astype(np.uint32)
+    magnitude = np.minimum(np.floor(np.abs(others) * _QUAT_SCALE + 0.5), 511).astype(np.uint32)
     codes = magnitude | np.where(np.signbit(others), 512, 0).astype(np.uint32)
     shifted = largest.astype(np.uint32) << 30 | codes[:, 0] << 20 | codes[:, 1] << 10 | codes[:, 2]
     return shifted.astype("<u4")

@@ -29,7 +29,7 @@ __all__ = [
 
 SH_COUNTS = (1, 4, 9, 16)
 """Coefficients of a color up to degree 0, 1, 2 and 3."""
-_END = 0.25 / 255  # the middle of what rounds to an end: [0, 0.5 / 255] or [254.5 / 255, 1]
+_END_VALUE = 0.25 / 255  # the middle of what rounds to an end: [0, 0.5 / 255] or [254.5 / 255, 1]
 # Powers of x, y and z in each basis function, modulo 2: what turns its sign when an axis turns.
 _ODD = np.array([
     (0, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 0),
@@ -66,7 +66,7 @@ def assembled(
 def logits_of_bytes(opacity: np.ndarray) -> np.ndarray:
     """Logits of opacities in 255ths; 0 is taken for 0.25 / 255 and 255 for 254.75 / 255, logits of -6.93 and 6.93."""
     table = np.arange(256) / 255.0
-    table[[0, 255]] = _END, 1.0 - _END
+    table[[0, 255]] = _END_VALUE, 1.0 - _END_VALUE
     return (np.log(table) - np.log1p(-table))[opacity]
 
 

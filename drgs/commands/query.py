@@ -79,7 +79,7 @@ def run(args: Query) -> None:
         "score": query.score_name,
         "rule": query.rule,
         "threshold": query.threshold,
-        "temperature": None if query.others is None else query.temperature,
+        "temperature": None if query.negatives is None else query.temperature,
         "gaussians": {"all": len(g), "selected": count, "written": len(kept)},
         "file": ply,
         "source": source,

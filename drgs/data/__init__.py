@@ -204,7 +204,7 @@ def _located(path: Path) -> tuple[str, Path]:
         return "colmap", path  # whose loader says what is missing
     below = [] if any(path.glob(f"*/{POSES}")) else _data_sets_below(path)
     if not below:
-        raise _nothing_found(path)
+        raise _no_data_set_error(path)
     if len(below) > 1:
         raise FileNotFoundError(
             f"{path}: must be one data set, found several in it ({', '.join(str(x) for _, x in below[:_SHOWN])}"
@@ -250,7 +250,7 @@ def _beside(name: str, path: Path, options: dict[str, Any]) -> str:
     return ""
 
 
-def _nothing_found(path: Path) -> FileNotFoundError:
+def _no_data_set_error(path: Path) -> FileNotFoundError:
     """The error for a folder that holds no data set: it has photographs without poses, or nothing where one looks."""
     if videos := list_videos(path):
         return FileNotFoundError(

@@ -19,20 +19,22 @@ if TYPE_CHECKING:
 
 __all__ = ["Focus", "level_frame", "middle_camera", "path", "scene_extent", "upright"]
 
-_ROUNDS = 30  # of reweighting; the median of lines settles in about ten
-_MEETING = 0.02  # smallest mean squared sine between the axes and their mean: 8 degrees
-_ALIKE = 0.8  # length of the mean axis of cameras that look the same way: within about 37 degrees
-_AIMED = 0.85  # cosine between an axis and the way to the point looked at: 32 degrees
-_MOST = 0.75  # share of the cameras that a common point must be before
-_PROBES = 8  # cameras asked how far they see
+# Angles and shares are chosen by hand, so that orbits, forward-facing captures, walks and drives of the data sets in
+# tests/test_orbits.py are told apart; no study varied them.
+_REWEIGHTINGS = 30  # rounds of reweighting, at most; the median of lines settles in about ten
+_MIN_CONVERGENCE = 0.02  # smallest mean squared sine between the axes and their mean: 8 degrees
+_PARALLEL_AXES = 0.8  # length of the mean axis of cameras that look the same way: within about 37 degrees
+_AIMED_COSINE = 0.85  # cosine between an axis and the way to the point looked at: 32 degrees
+_MIN_SHARE_IN_FRONT = 0.75  # share of the cameras that must have the common point in front of them
+_DEPTH_PROBES = 8  # cameras whose distance to the surface is taken
 _WIDEST_GAP = 90.0  # degrees without a camera that a circle may pass
 _LEAST_SPAN = 5.0  # degrees; cameras within less stand in a row, on a drive
-_TILT = 0.05  # weight of the images' up where their horizontals leave it open
-_JUMP = 8.0  # times the median step between photographs: no path leads there
-_TURN = 75.0  # degrees between photographs of one path
-_SMOOTH = 0.75  # standard deviation of the smoothing in steps between photographs, at least
-_STEEPEST = 80.0  # degrees above or below the horizon, beyond which an axis does not say what is ahead
-_SMOOTHED = 40  # and in parts of the whole path, of which a video has many photographs
+_IMAGE_UP_WEIGHT = 0.05  # weight of the images' up where their horizontals leave it open
+_MAX_STEP_RATIO = 8.0  # times the median step between photographs: no path leads there
+_MAX_PATH_TURN = 75.0  # degrees between two photographs that follow each other on one path
+_MIN_SMOOTHING = 0.75  # standard deviation of the smoothing in steps between photographs, at least
+_MAX_PITCH = 80.0  # degrees above or below the horizon, beyond which an axis does not say what is ahead
+_SMOOTHINGS_PER_PATH = 40  # at least 1 / 40 of the whole path, of which a video has many photographs
 _EXTENT_MARGIN = 1.1  # 3DGS's own factor of the radius of the cameras
 
 
@@ -73,27 +75,31 @@ class Focus:
         if center is not None:
             return cls(np.asarray(center, np.float64), eyes, True)
         across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-        if np.linalg.eigvalsh(across.mean(axis=0))[0] >= _MEETING:
+        if np.linalg.eigvalsh(across.mean(axis=0))[0] >= _MIN_CONVERGENCE:
             met = _meeting_point(eyes, across)
             aimed = _aimed(met, eyes, axes)
-            if aimed.mean() >= _MOST:
+            if aimed.mean() >= _MIN_SHARE_IN_FRONT:
                 return cls(met, eyes[aimed], True)
         mean = axes.mean(axis=0)
-        if distance_of is None or np.linalg.norm(mean) < _ALIKE:
+        if distance_of is None or np.linalg.norm(mean) < _PARALLEL_AXES:
             return None
         mean /= np.linalg.norm(mean)
         moved = eyes - eyes.mean(axis=0)
         along = moved @ mean
         if (along**2).sum() > 0.5 * (moved**2).sum():  # a drive: they move where they look
             return None
-        probes = [cameras[i * len(cameras) // _PROBES] for i in range(_PROBES)] if len(cameras) > _PROBES else cameras
+        probes = (
+            [cameras[i * len(cameras) // _DEPTH_PROBES] for i in range(_DEPTH_PROBES)]
+            if len(cameras) > _DEPTH_PROBES
+            else cameras
+        )
         seen = [distance for distance in map(distance_of, probes) if distance is not None]
         if not seen:
             return None
         ahead = np.median(eyes, axis=0) + np.median(seen) * mean
         aimed = _aimed(ahead, eyes, axes)
         focus = cls(ahead, eyes[aimed], False)
-        if aimed.mean() < _MOST or focus.stand(upright(cameras))[1] < _LEAST_SPAN:
+        if aimed.mean() < _MIN_SHARE_IN_FRONT or focus.stand(upright(cameras))[1] < _LEAST_SPAN:
             return None
         return focus
 
@@ -135,7 +141,7 @@ def upright(cameras: list[Camera]) -> np.ndarray:
     if length > 1e-9:  # below it they point everywhere, and what is left of the mean is rounding
         mean /= length
     lean = np.eye(3) - np.outer(mean, mean)
-    up = np.linalg.eigh(rights.T @ rights / len(rights) + _TILT * lean)[1][:, 0]
+    up = np.linalg.eigh(rights.T @ rights / len(rights) + _IMAGE_UP_WEIGHT * lean)[1][:, 0]
     return up if up @ mean >= 0 else -up
 
 
@@ -149,7 +155,7 @@ def level_frame(camera: Camera, up: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     """
     axis = camera.c2w[:3, 2]
     ahead = axis - (axis @ up) * up
-    if np.linalg.norm(ahead) < np.cos(np.radians(_STEEPEST)):
+    if np.linalg.norm(ahead) < np.cos(np.radians(_MAX_PITCH)):
         ahead = camera.c2w[:3, 1] * np.sign(axis @ up)
         ahead = ahead - (ahead @ up) * up
     ahead /= np.linalg.norm(ahead)
@@ -200,7 +206,7 @@ def path(cameras: list[Camera], frames: int) -> list[np.ndarray]:
     # The product of two axes of length 1 exceeds 1 by rounding, of which arccos is NaN.
     turned = np.degrees(np.arccos(np.clip((poses[1:, :3, 2] * poses[:-1, :3, 2]).sum(axis=1), -1, 1)))
     typical = max(float(np.median(walked)), 1e-12)  # a divisor, and most of them may not have moved at all
-    breaks = np.flatnonzero((walked > _JUMP * typical) | (turned > _TURN)) + 1
+    breaks = np.flatnonzero((walked > _MAX_STEP_RATIO * typical) | (turned > _MAX_PATH_TURN)) + 1
     stretch = max(np.split(np.arange(len(poses)), breaks), key=len)
     if len(stretch) < 3:
         return []
@@ -209,7 +215,7 @@ def path(cameras: list[Camera], frames: int) -> list[np.ndarray]:
     turned = turned[stretch[:-1]]
     # A turn by 30 degrees takes as long as a step; times increase even where a camera stays as it is.
     times = np.concatenate([[0.0], np.cumsum(np.maximum(walked / typical + turned / 30, 1e-3))])
-    width = max(_SMOOTH * times[-1] / (len(times) - 1), times[-1] / _SMOOTHED)
+    width = max(_MIN_SMOOTHING * times[-1] / (len(times) - 1), times[-1] / _SMOOTHINGS_PER_PATH)
     made = []
     for time in np.linspace(0, times[-1], frames):
         weights = np.exp(-0.5 * ((times - time) / width) ** 2)
@@ -227,7 +233,7 @@ def _meeting_point(eyes: np.ndarray, across: np.ndarray) -> np.ndarray:
         across: (V, 3, 3) projections onto the plane across each axis.
     """
     weights = np.ones(len(eyes))
-    for _ in range(_ROUNDS):
+    for _ in range(_REWEIGHTINGS):
         total = (weights[:, None, None] * across).sum(axis=0)
         point = np.linalg.solve(total, (weights[:, None] * (across @ eyes[:, :, None])[:, :, 0]).sum(axis=0))
         miss = np.linalg.norm((across @ (point - eyes)[:, :, None])[:, :, 0], axis=1)
@@ -240,7 +246,7 @@ def _meeting_point(eyes: np.ndarray, across: np.ndarray) -> np.ndarray:
 def _aimed(point: np.ndarray, eyes: np.ndarray, axes: np.ndarray) -> np.ndarray:
     """(V,) bool: which cameras have the point before them, near the middle of the picture."""
     ahead = point - eyes
-    return (ahead * axes).sum(axis=1) >= _AIMED * np.linalg.norm(ahead, axis=1)
+    return (ahead * axes).sum(axis=1) >= _AIMED_COSINE * np.linalg.norm(ahead, axis=1)
 
 
 def _covered(azimuths: np.ndarray) -> tuple[float, float, np.ndarray]:

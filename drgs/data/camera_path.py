@@ -100,9 +100,9 @@ class CameraPath:
         shares = np.asarray(shares, np.float64)
         if len(keys) == 1 or not len(steps):
             return [dataclasses.replace(keys[0], seconds=float(x * self.seconds)) for x in shares]
-        moments = shares * knots[-1]
-        number = np.clip(np.searchsorted(knots, moments, side="right") - 1, 0, len(steps) - 1)
-        samples = _Samples(steps, self.loop, number, ((moments - knots[number]) / steps[number])[:, None])
+        at = shares * knots[-1]
+        number = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(steps) - 1)
+        samples = _Samples(steps, self.loop, number, ((at - knots[number]) / steps[number])[:, None])
         places = np.array([key.position for key in keys], np.float64)
         position = samples.interpolated(places, np.diff(places, axis=0), np.add, _lerp)
         zoom = np.log(np.tan(np.radians([key.fov for key in keys]) / 2))[:, None]
@@ -113,7 +113,7 @@ class CameraPath:
         fovs = np.degrees(2 * np.arctan(np.exp(zoom[:, 0])))
         times: list[float | None] = [None] * len(shares)
         if keys[0].time is not None:
-            times = list(np.interp(moments, knots, np.array([key.time for key in keys], np.float64)).tolist())
+            times = list(np.interp(at, knots, np.array([key.time for key in keys], np.float64)).tolist())
         return [
             Keyframe(position[k], wxyz[k] / np.linalg.norm(wxyz[k]), float(fovs[k]), float(x * self.seconds), times[k])
             for k, x in enumerate(shares)
@@ -319,7 +319,7 @@ def read_camera_path(path: Path) -> CameraPath:
     check_json(where, found, dict, _ADVICE)
     if "camera_path" in found:
         return _of_nerfstudio(where, found)
-    _known(where, found, _OURS)
+    _check_keys(where, found, _OURS)
     check_json(where, found, {"keyframes": [dict]}, _ADVICE)
     rows = found["keyframes"]
     if not 1 <= len(rows) <= _MANY:
@@ -340,7 +340,7 @@ def read_camera_path(path: Path) -> CameraPath:
     )
 
 
-def _known(where: str, row: dict, names: tuple[str, ...]) -> None:
+def _check_keys(where: str, row: dict, names: tuple[str, ...]) -> None:
     """Raise ValueError if a key is unknown."""
     for name in row:
         if name not in names:
@@ -366,7 +366,7 @@ def _side(where: str, row: dict, name: str) -> int | None:
 
 def _keyframe(where: str, row: dict) -> Keyframe:
     """A keyframe of ours."""
-    _known(where, row, _KEYFRAME)
+    _check_keys(where, row, _KEYFRAME)
     if ("w2c" in row) == ("position" in row or "wxyz" in row):
         raise ValueError(f"{where}: must have either position and wxyz, or w2c, got both or neither; {_ADVICE}")
     check_json(where, row, {"fov": float, "seconds": float}, _ADVICE)

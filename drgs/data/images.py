@@ -211,7 +211,7 @@ def heif_size(path: Path) -> tuple[int, int]:
         ValueError: damaged, too large, or pillow-heif is missing.
     """
     _need_library(path)
-    width, height = _decoder.ask("size", path)
+    width, height = _decoder.call("size", path)
     return width, height
 
 
@@ -222,7 +222,7 @@ def read_heif(path: Path) -> np.ndarray:
         ValueError: damaged, too large, or pillow-heif is missing.
     """
     _need_library(path)
-    return _decoder.ask("pixels", path)
+    return _decoder.call("pixels", path)
 
 
 def heif_as_jpeg(path: Path, quality: int) -> bytes:
@@ -235,7 +235,7 @@ def heif_as_jpeg(path: Path, quality: int) -> bytes:
         ValueError: As `read_heif`.
     """
     _need_library(path)
-    return _decoder.ask("jpeg", path, quality).tobytes()
+    return _decoder.call("jpeg", path, quality).tobytes()
 
 
 def _need_library(path: Path) -> None:

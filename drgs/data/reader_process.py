@@ -60,7 +60,7 @@ class Child:
         """Number of the process; None where there is none."""
         return self._process.pid if self._process is not None and self._owner == os.getpid() else None
 
-    def ask(self, what: str, path: Path, *rest: Any, progress: Callable[[int], None] = lambda _: None) -> Any:
+    def call(self, what: str, path: Path, *rest: Any, progress: Callable[[int], None] = lambda _: None) -> Any:
         """Call a function of the module in its process; its result, a value of JSON or an array.
 
         Args:
@@ -140,7 +140,7 @@ def serve(functions: dict[str, Callable[..., Any]]) -> None:
     """
     for name in (signal.SIGINT, signal.SIGTERM):  # a fit that gets one saves first, and may need this process
         signal.signal(name, signal.SIG_IGN)
-    warnings = _KeptWarnings()
+    warnings = _WarningCollector()
     logging.getLogger().addHandler(warnings)
     file = socket.socket(fileno=int(sys.argv[1])).makefile("rwb")
     shared = _Shared(int(sys.argv[2]))
@@ -198,7 +198,7 @@ def _memory() -> int:
         return os.dup(file.fileno())
 
 
-class _KeptWarnings(logging.Handler):
+class _WarningCollector(logging.Handler):
     """Keeps what is logged."""
 
     def __init__(self) -> None:

@@ -97,7 +97,7 @@ def synchronous(
                 is_checked=not lazy,
                 camera_name=recording.name,
             )
-            there = _found(view, recording, number, lazy)
+            there = _attach_image(view, recording, number, lazy)
             (dataset.views if there else dataset.absent).append(view)
             if not there:
                 continue
@@ -117,7 +117,7 @@ def synchronous(
     return dataset
 
 
-def _found(view: View, recording: Recording, number: int, lazy: bool) -> bool:
+def _attach_image(view: View, recording: Recording, number: int, lazy: bool) -> bool:
     """Give a view its camera and its image, or say that there is none."""
     where = f"{recording.where}: camera {recording.name}"
     camera, source = recording.cameras[number], recording.source
@@ -133,11 +133,14 @@ def _found(view: View, recording: Recording, number: int, lazy: bool) -> bool:
     return True
 
 
-_FEWEST_CAMERAS = 3  # of two that disagree, nothing tells which one is wrong
-_FEWEST = 10  # changes that two curves must share to be compared
-_AGREES = 0.7  # correlation at the best shift from which on it is believed
-_IN_STEP = 0.5  # correlation of the other cameras with each other, in the median of pairs, below which none is late
-_GAIN = 0.25  # correlation that the shift must gain: curves that vary slowly agree at neighboring shifts, too
+# Correlations are of how much two cameras' pictures change over time; chosen by hand, checked in
+# tests/test_dynamic_data.py.
+_FEWEST_CAMERAS = 3  # of two cameras that disagree, either may be the late one
+_FEWEST_SHARED = 10  # changes (frames) that two curves must share to be compared
+_MIN_CORRELATION = 0.7  # correlation at the best shift from which on the shift is believed
+_MIN_OTHERS_CORRELATION = 0.5  # median correlation of pairs of the other cameras, below which no camera is called late
+# correlation that the shift must gain: curves that vary slowly correlate at neighboring shifts, too
+_MIN_CORRELATION_GAIN = 0.25
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,7 +187,7 @@ def late_cameras(pictures: Mapping[str, np.ndarray]) -> list[LateCamera]:
     """
     curves = {name: _energy(x) for name, x in pictures.items()}
     count = min((len(x) for x in curves.values()), default=0)
-    most = min(count // 3, count - _FEWEST)
+    most = min(count // 3, count - _FEWEST_SHARED)
     if len(curves) < _FEWEST_CAMERAS or most < 1:
         return []
     table = np.array(list(curves.values()))
@@ -193,13 +196,13 @@ def late_cameras(pictures: Mapping[str, np.ndarray]) -> list[LateCamera]:
     for index, (name, curve) in enumerate(curves.items()):
         rest = np.delete(np.arange(len(table)), index)
         among = pairs[np.ix_(rest, rest)][np.triu_indices(len(rest), 1)]
-        if np.median(among) < _IN_STEP:
+        if np.median(among) < _MIN_OTHERS_CORRELATION:
             continue
         others = np.median(table[rest], axis=0)
         shifts = range(-most, most + 1)
         agreement = {s: _correlation(curve[max(-s, 0) : count - max(s, 0)], others[max(s, 0) :]) for s in shifts}
         best = max(shifts, key=lambda s: (agreement[s], -abs(s)))
-        if best and agreement[best] >= _AGREES and agreement[best] - agreement[0] >= _GAIN:
+        if best and agreement[best] >= _MIN_CORRELATION and agreement[best] - agreement[0] >= _MIN_CORRELATION_GAIN:
             shift = best + _peak(*(agreement.get(best + step, -1.0) for step in (-1, 0, 1)))
             late.append(LateCamera(name, shift, agreement[best], agreement[0]))
     return late

@@ -155,7 +155,7 @@ def _check_direction(file: Path, cameras: list[Camera], points: np.ndarray | Non
     or without points, many more of them look at one place.
     """
     turned = [dataclasses.replace(camera, w2c=camera.c2w) for camera in cameras]
-    as_stated, inverted = (_seen(views, points) for views in (cameras, turned))
+    as_stated, inverted = (_visible_share(views, points) for views in (cameras, turned))
     if inverted > as_stated + _CLEARLY:
         what = "of the points are seen" if points is not None else "of the cameras look at one place"
         raise ValueError(
@@ -164,7 +164,7 @@ def _check_direction(file: Path, cameras: list[Camera], points: np.ndarray | Non
         )
 
 
-def _seen(cameras: list[Camera], points: np.ndarray | None) -> float:
+def _visible_share(cameras: list[Camera], points: np.ndarray | None) -> float:
     """Share of points that cameras show, on average; without points, of cameras that look at one place before them."""
     if points is not None and len(points):
         shares = []

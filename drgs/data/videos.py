@@ -38,7 +38,7 @@ class VideoFrame:
             FileNotFoundError, ValueError: No video, too short, or one whose frame cannot be decoded.
         """
         video = self._video()
-        return _decoder.ask("frame", self.path, video.version, video.is_mp4, self.index)
+        return _decoder.call("frame", self.path, video.version, video.is_mp4, self.index)
 
     def read_gray(self, longest: int) -> np.ndarray:
         """(h, w) uint8, reduced to at most `longest` pixels along the longer side.
@@ -47,7 +47,7 @@ class VideoFrame:
             FileNotFoundError, ValueError: As of `read`.
         """
         video = self._video()
-        return _decoder.ask("gray", self.path, video.version, video.is_mp4, self.index, longest)
+        return _decoder.call("gray", self.path, video.version, video.is_mp4, self.index, longest)
 
     def _video(self) -> VideoFile:
         video = read_video(self.path)
@@ -103,7 +103,7 @@ def _walked(path: Path, version: tuple[int, int]) -> VideoFile:
     """`read_video` of a file that has not changed since."""
     is_mp4 = _check_kind(path)
     with Bar(f"frames of {path.name}") as bar:
-        found = _decoder.ask("walk", path, version, is_mp4, progress=bar.update)
+        found = _decoder.call("walk", path, version, is_mp4, progress=bar.update)
     return VideoFile(path, found["width"], found["height"], tuple(found["stamps"]), found["count"], version, is_mp4)
 
 

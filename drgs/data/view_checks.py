@@ -34,15 +34,15 @@ __all__ = [
 # of cameras that film what moves (docs/dynamic-data.md, Layouts)
 _FEW_PLACES = 4
 _ENOUGH_PLACES = 6
-_FEWEST = 3  # images that a data set must have where others are missing
-_SHOWN = 5  # of those are named at once
-_ALSO = 50  # more of them at most, by the names of their files
-_LONGEST = 400  # characters of a path in messages
+_MIN_IMAGES = 3  # images that a data set must have where others are missing
+_NAMED_PATHS = 5  # missing images that a message names with their folders
+_NAMED_FILES = 50  # more of them that it names by file name, at most
+_MAX_PATH_SHOWN = 400  # characters of a path in messages
 # Copies of one photograph have nearly one pose: structure from motion places each by itself, by the same features.
-_NEAR = 1e-2  # of the spread of the cameras' centers; also the largest difference of entries of their rotations
-_EXACT = 1e-9  # of the spread and of 1: the same numbers, but for rounding
-_THUMBNAIL = 32  # pixels across the small pictures by which copies in two formats are compared
-_ALIKE = 0.05  # largest difference of these, white being 1: compression stays below 0.01, a passer-by is above
+_SAME_POSE = 1e-2  # of the spread of the cameras' centers; also the largest difference of entries of their rotations
+_IDENTICAL_POSE = 1e-9  # of the spread and of 1: the same numbers, but for rounding
+_THUMBNAIL_SIDE = 32  # pixels across the small pictures by which copies in two formats are compared
+_SAME_PICTURE = 0.05  # largest difference of these, white being 1: compression stays below 0.01, a passer-by is above
 
 _log = logging.getLogger(__name__)
 
@@ -60,20 +60,20 @@ def report_missing_images(where: Path, missing: list[Path], left: int, strict: b
     """
     if not missing:
         return
-    names = [str(path)[:_LONGEST] for path in missing]
+    names = [str(path)[:_MAX_PATH_SHOWN] for path in missing]
     count = len(missing) + left
-    shown = ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
+    shown = ", ".join(names[:_NAMED_PATHS]) + (", ..." if len(names) > _NAMED_PATHS else "")
     damaged = sum(is_file(path) for path in missing)
     state = "not there" if not damaged else "damaged" if damaged == len(missing) else "not there or damaged"
     problem = f"{where}: {len(names)} of the {count} images that it lists are {state} ({shown})"
-    if strict or left < _FEWEST:
-        rule = "all must be there" if strict else f"at least {_FEWEST} must be there"
-        hint = ", or drop --strict (strict=True) to go on without them" if strict and left >= _FEWEST else ""
+    if strict or left < _MIN_IMAGES:
+        rule = "all must be there" if strict else f"at least {_MIN_IMAGES} must be there"
+        hint = ", or drop --strict (strict=True) to go on without them" if strict and left >= _MIN_IMAGES else ""
         raise FileNotFoundError(f"{problem}; {rule}: restore them{hint}")
     _log.warning("%s; going on with the other %d (--strict refuses that)", problem, left)
-    if len(names) > _SHOWN:
-        others = [path.name[:_LONGEST] for path in missing[_SHOWN : _SHOWN + _ALSO]]
-        more = len(names) - _SHOWN - len(others)
+    if len(names) > _NAMED_PATHS:
+        others = [path.name[:_MAX_PATH_SHOWN] for path in missing[_NAMED_PATHS : _NAMED_PATHS + _NAMED_FILES]]
+        more = len(names) - _NAMED_PATHS - len(others)
         _log.info("also %s: %s%s", state, ", ".join(others), f" and {more} more" if more else "")
 
 
@@ -202,13 +202,15 @@ def drop_duplicates(dataset: Dataset) -> None:
             listed[first].split = min((splits[first], *named), key=order.index)
         if any(view.split not in ("val", "test") for view in kept):
             break
-    shown = [f"{listed[index].name} is the same as {listed[first].name}" for index, first in copies.items()][:_SHOWN]
+    shown = [f"{listed[index].name} is the same as {listed[first].name}" for index, first in copies.items()][
+        :_NAMED_PATHS
+    ]
     _log.warning(
         "%s: %d of the %d photographs are listed again (%s); each one counts once, in one split",
         dataset.path,
         len(copies),
         len(listed),
-        ", ".join(shown) + (", ..." if len(copies) > _SHOWN else ""),
+        ", ".join(shown) + (", ..." if len(copies) > _NAMED_PATHS else ""),
     )
     there = {id(view) for view in kept}
     dataset.views = [view for view in dataset.views if id(view) in there]
@@ -224,7 +226,7 @@ def _copies(views: list[View]) -> dict[int, int]:
     if np.isnan(poses).all():
         return {}
     centers = poses[..., 3]
-    poses[..., 3] /= max(np.ptp(centers[~np.isnan(centers[:, 0])], axis=0).max(), _EXACT)
+    poses[..., 3] /= max(np.ptp(centers[~np.isnan(centers[:, 0])], axis=0).max(), _IDENTICAL_POSE)
     alike: dict[tuple, list[int]] = defaultdict(list)
     for index, view in enumerate(views):
         path = view.image_path
@@ -237,12 +239,12 @@ def _copies(views: list[View]) -> dict[int, int]:
         file = path.stat()
         alike["file", file.st_dev, file.st_ino, *about].append(index)
         alike["size", file.st_size, *about].append(index)
-        alike["pose", (np.round(poses[index] / _EXACT) + 0.0).tobytes(), *about].append(index)  # -0.0 is 0.0
+        alike["pose", (np.round(poses[index] / _IDENTICAL_POSE) + 0.0).tobytes(), *about].append(index)  # -0.0 is 0.0
     first_of: dict[int, int] = {}
     for (kind, *_), members in alike.items():
         for n, index in enumerate(members):
             path = Path(views[index].image_path or "")
-            near = np.abs(poses[members[:n]] - poses[index]).max(axis=(1, 2)) <= _NEAR
+            near = np.abs(poses[members[:n]] - poses[index]).max(axis=(1, 2)) <= _SAME_POSE
             for other, is_near in zip(members[:n], near, strict=True):
                 before = Path(views[other].image_path or "")
                 same = kind == "file" or path == before
@@ -262,8 +264,8 @@ def _look_alike(one: Path, other: Path) -> bool:
     except ValueError:  # what cannot be read is said where it is read
         return False
     gray = [picture[..., :3].mean(axis=-1) if picture.ndim == 3 else picture for picture in pictures]
-    small = [resize_area(picture, _THUMBNAIL, _THUMBNAIL) for picture in gray]
-    return bool(np.abs(small[0] - small[1]).max() <= _ALIKE)
+    small = [resize_area(picture, _THUMBNAIL_SIDE, _THUMBNAIL_SIDE) for picture in gray]
+    return bool(np.abs(small[0] - small[1]).max() <= _SAME_PICTURE)
 
 
 def mark_partial_masks(views: list[View], lazy: bool) -> None:
@@ -284,12 +286,12 @@ def mark_partial_masks(views: list[View], lazy: bool) -> None:
             view.empty_outside = not cut_out
 
 
-_PHOTOGRAPHS = 8  # whose edges are looked at, evenly spaced
-_SOLID = 0.995  # alpha from which on a pixel shows the object alone
-_EDGE = (0.2, 0.8)  # alpha of pixels that show both
-_LEAST_EDGE = 200  # color values of edges below which these say nothing
-_BRIGHTNESS = (0.8, 1.25)  # of edges, in that of the object beside them, which is shaded differently there
-_CLEAR = 0.5  # share of the error of unmixed colors below which a mix is clear: 0.05 to 0.4 where one was made
+_EDGE_PROBES = 8  # photographs whose edges are compared, evenly spaced; chosen
+_OPAQUE_ALPHA = 0.995  # alpha from which on a pixel shows the object alone
+_EDGE_ALPHA = (0.2, 0.8)  # range of alpha of pixels that show both object and background
+_MIN_EDGE_VALUES = 200  # color values at edges; fewer decide nothing. Chosen
+_EDGE_BRIGHTNESS = (0.8, 1.25)  # of edges, in that of the object beside them, which is shaded differently there
+_CLEARLY_MIXED = 0.5  # share of the error of unmixed colors below which a mix is clear: 0.05 to 0.4 where one was made
 _COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
@@ -311,7 +313,7 @@ def default_background(dataset: Dataset, lazy: bool = False) -> tuple[tuple[floa
     views = [view for view in (views[:1] if lazy else views) if view.image_path and png_has_alpha(view.image_path)]
     if not views:
         return _COLORS["black"], ""
-    found = "" if lazy else _mixed_with(views[:: -(-len(views) // _PHOTOGRAPHS)])
+    found = "" if lazy else _mixed_with(views[:: -(-len(views) // _EDGE_PROBES)])
     if found:
         return _COLORS[found], f"{found}, which half-transparent pixels at the edges of objects are mixed with"
     if dataset.format == "transforms" and dataset.path.is_dir() and not (dataset.path / "transforms.json").is_file():
@@ -323,17 +325,17 @@ def _mixed_with(views: list[View]) -> str:
     """`black` or `white` if colors of half-transparent pixels are clearly mixed with it, else empty."""
     parts = [_edges(view) for view in views]
     alpha, object_color, color = (np.concatenate(x) for x in zip(*parts, strict=True))
-    if len(color) < _LEAST_EDGE:
+    if len(color) < _MIN_EDGE_VALUES:
         return ""
 
     def error(base: np.ndarray, ground: np.ndarray | float) -> float:
         """Mean absolute error of the colors as `base`, as bright as fits best, over the ground."""
         factor = np.dot(base, color - ground) / max(np.dot(base, base), 1e-12)
-        return float(np.abs(color - ground - np.clip(factor, *_BRIGHTNESS) * base).mean())
+        return float(np.abs(color - ground - np.clip(factor, *_EDGE_BRIGHTNESS) * base).mean())
 
     errors = {"black": error(alpha * object_color, 0.0), "white": error(alpha * object_color, 1 - alpha)}
     best = min(errors, key=errors.__getitem__)
-    return best if errors[best] < _CLEAR * error(object_color, 0.0) else ""
+    return best if errors[best] < _CLEARLY_MIXED * error(object_color, 0.0) else ""
 
 
 def _edges(view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -345,12 +347,12 @@ def _edges(view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if data.ndim != 3 or data.shape[2] != 4:
         return (np.empty(0, np.float32),) * 3
     color, alpha = data[..., :3], data[..., 3]
-    solid = (alpha >= _SOLID).astype(np.float32)
+    solid = (alpha >= _OPAQUE_ALPHA).astype(np.float32)
     # Sums over 5x5 pixels; nothing is added beyond the border.
     count, total = (
         cv2.boxFilter(x, -1, (5, 5), normalize=False, borderType=cv2.BORDER_CONSTANT)
         for x in (solid, color * solid[..., None])
     )
-    chosen = (alpha > _EDGE[0]) & (alpha < _EDGE[1]) & (count >= 3)
+    chosen = (alpha > _EDGE_ALPHA[0]) & (alpha < _EDGE_ALPHA[1]) & (count >= 3)
     beside = total[chosen] / count[chosen][:, None]
     return np.repeat(alpha[chosen], 3), beside.ravel(), color[chosen].ravel()

@@ -37,13 +37,13 @@ __all__ = [
     "write_png",
 ]
 
-_INK = (235, 235, 235)
-_UNKNOWN = 0.25  # gray of depth where nothing is
-_NOTHING = 64  # gray of pixels whose value is 0
-_DECADES = 3.0  # decades that are told apart by color, at most
+_INK = (235, 235, 235)  # RGB of text on pictures; chosen by eye
+_NO_DEPTH_GRAY = 0.25  # gray of depth where nothing is
+_ZERO_GRAY = 64  # gray of pixels whose value is 0
+_MAX_DECADES = 3.0  # decades that the color scale spans, at most; chosen by eye
 _WEBM_SEGMENT = bytes.fromhex("18538067")  # id of what holds all of a WebM file
 _WEBM_HEAD = 1024  # bytes of the file within which that begins
-_NAME = 100  # bytes of a view's name in the name of a file
+_MAX_NAME_BYTES = 100  # bytes of a view's name in the name of a file
 _JPEG_QUALITY = 95  # of 100
 _XMP = b"http://ns.adobe.com/xap/1.0/\0"
 _PANORAMA = (
@@ -55,7 +55,7 @@ _PANORAMA = (
     'GPano:FullPanoWidthPixels="{width}" GPano:FullPanoHeightPixels="{height}" '
     'GPano:PosePitchDegrees="0" GPano:PoseRollDegrees="0"/></rdf:RDF></x:xmpmeta>'
 )
-_OPAQUE = 0.5  # depth is shown where at least this much of the light stops
+_OPAQUE_ALPHA = 0.5  # depth is shown where at least this much of the light stops
 
 
 def to_bytes(image: np.ndarray) -> np.ndarray:
@@ -86,7 +86,7 @@ def file_names(names: list[str]) -> list[str]:
     result: list[str] = []
     for index, name in enumerate(names):
         clean = "".join(c if c.isalnum() or c in "-_." else "_" for c in name).strip(".")
-        clean = clean.encode()[:_NAME].decode(errors="ignore")
+        clean = clean.encode()[:_MAX_NAME_BYTES].decode(errors="ignore")
         clean = clean or f"view_{index:04d}"
         while clean in result:
             clean += f"_{index:04d}"
@@ -172,12 +172,12 @@ def depth_picture(depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 def depth_colors(depth: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, tuple[float, float]]:
     """(H, W, 3) uint8 of `depth_picture` without its bar, and the nearest and the farthest depth of its scale."""
-    known = (alpha >= _OPAQUE) & np.isfinite(depth)
+    known = (alpha >= _OPAQUE_ALPHA) & np.isfinite(depth)
     low, high = np.percentile(depth[known], (1, 99)) if known.any() else (0.0, 1.0)
     # Of one depth, too, the scale has a length to divide by: a millionth of it, which no label shows.
     high = max(high, low + 1e-12 + 1e-6 * abs(low))
     picture = inferno((high - np.where(known, depth, high)) / (high - low))
-    picture[~known] = round(255 * _UNKNOWN)
+    picture[~known] = round(255 * _NO_DEPTH_GRAY)
     return picture, (float(low), float(high))
 
 
@@ -198,9 +198,9 @@ def map_colors(values: np.ndarray) -> tuple[np.ndarray, tuple[float, float]]:
     known = values > 0
     top = np.log10(values[known].max()) if known.any() else 0.0
     low = np.log10(np.percentile(values[known], 1)) if known.any() else -1.0
-    low = min(max(low, top - _DECADES), top - 1e-3)  # of one value, too, the scale has a length to divide by
+    low = min(max(low, top - _MAX_DECADES), top - 1e-3)  # of one value, too, the scale has a length to divide by
     picture = inferno((np.log10(np.where(known, values, 10.0**low)) - low) / (top - low))
-    picture[~known] = _NOTHING
+    picture[~known] = _ZERO_GRAY
     return picture, (float(10.0**low), float(10.0**top))
 
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 __all__ = ["lines", "show"]
 
 _GAP = "  "
-_LEAST = 10  # columns of text, however many numbers there are
+_MIN_TEXT_WIDTH = 10  # columns of text, however many numbers there are
 
 
 def show(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], texts: Sequence[str] = ()) -> None:
@@ -37,7 +37,7 @@ def lines(
     spare = width - len(_GAP) * (len(columns) - 1) - sum(w for w, text in zip(widths, is_text, strict=True) if not text)
     while sum(w for w, text in zip(widths, is_text, strict=True) if text) > spare:
         widest = max((k for k in range(len(columns)) if is_text[k]), key=lambda k: widths[k])
-        if widths[widest] <= _LEAST:
+        if widths[widest] <= _MIN_TEXT_WIDTH:
             break
         widths[widest] -= 1
 

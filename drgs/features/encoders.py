@@ -34,8 +34,8 @@ __all__ = ["MAP_NORM", "SCALES", "TEMPLATES", "ClipEncoder"]
 SCALES = (0.75, 1.0, 1.5)
 TEMPLATES = ("a photo of a {}.", "a photo of the {}.", "a {} in a scene.", "{}")
 MAP_NORM = 4.0
-_SHORT = 2  # short side of the photograph at scale 1, in image sizes of the model
-_LONGEST = 4096  # pixels that the transformer may see along a side: its attention grows with their fourth power
+_SHORT_SIDE = 2  # short side of the photograph at scale 1, in image sizes of the model
+_MAX_SIDE = 4096  # pixels that the transformer may see along a side: its attention grows with their fourth power
 # CLIP's own
 _MEAN = (0.48145466, 0.4578275, 0.40821073)
 _STD = (0.26862954, 0.26130258, 0.27577711)
@@ -179,13 +179,13 @@ class ClipEncoder:
         import cv2
 
         height, width = image.shape[:2]
-        short = scale * _SHORT * self._config["vision_config"]["image_size"]
+        short = scale * _SHORT_SIDE * self._config["vision_config"]["image_size"]
         factor = short / min(height, width)
         size = [max(1, round(side * factor / self.patch)) * self.patch for side in (width, height)]
-        if max(size) > _LONGEST:
+        if max(size) > _MAX_SIDE:
             raise ValueError(
-                f"scale {scale:g}: the photograph must have at most {_LONGEST} pixels a side for the model, would have "
-                f"{size[0]}x{size[1]}; choose a smaller one"
+                f"scale {scale:g}: the photograph must have at most {_MAX_SIDE} pixels a side for the model, would "
+                f"have {size[0]}x{size[1]}; choose a smaller one"
             )
         how = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
         resized = cv2.resize(np.ascontiguousarray(image, np.float32), size, interpolation=how).clip(0, 1)
@@ -230,9 +230,9 @@ def _checked_config(folder: Path) -> dict[str, Any]:
     for name, usual in (("image_size", 224), ("patch_size", 32)):
         vision.setdefault(name, usual)
     check_json(f"{path}: vision_config", vision, {"image_size": int, "patch_size": int}, _ADVICE)
-    if not 0 < vision["patch_size"] <= vision["image_size"] <= _LONGEST:
+    if not 0 < vision["patch_size"] <= vision["image_size"] <= _MAX_SIDE:
         raise ValueError(
-            f"{path}: vision_config must have 0 < patch_size <= image_size <= {_LONGEST}, got "
+            f"{path}: vision_config must have 0 < patch_size <= image_size <= {_MAX_SIDE}, got "
             f"{vision['patch_size']} and {vision['image_size']}; {_ADVICE}"
         )
     return config

@@ -20,13 +20,13 @@ __all__ = ["NO_LABEL", "FeatureColors", "label_colors", "label_picture", "mask_p
 NO_LABEL = (40, 40, 40)
 """Color of pixels without a label."""
 _PERCENTILES = 1.0, 99.0  # of each component, which become 0 and 255: outliers do not take the range
-_ROWS = 5000  # samples of a basis: 20 MB of 512 channels in float64
-_INK = (235, 235, 235)
-_BACK = (18, 18, 18)
-_LINE = 17  # pixels of a legend's line
+_BASIS_SAMPLES = 5000  # samples of a basis: 20 MB of 512 channels in float64
+_INK = (235, 235, 235)  # RGB of a legend's text
+_BACKGROUND = (18, 18, 18)  # RGB behind a legend; chosen by eye, like the other colors and sizes
+_LINE_HEIGHT = 17  # pixels of a legend's line
 _SWATCH = 12  # pixels of its square's side
-_CHARACTER = 34  # characters of a name, at most
-_EDGE = 0.35  # how much darker the border between two classes is
+_MAX_NAME = 34  # characters of a name, at most
+_BORDER_DARKENING = 0.35  # how much darker the border between two classes is
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class FeatureColors:
     high: torch.Tensor
 
     @classmethod
-    def of(cls, maps: Iterable[torch.Tensor], rows: int = _ROWS) -> FeatureColors:
+    def of(cls, maps: Iterable[torch.Tensor], rows: int = _BASIS_SAMPLES) -> FeatureColors:
         """The basis of some maps.
 
         Args:
@@ -144,7 +144,7 @@ def overlay(image: np.ndarray, labels: np.ndarray, count: int, strength: float =
     edge[:, :-1] |= labels[:, :-1] != labels[:, 1:]
     edge[:-1] |= labels[:-1] != labels[1:]
     mixed = np.where((labels > 0)[..., None], mixed, photo)
-    return np.rint(np.where(edge[..., None], (1 - _EDGE) * mixed, mixed)).astype(np.uint8)
+    return np.rint(np.where(edge[..., None], (1 - _BORDER_DARKENING) * mixed, mixed)).astype(np.uint8)
 
 
 def mask_picture(image: np.ndarray, mask: np.ndarray, color: tuple[int, int, int] = (255, 120, 0)) -> np.ndarray:
@@ -176,24 +176,24 @@ def with_legend(picture: np.ndarray, names: Sequence[str], labels: Iterable[int]
     if not shown:
         return picture
     texts = ["no label" if k == 0 else _shortened(names[k - 1]) for k in shown]
-    height = max(len(picture), _LINE + 4)
-    lines = (height - 4) // _LINE
+    height = max(len(picture), _LINE_HEIGHT + 4)
+    lines = (height - 4) // _LINE_HEIGHT
     font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.4
     columns = []
     for start in range(0, len(shown), lines):
         part = list(zip(shown, texts, strict=True))[start : start + lines]
         wide = max(cv2.getTextSize(text, font, scale, 1)[0][0] for _, text in part)
-        column = np.full((height, _SWATCH + wide + 18, 3), _BACK, np.uint8)
+        column = np.full((height, _SWATCH + wide + 18, 3), _BACKGROUND, np.uint8)
         for row, (k, text) in enumerate(part):
-            top = 4 + row * _LINE
+            top = 4 + row * _LINE_HEIGHT
             column[top : top + _SWATCH, 6 : 6 + _SWATCH] = table[k]
             cv2.putText(column, text, (6 + _SWATCH + 5, top + 10), font, scale, _INK, 1, cv2.LINE_AA)
         columns.append(column)
-    below = np.full((height - len(picture), picture.shape[1], 3), _BACK, np.uint8)
+    below = np.full((height - len(picture), picture.shape[1], 3), _BACKGROUND, np.uint8)
     return np.concatenate([np.concatenate([picture, below]), *columns], axis=1)
 
 
 def _shortened(name: str) -> str:
     """A name as the font draws it: ASCII, and not too long."""
     drawn = "".join(c if " " <= c <= "~" else "?" for c in name)
-    return drawn if len(drawn) <= _CHARACTER else drawn[: _CHARACTER - 2] + ".."
+    return drawn if len(drawn) <= _MAX_NAME else drawn[: _MAX_NAME - 2] + ".."

@@ -2,9 +2,9 @@
 
 Two scores, named with every result:
 
-    cosine        the largest cosine with a wanted vector; what reaches the threshold is selected
-    probability   of the wanted vectors together, by a softmax of cosines / temperature over them and all the others;
-                  what reaches the threshold is selected, or without one, where a wanted vector has the largest cosine
+    cosine        the largest cosine with a positive; what reaches the threshold is selected
+    probability   of the positives together, by a softmax of cosines / temperature over them and the negatives;
+                  what reaches the threshold is selected, or without one, where a positive has the largest cosine
                   of all, whatever the temperature
 
 Feature 3DGS takes a softmax without a temperature: cosines differ by tenths, so that its probabilities are nearly alike
@@ -27,37 +27,37 @@ __all__ = ["TEMPERATURE", "TextQuery"]
 
 TEMPERATURE = 0.01
 """1 / 100, CLIP's own (Radford et al. 2021, section 2.5)."""
-_ALIKE = 0.999  # cosine from which a class and what is wanted mean the same, and do not compete
+_SAME_MEANING = 0.999  # cosine from which on a class means the same as a positive, and is no negative; chosen
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class TextQuery:
-    """Vectors that are wanted, and what else something could be.
+    """Text embeddings that are searched for (positives), and those of other classes (negatives).
 
     Attributes:
-        wanted: (Q, C) float32 vectors of length 1.
-        others: (O, C) vectors alike, or None: the score is the cosine, not the probability.
-        threshold: Least score that is selected; None: the largest cosine of all must be a wanted one.
+        positives: (Q, C) float32 vectors of length 1.
+        negatives: (O, C) vectors alike, or None: the score is the cosine, not the probability.
+        threshold: Least score that is selected; None: the largest cosine of all must be that of a positive.
         temperature: Temperature of the softmax.
     """
 
-    wanted: torch.Tensor
-    others: torch.Tensor | None = None
+    positives: torch.Tensor
+    negatives: torch.Tensor | None = None
     threshold: float | None = None
     temperature: float = TEMPERATURE
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "wanted", unit_rows(self.wanted, "query: the wanted vectors"))
-        if self.others is not None:
-            object.__setattr__(self, "others", unit_rows(self.others, "query: the other vectors"))
-            if self.others.shape[1] != self.channels:
+        object.__setattr__(self, "positives", unit_rows(self.positives, "query: the wanted vectors"))
+        if self.negatives is not None:
+            object.__setattr__(self, "negatives", unit_rows(self.negatives, "query: the other vectors"))
+            if self.negatives.shape[1] != self.channels:
                 raise ValueError(
-                    f"query: what is wanted must have the {self.others.shape[1]} channels of the classes, got "
+                    f"query: what is wanted must have the {self.negatives.shape[1]} channels of the classes, got "
                     f"{self.channels}; take both from one text encoder"
                 )
-        if self.threshold is None and self.others is None:
+        if self.threshold is None and self.negatives is None:
             raise ValueError("query: a threshold must be given where nothing else competes; choose a cosine")
-        low = -1.0 if self.others is None else 0.0
+        low = -1.0 if self.negatives is None else 0.0
         if self.threshold is not None and not low <= self.threshold <= 1:
             raise ValueError(
                 f"query: the threshold of a {self.score_name} must be in [{low:g}, 1], got {self.threshold}; correct it"
@@ -83,8 +83,8 @@ class TextQuery:
             raise ValueError("query: the classes must have text embeddings, have names only; use --text-embedding")
         rows = [label - 1 for label in sorted(labels)]
         others = [k for k in range(len(classes)) if k not in rows]
-        competing = classes.embeddings[others] if others else None
-        return cls(classes.embeddings[rows], competing, threshold, temperature)
+        negatives = classes.embeddings[others] if others else None
+        return cls(classes.embeddings[rows], negatives, threshold, temperature)
 
     @classmethod
     def of_vectors(
@@ -103,38 +103,38 @@ class TextQuery:
         Raises:
             ValueError: If there is neither a threshold nor a class that competes.
         """
-        wanted = unit_rows(vectors[None] if vectors.ndim == 1 else vectors, "query: text embeddings")
+        positives = unit_rows(vectors[None] if vectors.ndim == 1 else vectors, "query: text embeddings")
         if threshold is not None:
-            return cls(wanted, None, threshold, temperature)
+            return cls(positives, None, threshold, temperature)
         if classes is None or classes.embeddings is None:
             raise ValueError(
                 "query: --threshold must be given, as there are no classes with embeddings to compare with; choose a "
                 "cosine"
             )
-        competing = classes.vectors(wanted.shape[1])
-        competing = competing[(competing @ wanted.T).amax(1) < _ALIKE]
-        if not len(competing):
+        negatives = classes.vectors(positives.shape[1])
+        negatives = negatives[(negatives @ positives.T).amax(1) < _SAME_MEANING]
+        if not len(negatives):
             raise ValueError("query: --threshold must be given, every class means the same; choose a cosine")
-        return cls(wanted, competing, None, temperature)
+        return cls(positives, negatives, None, temperature)
 
     @property
     def channels(self) -> int:
         """C of the vectors."""
-        return self.wanted.shape[1]
+        return self.positives.shape[1]
 
     @property
     def score_name(self) -> str:
         """`cosine` or `probability`."""
-        return "cosine" if self.others is None else "probability"
+        return "cosine" if self.negatives is None else "probability"
 
     @property
     def rule(self) -> str:
         """What is selected, in words."""
-        if self.others is None:
+        if self.negatives is None:
             return f"cosine >= {self.threshold:g}"
         if self.threshold is None:
-            return f"largest cosine of {len(self.wanted) + len(self.others)} texts"
-        count = len(self.wanted) + len(self.others)
+            return f"largest cosine of {len(self.positives) + len(self.negatives)} texts"
+        count = len(self.positives) + len(self.negatives)
         return f"probability >= {self.threshold:g} (softmax over {count} texts, temperature {self.temperature:g})"
 
     def score(self, features: torch.Tensor, decoder: Decoder | None = None) -> tuple[torch.Tensor, torch.Tensor]:
@@ -158,13 +158,13 @@ class TextQuery:
             raise ValueError(
                 f"query: text embeddings must have the {channels} channels of the {what}, got {self.channels}; {advice}"
             )
-        wanted = len(self.wanted)
-        if self.others is None:
-            score = cosines(features, self.wanted, decoder).amax(-1)
+        count = len(self.positives)
+        if self.negatives is None:
+            score = cosines(features, self.positives, decoder).amax(-1)
             assert self.threshold is not None  # or it would have been refused
             return score, score >= self.threshold
-        found = cosines(features, torch.cat([self.wanted, self.others]), decoder)
-        score = torch.softmax(found / self.temperature, -1)[..., :wanted].sum(-1)
+        found = cosines(features, torch.cat([self.positives, self.negatives]), decoder)
+        score = torch.softmax(found / self.temperature, -1)[..., :count].sum(-1)
         if self.threshold is not None:
             return score, score >= self.threshold
-        return score, found[..., :wanted].amax(-1) > found[..., wanted:].amax(-1)
+        return score, found[..., :count].amax(-1) > found[..., count:].amax(-1)

@@ -28,7 +28,7 @@ SCORE_DEFINITIONS = {
     ),
     "iou": "intersection over union of each class over all images; none where the reference does not have the class",
 }
-_TOP = 7  # labels, Feature 3DGS's own number
+_TOP_LABELS = 7  # labels, Feature 3DGS's own number
 _CHUNK = 1 << 22  # numbers that a step holds: 16 MB of float32, 8,192 pixels of 512 channels
 
 
@@ -263,6 +263,6 @@ def _top(confusion: np.ndarray) -> float:
     """The average IoU of the labels of an image that are most frequent in prediction and reference together."""
     right, union, _ = _overlaps(confusion)
     often = confusion.sum(1)[1:] + confusion.sum(0)[1:]
-    top = np.argsort(-often, kind="stable")[:_TOP]  # stable: of equally frequent labels the smaller number first
+    top = np.argsort(-often, kind="stable")[:_TOP_LABELS]  # stable: of equally frequent labels the smaller number first
     top = top[often[top] > 0]
     return float((right[top] / union[top]).mean())

@@ -24,7 +24,7 @@ import torch
 
 from drgs.cameras.sizes import at_most
 from drgs.ellipsoids import colors_only
-from drgs.information.complement import left
+from drgs.information.complement import remaining
 from drgs.information.nuisances import NO_NUISANCES, Nuisances
 from drgs.information.quantity import Quantity, ViewContext
 from drgs.information.sums import Information
@@ -50,14 +50,14 @@ __all__ = [
 
 BACKDROP = "backdrop"  # the group of its information
 _OPACITY, _TAKEN = "opacity", "taken"  # names of what is computed of one view
-_SIDE = 16  # cells along an edge of the cube, of 4 to 6 degrees
-CELLS = 6 * _SIDE**2
-_PIXELS = 1200  # of a view as its depth is looked at, such as 40 x 30: a quantile needs no detail
-_VIEWS = 16  # whose depth is looked at, at most: the cost does not grow with the number of candidates
+_CELLS_PER_EDGE = 16  # cells along an edge of the cube, of 4 to 6 degrees; chosen
+CELLS = 6 * _CELLS_PER_EDGE**2
+_DEPTH_PIXELS = 1200  # pixels of a view's depth image, such as 40 x 30: a quantile needs no detail
+_DEPTH_VIEWS = 16  # views whose depth is rendered, at most: the cost does not grow with the number of candidates
 _FAST = RenderSettings.preset("fast")  # measures depth along the ray, as `ewa` does not
-_SOLID = 0.5  # opacity from which on the median depth is that of a surface
-_FARTHEST = 0.95  # quantile of all depths that is the radius: a few floaters do not decide it
-_AROUND = 1.05  # of the distance of the outermost camera, at least: cameras are inside, not on the sphere
+_SURFACE_ALPHA = 0.5  # opacity from which on the median depth is that of a surface
+_RADIUS_QUANTILE = 0.95  # quantile of all depths that is the radius: a few floaters do not decide it; chosen
+_MIN_RADIUS_RATIO = 1.05  # of the distance of the outermost camera, at least: cameras are inside, not on the sphere
 
 
 ComputeViews = Callable[[Quantity, Sequence["Camera"]], Iterable[Information]]
@@ -101,9 +101,9 @@ def backdrop_sphere(
     centers = np.stack([camera.center for camera in cameras])
     # Of the cameras, not of their order, which the last bits of a running sum depend on.
     center = np.array([math.fsum(along) / len(cameras) for along in centers.T.tolist()])
-    if len(cameras) > _VIEWS:
+    if len(cameras) > _DEPTH_VIEWS:
         in_order = sorted(cameras, key=_place)
-        cameras = [in_order[i * len(cameras) // _VIEWS] for i in range(_VIEWS)]
+        cameras = [in_order[i * len(cameras) // _DEPTH_VIEWS] for i in range(_DEPTH_VIEWS)]
     quantity = SurfaceDepths()
     if compute is not None:
         computed = compute(quantity, cameras)
@@ -113,7 +113,7 @@ def backdrop_sphere(
     if not len(solid):
         return None
     outermost = float(np.linalg.norm(centers - center, axis=1).max())
-    radius = max(float(np.quantile(solid, _FARTHEST)), _AROUND * outermost)
+    radius = max(float(np.quantile(solid, _RADIUS_QUANTILE)), _MIN_RADIUS_RATIO * outermost)
     return Sphere((float(center[0]), float(center[1]), float(center[2])), radius)
 
 
@@ -132,10 +132,10 @@ class SurfaceDepths(Quantity):
 
         with torch.no_grad():  # a distance is a number
             plain = colors_only(view.scene, view.camera.time)
-            small = at_most(view.camera, _PIXELS)
+            small = at_most(view.camera, _DEPTH_PIXELS)
             out = render(plain, small, _FAST, outputs=("median_depth",))
         assert out.median_depth is not None
-        return {"depths": out.median_depth[(out.alpha >= _SOLID) & (out.median_depth > 0)].cpu()}
+        return {"depths": out.median_depth[(out.alpha >= _SURFACE_ALPHA) & (out.median_depth > 0)].cpu()}
 
     def key(self, camera: Camera, settings: RenderSettings) -> Hashable:
         """Whatever the settings are."""
@@ -158,8 +158,8 @@ def backdrop_cells(camera: Camera, sphere: Sphere | None = None) -> torch.Tensor
         along, *others = (rays[(k + step) % 3][seen] for step in range(3))
         # Evenly in angle, in [0, 2]; the edge of a face, 2, would be cell 16.
         even = (np.arctan(x / np.abs(along)) * 4 / np.pi + 1 for x in others)
-        first, second = ((x / 2 * _SIDE).astype(np.int64).clip(0, _SIDE - 1) for x in even)
-        cells[seen] = ((2 * k + (along < 0)) * _SIDE + first) * _SIDE + second
+        first, second = ((x / 2 * _CELLS_PER_EDGE).astype(np.int64).clip(0, _CELLS_PER_EDGE - 1) for x in even)
+        cells[seen] = ((2 * k + (along < 0)) * _CELLS_PER_EDGE + first) * _CELLS_PER_EDGE + second
     return torch.from_numpy(cells.reshape(camera.height, camera.width))
 
 
@@ -199,7 +199,7 @@ def painted_opacity(
     # The same clamp as of `_open`, and 1 - alpha in float64, as there.
     rows = taken.double() * (1 - opacity.double().cpu()).clamp(min=0).reshape(-1, 1, 1)
     lost.index_add_(0, cells, rows)
-    return left(shown, lost.square().sum(-1))
+    return remaining(shown, lost.square().sum(-1))
 
 
 def backdrop_variance(

@@ -28,19 +28,19 @@ import dataclasses
 
 import torch
 
-__all__ = ["Eliminated", "left"]
+__all__ = ["Eliminated", "remaining"]
 
 _NULL = 1e-8
 """Eigenvalue of the nuisances' information, scaled to a diagonal of 1, below which a direction is none: what rounding
 of float32 images leaves of a direction that changes nothing (1e-6 of what each unknown alone does), squared, is 1e-12.
 A direction of unknowns that together do less than 1e-4 of what each does alone stays in the scene's information."""
-_SHARE = 1e-12  # of a direction's information, below which what is known before is all that there is
+_MIN_SHARE = 1e-12  # of a direction's information, below which what is known before is all that there is
 _ROUNDING = 4e-6
 """Share of an entry that is no information: the sum and what is taken from it are sums of float32 images that were
 found in two ways, apart by up to 1e-6 of the entry on scenes of 20,000 Gaussians."""
 
 
-def left(whole: torch.Tensor, lost: torch.Tensor) -> torch.Tensor:
+def remaining(whole: torch.Tensor, lost: torch.Tensor) -> torch.Tensor:
     """What is left of entries of a diagonal; 0, not a rest of either sign, where that is all rounding."""
     rest = whole - lost
     return torch.where(rest > _ROUNDING * whole, rest, 0.0)
@@ -70,7 +70,7 @@ class Eliminated:
         Q = flat @ (inverse[:, None] * vectors[:, there] / values[there].sqrt())
         # Q Q^T is N M^-1 N^T; its own eigenvectors are orthonormal whatever is known before.
         shares, turned = torch.linalg.eigh(Q.T @ Q)
-        seen = shares > _SHARE
+        seen = shares > _MIN_SHARE
         U = Q @ (turned[:, seen] / shares[seen].sqrt())
         # A share is at most 1 but for rounding, which would be information below 0.
         return cls(U.reshape(*N.shape[:-1], -1), shares[seen].clamp_max(1.0))

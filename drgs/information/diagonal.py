@@ -20,7 +20,7 @@ import torch
 from drgs.ellipsoids import DeformableScene
 from drgs.information.choices import METHODS, Method
 from drgs.information.columns import BATCH, jacobian_columns
-from drgs.information.complement import left
+from drgs.information.complement import remaining
 from drgs.information.elimination import BLOCK_INPUTS, ViewRows
 from drgs.information.gains import DENSE
 from drgs.information.groups import Group, groups_of
@@ -71,13 +71,13 @@ class Diagonal(Quantity):
     @alone
     def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
         """Group -> float64 tensor on the CPU; 0 of a view without Gaussians. A replay gives the view its opacity."""
-        seen = view.gaussians
-        scene = seen if self.of_gaussians else view.scene
-        wanted = self._checked_groups(groups_of(seen, self.groups, scene))
+        gaussians = view.gaussians
+        scene = gaussians if self.of_gaussians else view.scene
+        wanted = self._checked_groups(groups_of(gaussians, self.groups, scene))
         if self.semantics is not None:
-            self.semantics.check(self.where, seen)
-        if not len(seen):
-            result = {name: torch.zeros(group.shape(seen)) for name, group in wanted.items()}
+            self.semantics.check(self.where, gaussians)
+        if not len(gaussians):
+            result = {name: torch.zeros(group.shape(gaussians)) for name, group in wanted.items()}
         elif self.method in ("columns", "probes"):
             compute = _by_columns if self.method == "columns" else _by_probes
             result = compute(self, view, {n: group for n, group in wanted.items() if group.owner != "scene"})
@@ -98,7 +98,7 @@ class Diagonal(Quantity):
         result = dict(replay.diagonal(wanted, self.channel_weights, self.method == "fisherrf", along))
         rows = ViewRows.of(view, self.channel_weights, self.semantics, self.nuisances)
         if rows is not None:
-            result |= {name: left(result[name], lost) for name, lost in rows.lost(wanted).items()}
+            result |= {name: remaining(result[name], lost) for name, lost in rows.lost(wanted).items()}
         return result
 
     def _checked_groups(self, wanted: dict[str, Group]) -> dict[str, Group]:
@@ -147,15 +147,15 @@ class DenseBlocks(Quantity):
     @alone
     def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
         """Float64 on the CPU."""
-        seen = view.gaussians
+        gaussians = view.gaussians
         if self.semantics is not None:
-            self.semantics.check(self.where, seen)
-        if not len(seen):
+            self.semantics.check(self.where, gaussians)
+        if not len(gaussians):
             return {DENSE: torch.zeros(0, BlockSums.SIZE, BlockSums.SIZE, dtype=torch.float64)}
         blocks = view.replay(self.semantics).blocks(self.channel_weights)
         rows = ViewRows.of(view, self.channel_weights, self.semantics, self.nuisances)
         if rows is not None:
-            blocks = blocks - rows.taken_of_blocks(groups_of(seen, BLOCK_INPUTS))
+            blocks = blocks - rows.taken_of_blocks(groups_of(gaussians, BLOCK_INPUTS))
         return {DENSE: blocks}
 
 
@@ -219,7 +219,7 @@ def _by_columns(
             elif group.outputs != (0, 3):
                 squared += columns[..., 3:].square().sum((1, 2, 3))
             if rows_of_view is not None and (group.outputs == (0, 3) or semantics is not None):
-                squared = left(squared, rows_of_view.lost_of_columns(columns, group.outputs == (0, 3)))
+                squared = remaining(squared, rows_of_view.lost_of_columns(columns, group.outputs == (0, 3)))
             parts.append(squared)
         result[name] = group.merge(torch.cat(parts).reshape(shape))
     return result
@@ -272,5 +272,5 @@ def _by_probes(
         replay = view.replay(semantics, geometry=False)
         result |= replay.diagonal(other, weights, False)
         if rows is not None:
-            result |= {name: left(result[name], lost) for name, lost in rows.lost(other).items()}
+            result |= {name: remaining(result[name], lost) for name, lost in rows.lost(other).items()}
     return result

@@ -68,7 +68,7 @@ if TYPE_CHECKING:
 __all__ = ["NetworkInformation", "NetworkProbes"]
 
 _FLOATS = 1 << 23  # of the tangents that one traversal carries, or of images and what is summed up along them: 32 MiB
-_BATCH = 16  # tangents of one traversal
+_BATCH = 16  # tangents of one traversal; chosen: bounds memory
 
 _GEOMETRY_FIELDS = {"means": 0, "quats": 3, "log_scales": 6, "logit_opacities": 9}
 """Raw fields of Gaussians -> first place of theirs in the geometry of a row, where rotations stand for quats."""
@@ -225,7 +225,7 @@ class _Rows:
     Attributes:
         scene: The scene.
         gaussians: Its Gaussians at the time of the view.
-        seen: The same with the channels of features that are rows, if any.
+        rendered: The same with the channels of features that are rows, if any.
         deformed: The scene with these features; forward mode leads through it.
         camera, settings: The view.
         semantics: The metric of these features.
@@ -237,7 +237,7 @@ class _Rows:
 
     scene: DeformableScene
     gaussians: Gaussians
-    seen: Gaussians
+    rendered: Gaussians
     deformed: DeformableScene
     camera: Camera
     settings: RenderSettings
@@ -250,27 +250,27 @@ class _Rows:
     @classmethod
     def of(cls, where: str, view: ViewContext, quantity: NetworkInformation) -> _Rows | None:
         """The rows that a quantity is of; None if there is nothing to see."""
-        seen, semantics, scene = view.gaussians, quantity.semantics, view.scene
+        rendered, semantics, scene = view.gaussians, quantity.semantics, view.scene
         assert isinstance(scene, DeformableScene)  # it has groups
-        if not len(seen) or not view.camera.width * view.camera.height:
+        if not len(rendered) or not view.camera.width * view.camera.height:
             return None
         weights = torch.tensor(three_weights(where, quantity.channel_weights), dtype=torch.float64).sqrt()
         deformed: DeformableScene = scene
         directions = None
         if semantics is None:
-            seen = seen.replace(features=None)
+            rendered = rendered.replace(features=None)
         else:
-            semantics.check(where, seen)
-            assert seen.features is not None  # `check` has refused it
+            semantics.check(where, rendered)
+            assert rendered.features is not None  # `check` has refused it
             # Squares of few channels add up to those of all decoded ones, in one traversal.
-            directions = semantics.directions(seen.features)
+            directions = semantics.directions(rendered.features)
             deformed = reduced = _Reduced(scene, directions)
-            seen = reduced.reduced(seen)
+            rendered = reduced.reduced(rendered)
             weights = torch.cat([weights, torch.full((directions.shape[1],), semantics.weight**0.5)])
         return cls(
             scene=original(scene),
             gaussians=view.gaussians,
-            seen=seen.detach(),
+            rendered=rendered.detach(),
             deformed=deformed,
             camera=view.camera,
             settings=view.settings,
@@ -284,7 +284,7 @@ class _Rows:
     @functools.cached_property
     def call(self) -> Call:
         """The call of the view, by which forward mode leads from phi to the image."""
-        return Call(self.seen, self.camera, self.settings, frozenset(), scene=self.deformed)
+        return Call(self.rendered, self.camera, self.settings, frozenset(), scene=self.deformed)
 
     @functools.cached_property
     def scales(self) -> torch.Tensor:
@@ -313,7 +313,7 @@ class _Rows:
     @property
     def most_images(self) -> int:
         """How many images are pulled back at a time."""
-        return max(1, _FLOATS // max(self.pixels * self.channels, len(self.seen) * GEOMETRY))
+        return max(1, _FLOATS // max(self.pixels * self.channels, len(self.rendered) * GEOMETRY))
 
     def jacobian(self, groups: Groups) -> SceneJacobian:
         """J of the Gaussians by phi."""
@@ -331,7 +331,7 @@ class _Rows:
     def hit_sums(self, jacobian: SceneJacobian, images: torch.Tensor) -> HitSums:
         """Sums over the view's hits along (K, pixels, C) rows, none added yet."""
         moving = jacobian.moving
-        which = torch.ones(len(self.seen), dtype=torch.bool) if moving is None else moving.cpu()
+        which = torch.ones(len(self.rendered), dtype=torch.bool) if moving is None else moving.cpu()
         return HitSums(self.cotangents(images), which)
 
     def squares_of_hits(self, jacobian: SceneJacobian, sums: HitSums) -> dict[str, torch.Tensor]:
@@ -339,18 +339,20 @@ class _Rows:
         traversal has added them.
         """
         if not sums.is_full:
-            gaussians = self.seen if self.semantics is None else self.gaussians  # a replay reduces features by itself
+            gaussians = (
+                self.rendered if self.semantics is None else self.gaussians
+            )  # a replay reduces features by itself
             Replay(gaussians, self.camera, self.settings, semantics=self.semantics, mask=self.mask).add_up(sums)
         geometry = sums.geometry()
         moved = geometry.any(2).any(0)  # a view shows few of those that move
         index = sums.wanted.to(moved.device)[moved]
-        quats = self.seen.quats.to(geometry.device)
+        quats = self.rendered.quats.to(geometry.device)
         return jacobian.squared_slopes(index, _field_slopes(geometry[:, moved], quats[index]))
 
     def _squares_of_passes(self, jacobian: SceneJacobian) -> Callable[[torch.Tensor], dict[str, torch.Tensor]]:
         """The same by a reverse pass for each image, for fields beyond the geometry."""
-        pull = Pullback(Call(self.seen, self.camera, self.settings, frozenset()), sorted(jacobian.fields))
-        index = torch.arange(len(self.seen))
+        pull = Pullback(Call(self.rendered, self.camera, self.settings, frozenset()), sorted(jacobian.fields))
+        index = torch.arange(len(self.rendered))
 
         def squares(images: torch.Tensor) -> dict[str, torch.Tensor]:
             total: dict[str, torch.Tensor] = {}

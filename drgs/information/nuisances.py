@@ -17,7 +17,7 @@ Nuisance = Literal["exposure", "pose"]
 
 NUISANCES: tuple[Nuisance, ...] = typing.get_args(Nuisance)
 
-_STD = (1e-9, 1e9)  # whose squares and their inverses are numbers by far
+_STD_RANGE = (1e-9, 1e9)  # allowed prior standard deviations: their squares and inverses are far inside float64
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -75,7 +75,7 @@ class Nuisances(Record):
 
     @staticmethod
     def _check(name: str, value: object) -> None:
-        low, high = _STD
+        low, high = _STD_RANGE
         if isinstance(value, bool) or not (isinstance(value, numbers.Real) and low <= float(value) <= high):
             raise ValueError(
                 f"nuisances: {name} must be within {low:g} and {high:g}, got {value!r}; leave it out where nothing is "

@@ -268,7 +268,7 @@ def opacity_of(scene: Scene, camera: Camera, settings: RenderSettings) -> torch.
 _Any = TypeVar("_Any")
 _Scene = TypeVar("_Scene", bound=Scene)
 
-_BYTES = 64 << 20  # that Gaussians of several times may take, 64 MiB, or those of one time
+_TIMES_BYTES = 64 << 20  # bytes that the Gaussians of several times may take, or those of one time; chosen
 
 
 def once_per_time(scene: _Any) -> _Any:
@@ -302,7 +302,7 @@ class _OncePerTime:
             with torch.no_grad():  # information is a number
                 self._gaussians[time] = self._scene.at(time)
             if len(self._gaussians) > 1:
-                self._most = self._most or max(1, _BYTES // max(1, self._own_bytes(self._gaussians[time])))
+                self._most = self._most or max(1, _TIMES_BYTES // max(1, self._own_bytes(self._gaussians[time])))
                 if len(self._gaussians) > self._most:
                     self._gaussians.popitem(last=False)
         self._gaussians.move_to_end(time)

@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 
 __all__ = ["Replay", "WalkSums"]
 
-_TABLED = 4  # channels whose tables are worth their memory
-_SEMANTIC = 16  # semantic channels of one traversal, besides the colors
+_TABLED_CHANNELS = 4  # channels whose tables are worth their memory
+_SEMANTIC_CHANNELS = 16  # semantic channels of one traversal, besides the colors
 _FLOAT_MAX = torch.finfo(torch.float32).max
-_MOST = 1e-6 * _FLOAT_MAX  # of a weight, so that what few of them add up to is no inf, which times 0 were NaN
+_MAX_WEIGHT = 1e-6 * _FLOAT_MAX  # of a weight, so that what few of them add up to is no inf, which times 0 were NaN
 
 
 class Walk(NamedTuple):
@@ -96,7 +96,7 @@ class Replay:
         if semantics is not None and geometry:
             assert gaussians.features is not None  # `SemanticMetric.check` has refused it
             channels = semantics.channels(gaussians.features)
-            slices = list(channels.split(_SEMANTIC, 1)) if channels.shape[1] else slices
+            slices = list(channels.split(_SEMANTIC_CHANNELS, 1)) if channels.shape[1] else slices
         self.semantics = semantics
         self.slices = slices
         seen = gaussians.detach().replace(features=slices[0])
@@ -203,11 +203,11 @@ class Replay:
                 channels, done = compositor.again(to_drjit(self.lib, features.reshape(-1)).array, count)
             numbers = channels.outputs if self.extras is not None else 0
             kernel = functools.partial(self._rows, channels)
-            tabled = None if numbers > _TABLED else numbers
+            tabled = None if numbers > _TABLED_CHANNELS else numbers
             own = [*(weights if number == 0 else [0.0] * 3), *[gamma] * count]
             for at in done:
                 known = along_lists(self.lib, *at, tabled, kernel)
-                yield Walk(number == 0, 3 + number * _SEMANTIC, own, channels, *known)
+                yield Walk(number == 0, 3 + number * _SEMANTIC_CHANNELS, own, channels, *known)
 
     def _rows(
         self, channels: Channels, part: Part, finals: list[dict], sink: Sink | Any = None, table: Table | None = None
@@ -318,7 +318,7 @@ class Replay:
         """Weights of `variance` on the device."""
         if not torch.isfinite(weights).all():
             raise ValueError("fisher.variance_map: weights must be finite, got NaN or Inf; raise lambda above 0")
-        return to_drjit(self.lib, weights.clamp_max(_MOST).float().reshape(-1).to(self.call.home)).array
+        return to_drjit(self.lib, weights.clamp_max(_MAX_WEIGHT).float().reshape(-1).to(self.call.home)).array
 
     def sh_information(self, squares: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
         """(N, K, 3) squares of the derivatives by SH, from (N, 1) sum w^2, times (3,) weights; call after `sums`."""

@@ -35,8 +35,10 @@ if TYPE_CHECKING:
 
 __all__ = ["SemanticMetric"]
 
-_RANK = 1e-12  # of the largest eigenvalue: below, float64 rounding of W^T W
-_SAMPLE = 4096  # Gaussians that say in which directions features differ: any directions are right, these are good
+_RANK_TOLERANCE = 1e-12  # of the largest eigenvalue: below, float64 rounding of W^T W
+# Gaussians that the directions in which features differ are computed from: any directions are right, these have little
+# variance
+_SAMPLED_GAUSSIANS = 4096
 
 
 class _Decodes(Protocol):
@@ -117,7 +119,7 @@ class SemanticMetric:
                 f"SemanticMetric: matrix must be positive semidefinite, got an eigenvalue of {float(values[0]):.3g}; "
                 "use W.T @ W"
             )
-        seen = values > _RANK * self.width * top
+        seen = values > _RANK_TOLERANCE * self.width * top
         return vectors[:, seen] * values[seen].sqrt()
 
     def directions(self, features: torch.Tensor) -> torch.Tensor:
@@ -131,7 +133,7 @@ class SemanticMetric:
         if self.estimate == "collapsed":
             return L @ draw(rank, K) / K**0.5
         # Detached: directions are frozen, too. float64, for eigenvectors of sums of thousands of squares.
-        some = features[:: max(1, len(features) // _SAMPLE)].detach().double().cpu() @ L
+        some = features[:: max(1, len(features) // _SAMPLED_GAUSSIANS)].detach().double().cpu() @ L
         Q = torch.linalg.eigh(some.T @ some)[1].flip(1)  # eigenvalues descend
         return L @ torch.cat([Q[:, : K - 1], Q[:, K - 1 :] @ draw(rank - K + 1, 1)], 1)
 
@@ -139,7 +141,7 @@ class SemanticMetric:
         """(N, K) float32 scalars of (N, D) features, whose squared differences add up to that of the features."""
         P = self.directions(features)
         # A part at a time: float64 of all would be twice the features, and fit no cache.
-        parts = [(part.double().cpu() @ P).float() for part in features.detach().split(_SAMPLE)]
+        parts = [(part.double().cpu() @ P).float() for part in features.detach().split(_SAMPLED_GAUSSIANS)]
         return torch.cat(parts).to(features.device) if parts else features.new_zeros(0, P.shape[1])
 
     def squares(self, features: torch.Tensor) -> torch.Tensor:

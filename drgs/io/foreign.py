@@ -13,7 +13,7 @@ from pathlib import Path
 
 __all__ = ["is_file", "refuse_foreign"]
 
-_HEAD = 4096
+_HEAD_BYTES = 4096  # bytes from the start of a file, enough for every mark that is looked for
 _SPLATS = {
     ".spz": "an SPZ file (Niantic's compressed Gaussians)",
     ".sog": "a SOG file (PlayCanvas' compressed Gaussians)",
@@ -43,8 +43,8 @@ def refuse_foreign(path: Path, wanted: str) -> None:
         if not path.is_file():
             return
     with path.open("rb") as file:
-        head = file.read(_HEAD)
-    other = _lfs(head, path) or _splats(head, path) or _other(head, path)
+        head = file.read(_HEAD_BYTES)
+    other = _lfs(head, path) or _splats(head, path) or _other_file(head, path)
     if other:
         raise ValueError(f"{path}: must be {wanted}, is {other[0]}; {other[1]}")
 
@@ -91,7 +91,7 @@ def _splats(head: bytes, path: Path) -> tuple[str, str] | None:
     return (kind, _conversion(path, suffix)) if kind else None
 
 
-def _other(head: bytes, path: Path) -> tuple[str, str] | None:
+def _other_file(head: bytes, path: Path) -> tuple[str, str] | None:
     """Anything else that people pass by mistake."""
     start = head.lstrip(b"\xef\xbb\xbf \t\r\n")[:16].lower()
     brand = head[8:12] if head[4:8] == b"ftyp" else b""

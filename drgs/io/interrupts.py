@@ -28,8 +28,9 @@ __all__ = [
 ]
 
 _SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
-_ANSWER = 0.7  # seconds that the main thread is given to come back from native code
-_SAME = 1.0  # seconds within which a signal is the same one again
+# seconds that the main thread is given to return from native code; a command ends within two. Chosen
+_ANSWER_SECONDS = 0.7
+_SAME_SIGNAL_SECONDS = 1.0  # seconds within which a second signal counts as the same; chosen
 
 
 class Terminated(KeyboardInterrupt):
@@ -63,7 +64,7 @@ class _Handlers:
         if self.first is None:
             self.first = now
             self.signum = signum
-        is_again = now - self.first >= _SAME
+        is_again = now - self.first >= _SAME_SIGNAL_SECONDS
         if not (is_again or is_first and not self.waits):
             return
         if self.leave is None and self.is_native:
@@ -80,11 +81,11 @@ class _Handlers:
                 continue
             began = time.monotonic()
             self.heard = began if self.heard is None else self.heard
-            is_again = began - self.heard >= _SAME
+            is_again = began - self.heard >= _SAME_SIGNAL_SECONDS
             while not self.is_answered or is_again:
                 if self.waits and not is_again:
                     break
-                if time.monotonic() - began > _ANSWER:
+                if time.monotonic() - began > _ANSWER_SECONDS:
                     leave(numbers[-1])
                 time.sleep(0.02)
 
@@ -245,7 +246,7 @@ def _ignore_again(first: float) -> None:
     """
 
     def again(signum: int, _frame: object) -> None:
-        if time.monotonic() - first >= _SAME:
+        if time.monotonic() - first >= _SAME_SIGNAL_SECONDS:
             signal.signal(signum, before[signum])
             signal.raise_signal(signum)
 

@@ -13,9 +13,9 @@ from drgs.io.foreign import refuse_foreign
 
 __all__ = ["check_json", "parse_json", "read_json", "read_toml"]
 
-_LARGEST = 1 << 29  # bytes; ten thousand photographs with all their fields take some 20 MB
-_LARGEST_TOML = 1 << 20
-_INT64 = 1 << 63
+_MAX_JSON_BYTES = 1 << 29  # bytes; ten thousand photographs with all their fields take some 20 MB
+_MAX_TOML_BYTES = 1 << 20  # bytes; a file of all options has some 10 KB
+_INT64 = 1 << 63  # integers beyond are no 64-bit ones
 
 
 def read_json(path: Path, what: str = "a JSON file", advice: str = "write the file again") -> Any:
@@ -29,7 +29,7 @@ def read_json(path: Path, what: str = "a JSON file", advice: str = "write the fi
         FileNotFoundError: If there is no such file.
         ValueError: If it is not JSON, too large or too deeply nested, or known to be of another kind.
     """
-    return parse_json(_bounded(path, what, advice, _LARGEST), str(path), advice)
+    return parse_json(_bounded(path, what, advice, _MAX_JSON_BYTES), str(path), advice)
 
 
 def read_toml(path: Path, what: str = "a TOML file", advice: str = "write the file again") -> dict[str, Any]:
@@ -37,7 +37,7 @@ def read_toml(path: Path, what: str = "a TOML file", advice: str = "write the fi
 
     Args, Raises: As `read_json`.
     """
-    data = _bounded(path, what, advice, _LARGEST_TOML)
+    data = _bounded(path, what, advice, _MAX_TOML_BYTES)
     try:
         return tomllib.loads(data.decode("utf-8-sig").replace("\r\n", "\n"))
     except RecursionError:

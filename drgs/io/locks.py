@@ -23,8 +23,8 @@ __all__ = ["NAME", "InUse", "acquire", "exclusive", "host_of", "release"]
 NAME = ".drgs.lock"
 """Name of the lock in the folder that is being written."""
 
-_MAX_BYTES = 4096
-_UNWRITTEN = 2.0  # seconds after which a lock without content is of a process that was killed while it wrote it
+_MAX_BYTES = 4096  # bytes of a lock file that are read: ours has a line
+_UNWRITTEN_SECONDS = 2.0  # seconds after which a lock without content is of a process that was killed while it wrote it
 
 
 class InUse(ValueError):
@@ -85,7 +85,7 @@ def host_of(folder: Path) -> str | None:
 def _refuse_if_running(folder: Path, path: Path, owner: dict) -> None:
     this = _this_process()
     if not owner:
-        if time.time() - path.stat().st_mtime < _UNWRITTEN:
+        if time.time() - path.stat().st_mtime < _UNWRITTEN_SECONDS:
             raise InUse(f"{folder}: must not be written by two commands at once, another one begins; wait for it")
         return
     where = f"{folder}: must not be written by two commands at once, {_in_words(owner)} writes there"

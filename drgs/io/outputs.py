@@ -40,7 +40,7 @@ __all__ = [
 
 JOURNAL = ".drgs.jsonl"
 _MAX_JSON = 64 << 20  # bytes; a longer file is none that a command wrote as its report
-_LARGE = 1 << 20  # bytes that take long enough to hash that the result is kept
+_KEEP_HASH_BYTES = 1 << 20  # bytes that take long enough to hash that the result is kept
 
 _log = logging.getLogger(__name__)
 _held: dict[Path, LockedFolder] = {}
@@ -431,7 +431,7 @@ def _fingerprint(path: Path) -> str:
         return _hashes[key]
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    if status.st_size > _LARGE:  # small ones are quick, and might be replaced within a tick of the clock
+    if status.st_size > _KEEP_HASH_BYTES:  # small ones are quick, and might be replaced within a tick of the clock
         _hashes[key] = digest
     return digest
 

@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 FIELDS = ("rgb", "alpha", "depth", "features")
-_ENTRIES = 1 << 22  # entries of an intermediate of the dense Jacobian that are held at once: 32 MB
+_JACOBIAN_ENTRIES = 1 << 22  # entries of an intermediate of the dense Jacobian that are held at once: 32 MB
 
 
 # -------------------------------------------------- random scenes
@@ -320,7 +320,7 @@ def _dense(flat: torch.Tensor, inputs: list[torch.Tensor]) -> list[torch.Tensor]
     zeros = [torch.zeros(len(flat), *x.shape, dtype=torch.float64) for x in inputs]
     if not flat.requires_grad or not any(x.numel() for x in inputs):
         return zeros
-    step = max(1, _ENTRIES // (len(flat) * len(inputs[0])))
+    step = max(1, _JACOBIAN_ENTRIES // (len(flat) * len(inputs[0])))
     if len(flat) <= sum(x.numel() for x in inputs):
         rows = _batched(flat, inputs, step)
         return [zero if row is None else row.double() for zero, row in zip(zeros, rows, strict=True)]

@@ -39,13 +39,14 @@ DISTORTIONS = {
     "no tangential terms": lambda k1, k2, p1, p2, *rest: (k1, k2, 0.0, 0.0, *rest),
     "in the order k1, k2, k3, p1, p2": lambda k1, k2, p1, p2, *rest: (k1, k2, *_later(p1, p2, *rest)),
 }
-_WINDOW = 16  # pixels a side of the squares that the oracle draws one at a time, to bound its memory
+_ORACLE_WINDOW = 16  # pixels a side of the squares that the oracle draws one at a time, to bound its memory
 _DENSE_PAIRS = (
     4_000_000  # (pixel, Gaussian) pairs of a view that are drawn densely where our renderer lacks a convention
 )
-_NEAR = 2e-6  # share of the distance: some ten times what float32 loses where it computes a depth
-_EFFECT = 1e-5  # part of a weight: what moves less moves no gradient by what counts
-_COMPENSATION_FLOOR = 0.005**2  # smallest ratio of determinants
+# relative difference of depths that counts as a tie: some ten times float32's rounding where it computes a depth
+_NEAR_TIE = 2e-6
+_MIN_WEIGHT_CHANGE = 1e-5  # change of a compositing weight; a smaller one moves no gradient by what counts. Chosen
+_COMPENSATION_FLOOR = 0.005**2  # smallest ratio of determinants: gsplat's smallest factor, squared
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,10 +175,10 @@ class ReferenceModel:
                     g,
                     camera,
                     self.settings,
-                    tolerance=_NEAR,
+                    tolerance=_NEAR_TIE,
                     window=window,
                     exact_ties=True,
-                    effect=_EFFECT,
+                    effect=_MIN_WEIGHT_CHANGE,
                     **self._oracle_arguments(),
                 )
                 ties[y : y + height, x : x + width] = out.ambiguous
@@ -310,9 +311,9 @@ def _windows(camera: Camera, whole: bool = False) -> Iterator[tuple[int, int, in
     if whole:
         yield 0, 0, camera.width, camera.height
         return
-    for y in range(0, camera.height, _WINDOW):
-        for x in range(0, camera.width, _WINDOW):
-            yield x, y, min(_WINDOW, camera.width - x), min(_WINDOW, camera.height - y)
+    for y in range(0, camera.height, _ORACLE_WINDOW):
+        for x in range(0, camera.width, _ORACLE_WINDOW):
+            yield x, y, min(_ORACLE_WINDOW, camera.width - x), min(_ORACLE_WINDOW, camera.height - y)
 
 
 def _eye(camera: Camera, between: bool) -> torch.Tensor:
@@ -342,7 +343,7 @@ def _compensation(raw: dict, camera: Camera, s: RenderSettings, floor: float) ->
 
 # ----------------------------------------------------------------------------------------------------------- the search
 
-_SHARE = 0.3  # share of the remaining difference that a variation must explain to be named
+_MIN_EXPLAINED_SHARE = 0.3  # share of the remaining difference that a variation must explain to be named; chosen
 LEAST = 0.1  # share of the pixels: fewer that are without near ties say nothing
 
 
@@ -513,7 +514,7 @@ def _descend(
         best = min(distance(new) for new, _ in tried)
         # Of those that explain as much, the first one listed: what differs then is rounding.
         new, field = next(pair for pair in tried if distance(pair[0]) <= max(1.001 * best, settled))
-        if distance(new) > (1 - _SHARE) * distance(model):
+        if distance(new) > (1 - _MIN_EXPLAINED_SHARE) * distance(model):
             break
         model = _refined(distance, new, field, settled) if field in _FITTED else new
     for field in _different(model, start):

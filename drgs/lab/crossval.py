@@ -40,12 +40,14 @@ __all__ = ["VERDICTS", "Crop", "Result", "crops", "crossval"]
 
 VERDICTS = ("gradient bug", "undecided", "model difference", "other convention", "known deviation", "agreement")
 _STARTS = ("gsplat", "inria", "3dgut", "fast", "exact", "mitsuba")  # the first of equally near ones is taken
-_ORACLE_PAIRS = 4_000_000  # (pixel, Gaussian) pairs of a scene that the oracle takes as it is
+# (pixel, Gaussian) pairs up to which the oracle takes a scene whole; larger ones are cropped. Chosen: bounds seconds
+_ORACLE_PAIRS = 4_000_000
 _TOLERANCE = {torch.float64: 5e-4, torch.float32: 5e-3}  # relative L2 difference of gradients that agree
 _SETTLED = {torch.float64: 1e-5, torch.float32: 1e-4}  # RMS of images that differ by rounding and its cut-offs
-_ALPHA = 1e-4  # mean difference of alpha from which on it is reported
-_SIDES = (32, 16, 8)  # pixels of a crop, the largest that the oracle can take
-_STEP = 16  # pixels between the places that are tried for a crop: a rasterizer's tiles stay where they are
+# mean difference of alpha from which on it is reported; chosen, ten times `_SETTLED` of float64
+_ALPHA_TOLERANCE = 1e-4
+_CROP_SIDES = (32, 16, 8)  # pixels of a side of a crop: the largest that the oracle can take
+_CROP_STEP = 16  # pixels between the places that are tried for a crop: gsplat's tiles stay where they are
 _CROP_PAIRS = 1_000_000  # (pixel, Gaussian) pairs of a crop that take the oracle seconds: image and gradient, by CPU
 
 
@@ -98,7 +100,7 @@ class Result:
         for view in self.views:
             if view.error is not None:
                 lines.append(f"view {view.view}: {error_line(view.error, r['size'])}")
-            if abs(bias := view.alpha.bias) > _ALPHA:
+            if abs(bias := view.alpha.bias) > _ALPHA_TOLERANCE:
                 what = "lower: hits are missing" if bias < 0 else "higher"
                 lines.append(f"view {view.view}: alpha is {abs(bias):.1e} {what} on average")
         for name, group in self.groups.items():
@@ -162,8 +164,8 @@ def crossval(
     first = int(np.argmax([float(x.var()) for x in pictures]))  # the view that shows most
 
     @functools.cache
-    def drawn_by(model: ReferenceModel, view: int) -> tuple[torch.Tensor, torch.Tensor]:
-        return _drawn(model, raw, cameras[view], oracle)
+    def rendered_by(model: ReferenceModel, view: int) -> tuple[torch.Tensor, torch.Tensor]:
+        return _rendered(model, raw, cameras[view], oracle)
 
     @functools.cache
     def ties_of(model: ReferenceModel, view: int) -> torch.Tensor:
@@ -173,16 +175,16 @@ def crossval(
     search = conventions.find(
         pictures[first],
         list(starts.values()),
-        lambda m: drawn_by(m, first)[0],
+        lambda m: rendered_by(m, first)[0],
         lambda m: ties_of(m, first),
         _SETTLED[dtype],
         lambda m: m.suits(cameras[first], len(g)),
     )
     model = search.model
     claimed = next(name for name, start in starts.items() if start == search.start)
-    drawn = [drawn_by(model, view) for view in range(len(cameras))]
+    drawn = [rendered_by(model, view) for view in range(len(cameras))]
     if not any(bool(alpha.any()) for _, alpha in drawn):
-        if any(bool(drawn_by(search.start, view)[1].any()) for view in range(len(cameras))):
+        if any(bool(rendered_by(search.start, view)[1].any()) for view in range(len(cameras))):
             raise ValueError(
                 f"{rasterizer.name}: its image must show Gaussians, shows the background alone where preset {claimed} "
                 "shows some; correct the rasterizer"
@@ -196,7 +198,7 @@ def crossval(
         models = {"the model at its conventions": model} if search.findings else {}
         models |= {f"preset {claimed}": search.start}  # and what else may be meant
         models |= {f"preset {name}": start for name, start in starts.items()}
-        comparison.views = with_errors(comparison, pictures, models, drawn_by)
+        comparison.views = with_errors(comparison, pictures, models, rendered_by)
     not_offered = {k: "its image has no gradient of them" for k in MOTIONS if k in raw and k not in comparison.groups}
     if channels:
         wide, reason = _wide_gradients(case, model, comparison, channels, seed, functools.partial(ties_of, model))
@@ -207,7 +209,7 @@ def crossval(
     exact = ReferenceModel(RenderSettings.preset("exact", background=background))
     images = []
     for picture, (same, _), camera in zip(pictures, drawn, cameras, strict=True):
-        true, _ = _drawn(exact, raw, camera, False)
+        true, _ = _rendered(exact, raw, camera, False)
         images.append({"rasterizer": picture.numpy(), "model": same.numpy(), "exact": true.numpy()})
     return Result(report, images, comparison.groups, comparison.views, search.findings, model, g, cameras)
 
@@ -338,7 +340,7 @@ def _legal(name: str, fields: dict) -> dict:
     return fields
 
 
-def _drawn(model: ReferenceModel, raw: dict, camera: Camera, oracle: bool) -> tuple[torch.Tensor, torch.Tensor]:
+def _rendered(model: ReferenceModel, raw: dict, camera: Camera, oracle: bool) -> tuple[torch.Tensor, torch.Tensor]:
     with torch.no_grad():  # images alone are compared
         image, alpha = model.draw(raw, camera, oracle)
     return image.cpu(), alpha.cpu()
@@ -363,12 +365,12 @@ def crops(g: Gaussians, cameras: list[Camera], settings: RenderSettings) -> tupl
     """
     drawn = []
     for camera in cameras:
-        image, visible = _drawn_by_us(g, camera, settings)
+        image, visible = _rendered_by_drgs(g, camera, settings)
         if bool(visible.any()):
             drawn.append((camera, image))
     if not drawn:
         raise ValueError("crossval: the cameras must show Gaussians, none of them shows any; choose others")
-    for side in _SIDES:
+    for side in _CROP_SIDES:
         parts = []
         places = []
         in_crops = []
@@ -377,7 +379,7 @@ def crops(g: Gaussians, cameras: list[Camera], settings: RenderSettings) -> tupl
             x, y = _most_varied(image, width, height)
             parts.append(cropped(camera, x, y, width, height))
             places.append(Crop(x, y, width, height, [camera.width, camera.height]))
-            in_crops.append(_drawn_by_us(g, parts[-1], settings)[1])
+            in_crops.append(_rendered_by_drgs(g, parts[-1], settings)[1])
         if max(int(x.sum()) for x in in_crops) * side**2 <= _CROP_PAIRS:
             break
     index = torch.nonzero(torch.stack(in_crops).any(0))[:, 0]
@@ -386,7 +388,7 @@ def crops(g: Gaussians, cameras: list[Camera], settings: RenderSettings) -> tupl
     return Gaussians(**fields, origin=g.origin), parts, places
 
 
-def _drawn_by_us(g: Gaussians, camera: Camera, settings: RenderSettings) -> tuple[torch.Tensor, torch.Tensor]:
+def _rendered_by_drgs(g: Gaussians, camera: Camera, settings: RenderSettings) -> tuple[torch.Tensor, torch.Tensor]:
     """(H, W, 4) color and alpha, and (N,) bool: what is seen."""
     with torch.no_grad():  # a crop's place has no derivative
         out = render(g, camera, settings, outputs=("visibility",))
@@ -399,11 +401,11 @@ def _most_varied(image: torch.Tensor, width: int, height: int) -> tuple[int, int
     x = image.double().permute(2, 0, 1)[None]  # the difference of two squares cancels in float32 where little varies
 
     def mean(values: torch.Tensor) -> torch.Tensor:
-        return torch.nn.functional.avg_pool2d(values, (height, width), stride=_STEP)
+        return torch.nn.functional.avg_pool2d(values, (height, width), stride=_CROP_STEP)
 
     variance = (mean(x * x) - mean(x) ** 2).sum(1)[0]
     row, column = divmod(int(variance.argmax()), variance.shape[1])
-    return _STEP * column, _STEP * row
+    return _CROP_STEP * column, _CROP_STEP * row
 
 
 # ------------------------------------------------------------------------- images of many channels
@@ -449,7 +451,7 @@ def _wide_gradients(
     except Exception as error:  # whatever a function raises that knows three channels only
         return {}, f"it draws no image of {channels} channels: {one_line(error)}"
     wide = dataclasses.replace(case, raw=raw, cameras=[camera], background=black, first=0)
-    drawn = [_drawn(model, raw, camera, case.oracle)]
+    drawn = [_rendered(model, raw, camera, case.oracle)]
     wider = compared(wide, model, u, [picture], [alpha], drawn, lambda _: near_ties(case.first))
     right = [name for name, row in rgb.groups.items() if row.verdict == "agreement"]
     wider.groups = {name: row for name, row in wider.groups.items() if name == COLORS or name in right}

@@ -43,14 +43,16 @@ PATTERNS = {
 OFF = 1e-3
 """A pixel that differs by more is off."""
 _PLACES = ("border", "edges", "few pixels", "none")
-_FOUND = 0.9  # share of the squared error that a pattern must explain
-_AS_GOOD = 0.01  # share of the squared error: a simpler pattern that explains so little less is taken
-_SIDE = 0.1  # share of the width or height that a border is at most
-_STEEP = 0.1  # share of the pixels, those of the largest gradient
-_FEW = 0.05  # share of the pixels
-_SIGMAS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.25, 1.5, 2.0, 3.0)  # standard deviations of blurs, in pixels
-_MOVES = 20  # steps of the search for a shift, each about squares the error of the one before
-_MOVED = 1e-4  # pixels that the last of these steps moves something by
+# Shares are chosen by hand; tests/test_image_errors.py breaks images in each of these ways.
+_MIN_EXPLAINED = 0.9  # share of the squared error that a pattern must explain to be named
+_TIE = 0.01  # share of the squared error: of patterns that differ by less the simplest is taken
+_MAX_BORDER = 0.1  # share of the width or height that a border is at most
+_EDGE_SHARE = 0.1  # share of the pixels that count as edges, those of the largest gradient
+_FEW_PIXELS = 0.05  # share of the pixels that counts as few
+# standard deviations of the blurs that are tried, px
+_BLUR_SIGMAS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.25, 1.5, 2.0, 3.0)
+_MAX_SHIFT_STEPS = 20  # steps of Gauss-Newton for a shift, at most; each about squares the error of the one before
+_SHIFT_CONVERGED = 1e-4  # px: a smaller step ends them
 
 
 @dataclasses.dataclass(frozen=True)
@@ -177,8 +179,8 @@ def pattern_of(
         return Pattern("none", "no error where pixels count", math.nan)
     patterns = sorted(_changes(case), key=lambda pattern: list(PATTERNS).index(pattern.name))
     best = max(pattern.explained for pattern in patterns)
-    if best >= _FOUND:
-        return next(pattern for pattern in patterns if pattern.explained >= best - _AS_GOOD)
+    if best >= _MIN_EXPLAINED:
+        return next(pattern for pattern in patterns if pattern.explained >= best - _TIE)
     return _place(case) or Pattern("none", "no known pattern", math.nan)
 
 
@@ -257,7 +259,7 @@ def _moves(case: _Case) -> Iterator[tuple]:
         ends = []
         for start in ((0.0, 0.0, 0.0), (far_x, far_y, 0.0)):
             move = np.array(start)
-            for _ in range(_MOVES):
+            for _ in range(_MAX_SHIFT_STEPS):
                 changed, known = _moved(case.right, move)
                 use = case.counts & known
                 if not use.any():
@@ -269,7 +271,7 @@ def _moves(case: _Case) -> Iterator[tuple]:
                 right = table @ (case.wrong - changed)[use].ravel()
                 step = np.linalg.lstsq(square, right, rcond=None)[0].clip(-2, 2)  # of a flat image no move is best
                 move[:count] += step
-                if np.abs(step * (1, 1, max(width, height))[:count]).max() < _MOVED:
+                if np.abs(step * (1, 1, max(width, height))[:count]).max() < _SHIFT_CONVERGED:
                     break
             move[:2] = move[:2].clip(-width, width)  # a search that diverged stays in numbers that can be warped by
             changed, known = _moved(case.right, move)
@@ -299,7 +301,7 @@ def _moved(image: np.ndarray, move: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def _blurs(case: _Case) -> Iterator[tuple]:
-    for sigma in _SIGMAS:
+    for sigma in _BLUR_SIGMAS:
         blurred = cv2.GaussianBlur(case.right, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
         yield "blur", f"blurred by {sigma:g} pixels", blurred
 
@@ -322,19 +324,21 @@ def _place(case: _Case) -> Pattern | None:
     sides = {"left": (1, 1), "right": (1, -1), "top": (0, 1), "bottom": (0, -1)}
     for side, (axis, way) in sides.items():
         along = np.cumsum(error.sum(1 - axis)[::way]) / total
-        depth = int(np.searchsorted(along, _FOUND)) + 1
-        if depth <= max(1, _SIDE * len(along)):
+        depth = int(np.searchsorted(along, _MIN_EXPLAINED)) + 1
+        if depth <= max(1, _MAX_BORDER * len(along)):
             share = float(along[depth - 1])
             return Pattern("border", f"but off along its {side} side: {share:.0%} of the error is there", share)
     few = np.sort(error[case.counts])[::-1]
-    share = min(1.0, float(few[: max(1, int(_FEW * len(few)))].sum() / total))  # of sums in another order
-    if share >= _FOUND:
-        return Pattern("few pixels", f"but off in few pixels: {_FEW:.0%} of them have {share:.0%} of the error", share)
+    share = min(1.0, float(few[: max(1, int(_FEW_PIXELS * len(few)))].sum() / total))  # of sums in another order
+    if share >= _MIN_EXPLAINED:
+        return Pattern(
+            "few pixels", f"but off in few pixels: {_FEW_PIXELS:.0%} of them have {share:.0%} of the error", share
+        )
     steep = sum((x**2).sum(-1) for x in np.gradient(case.right, axis=(0, 1)))
-    edges = steep >= np.quantile(steep[case.counts], 1 - _STEEP)
+    edges = steep >= np.quantile(steep[case.counts], 1 - _EDGE_SHARE)
     share = float(error[edges].sum() / total)
-    if share >= _FOUND:
-        what = f"but off at edges: the steepest {_STEEP:.0%} of its pixels have {share:.0%} of the error"
+    if share >= _MIN_EXPLAINED:
+        what = f"but off at edges: the steepest {_EDGE_SHARE:.0%} of its pixels have {share:.0%} of the error"
         return Pattern("edges", what, share)
     return None
 

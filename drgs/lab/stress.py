@@ -34,7 +34,7 @@ __all__ = ["BOUNDS", "StressRow", "Truth", "row_of", "refused", "rows", "truth_o
 BOUNDS = {"image": 1e-5, "gradient": 1e-4, "forward": 1e-4, "duality": 1e-4, "fisher": 1e-4}
 """What `exact` claims; every case here is held to it, whatever its settings, but where `bvh` rounds or warns."""
 
-_DENSE = 3_000_000  # pixels^2 x Gaussians: the dense Jacobian of that takes the oracle a few seconds
+_MAX_DENSE_ENTRIES = 3_000_000  # pixels^2 x Gaussians: the dense Jacobian of that takes the oracle a few seconds
 _ROUNDING = 8 * 6e-8  # rounding of `bvh`, times distance / smallest sigma: docs/numerics.md
 
 _CRITERIA = ("logdet", "eig", "trace_cov")
@@ -126,7 +126,7 @@ def truth_of(case: ExtremeCase) -> Truth:
     view = cam
     remark = ""
     whole = settings.culling == "extent" and settings.fov_clamp == "none"
-    most = math.isqrt(_DENSE // max(len(g), 1)) if whole else good.numel()
+    most = math.isqrt(_MAX_DENSE_ENTRIES // max(len(g), 1)) if whole else good.numel()
     if not good.all() and not whole:
         remark = "no Fisher error: some pixels are near a tie, and clamp and culling make a part another image"
         return Truth(g, cam, oracle, None, {}, remark)

@@ -74,7 +74,7 @@ __all__ = [
 CLOCKS = ("forward", "forward_backward", "fisher")
 """What is timed: an image; an image and its gradients; the Fisher diagonal of a view."""
 
-_UNSEEN = 1e-6  # share of the largest group, and of a diagonal's largest entry: smaller ones have no relative error
+_NEGLIGIBLE = 1e-6  # share of the largest group, and of a diagonal's largest entry: smaller ones have no relative error
 
 
 # ------------------------------------------------------------------------------------------------------ which settings
@@ -261,7 +261,7 @@ class InformationError:
 def _compared(sizes: dict[str, float]) -> list[str]:
     """Groups that have a relative error: rotating spheres changes nothing, and rounding would look like an error."""
     # Means have a unit, the others do not.
-    least = _UNSEEN**2 * max((x for name, x in sizes.items() if name != "means"), default=0.0)
+    least = _NEGLIGIBLE**2 * max((x for name, x in sizes.items() if name != "means"), default=0.0)
     return [name for name, x in sizes.items() if x > (0.0 if name == "means" else least)]
 
 
@@ -414,7 +414,7 @@ USES = {
 }
 """Use -> the time that counts, and the errors that must be within the budget."""
 
-_SURE = 0.05  # two-sided; of the interval, by the sign test
+_SIGNIFICANCE = 0.05  # two-sided level of the interval of a time ratio (sign test): 95 %, the usual one
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -468,7 +468,7 @@ def interval(ratios: Sequence[float]) -> Interval | None:
     n = len(ratios)
     k = 0
     tail = 0.5 ** len(ratios)
-    while 2 * (tail + math.comb(n, k + 1) * 0.5**n) <= _SURE:
+    while 2 * (tail + math.comb(n, k + 1) * 0.5**n) <= _SIGNIFICANCE:
         k += 1
         tail += math.comb(n, k) * 0.5**n
     return Interval(ratio=statistics.median(x), low=x[k], high=x[-1 - k], rounds=n)
@@ -546,11 +546,12 @@ _Result = TypeVar("_Result")
 
 # ------------------------------------------------------------------------------------------------------------ measuring
 
-_SECONDS = 100.0  # rounds end after so many of the clock or, where others use the machine, of the processor
-_AT_LEAST = 3  # rounds, before which they do not end: fewer have no middle
-_RAYS = 200  # rays of a sample on Mitsuba's traversal, where a whole view without cut-offs takes minutes
-_PAIRS = 6_000_000  # (ray, Gaussian) pairs of the oracle's sample: 10 s
-_NOTHING = 1e-6  # alpha of a view that shows nothing
+# seconds after which no further round begins: of the clock or, where others use the machine, of the processor. Chosen
+_ROUNDS_SECONDS = 100.0
+_MIN_ROUNDS = 3  # rounds of timing, at least: fewer have no median
+_BVH_RAYS = 200  # rays of a sample on Mitsuba's traversal, where a whole view without cut-offs takes minutes
+_ORACLE_PAIRS = 6_000_000  # (ray, Gaussian) pairs of the oracle's sample: 10 s
+_EMPTY_ALPHA = 1e-6  # largest alpha of a view that shows nothing
 
 
 def measure(
@@ -593,7 +594,7 @@ def measure(
     for number in range(max(repeats, len(cameras) - 1) + 1):
         timed = 1 <= number <= repeats
         spent = min(time.perf_counter() - began[0], time.process_time() - began[1])
-        if number >= len(cameras) and done >= _AT_LEAST and spent > _SECONDS:
+        if number >= len(cameras) and done >= _MIN_ROUNDS and spent > _ROUNDS_SECONDS:
             break
         truth.measure(number, timed)
         if number == 0:
@@ -660,7 +661,7 @@ class _Setup:
     def image(self, g: Gaussians, camera: Camera, settings: RenderSettings, share: float) -> torch.Tensor:
         """(H, W, 3), whatever the share of its resolution that is rendered."""
         out = render(g, by_share(camera, share), settings, outputs=())
-        self.shown = self.shown or bool(out.alpha.detach().amax() > _NOTHING)  # a yes or no has no derivative
+        self.shown = self.shown or bool(out.alpha.detach().amax() > _EMPTY_ALPHA)  # a yes or no has no derivative
         if share == 1:
             return out.rgb
         size = (camera.height, camera.width)
@@ -767,7 +768,7 @@ class _Measurement:
             y = truth.information[name]
             a, b = self.diagonals.get(name, (0.0, 0.0))
             self.diagonals[name] = a + float((x - y).abs().sum()), b + float(y.sum())
-            known = y > _UNSEEN * y.max()
+            known = y > _NEGLIGIBLE * y.max()
             if bool(known.any()):
                 self.medians.setdefault(name, []).append(float(((x - y).abs()[known] / y[known]).median()))
 
@@ -801,7 +802,7 @@ def _sampled(rows: list[TradeoffRow], setup: _Setup, truth: _Measurement, seed: 
     for row in rows:
         if row.skipped is not None or row.by == "view":
             continue
-        count_of_rays = _RAYS if row.by == "rays" else max(32, min(_RAYS, _PAIRS // count))
+        count_of_rays = _BVH_RAYS if row.by == "rays" else max(32, min(_BVH_RAYS, _ORACLE_PAIRS // count))
         chosen = places[:count_of_rays].sort().values
         try:
             errors = _by_rays(row, setup, truth, chosen)
@@ -924,9 +925,9 @@ def _clock_name() -> str:
 
 # ------------------------------------------------------------------------------------- views as large as they are drawn
 
-_ROUNDS = 3  # rounds that say how much times scatter
-_FORWARD = 0.6  # share of the seconds for images, which is what is drawn at full size
-_GROW = 4  # times as many pixels are tried next, on the way to full size
+_FULL_SIZE_ROUNDS = 3  # rounds at full size: the fewest that show how times scatter
+_FORWARD_SHARE = 0.6  # share of the seconds for images, the rest for gradients and information; chosen
+_PIXEL_GROWTH = 4  # times as many pixels are tried next, on the way to full size; chosen
 
 
 @dataclasses.dataclass(frozen=True)
@@ -980,7 +981,7 @@ def measure_full(
     drawn = [cameras[0].width, cameras[0].height]
     for k, (clock, names) in enumerate(chosen.items()):
         work = _Work(clock, gaussians, seed)
-        share = seconds * (_FORWARD if clock == "forward" and len(chosen) > 1 else 1 / (len(chosen) - k))
+        share = seconds * (_FORWARD_SHARE if clock == "forward" and len(chosen) > 1 else 1 / (len(chosen) - k))
         # What a round takes, in units of exact's time: at full size the others take a smaller share of it, if any.
         units = 1 + sum(rows[name].times[clock].ratio for name in names)
         views, spent = _sized(work, cameras, exact, measured.pixels, share, units, say)
@@ -989,7 +990,7 @@ def measure_full(
             report[clock] = FullSize(None, drawn, 0, [])
             continue
         took: dict[str, list[float]] = {name: [] for name in (exact.name, *names)}
-        for number in range(max(repeats, _ROUNDS)):
+        for number in range(max(repeats, _FULL_SIZE_ROUNDS)):
             a_round = sum(x[-1] for x in took.values()) if number else 0.0
             if number and spent + a_round > share:
                 break
@@ -1001,7 +1002,7 @@ def measure_full(
         seconds = max(seconds - spent, 0.0)
         for name, times in took.items():
             ratios = interval([a / b for a, b in zip(times, took[exact.name], strict=True)])
-            if ratios.rounds < _ROUNDS and name != exact.name:
+            if ratios.rounds < _FULL_SIZE_ROUNDS and name != exact.name:
                 ratios = _widened(ratios, measured.scatter[clock])
             rows[name].full[clock] = FullTime(**dataclasses.asdict(ratios), seconds=statistics.median(times))
         report[clock] = FullSize([views[0].width, views[0].height], drawn, len(took[exact.name]), list(took))
@@ -1067,8 +1068,8 @@ def _sized(
         spent += took
         # Time grows with the pixels at most. What is tried on the way is spent, too.
         fits = pixels * (seconds - spent) / (units * took)
-        following = min(whole, _GROW * pixels)
-        if following * _GROW >= fits or following >= whole:
+        following = min(whole, _PIXEL_GROWTH * pixels)
+        if following * _PIXEL_GROWTH >= fits or following >= whole:
             break
         pixels = following
     return [at_most(camera, int(min(whole, fits))) for camera in cameras if fits >= least], spent

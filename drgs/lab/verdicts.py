@@ -156,10 +156,12 @@ class GroupRow:
 
 # ------------------------------------------------------------------------------------------------------------- verdicts
 
-_FEW = 0.01  # share of the pixels: so few that are off hang on a cut-off or on the order, and are left out
-_IMAGE = 1e-3  # RMS of images that agree
-_ENOUGH = 3  # converged differences that a verdict needs
-_OWN = 0.02  # relative difference from its own central differences that is a bug
+# Chosen; benchmarks/crossval_broken.json has the verdicts with them on rasterizers that were broken on purpose.
+# share of the pixels: if so few are off, a cut-off or the order decided them, and they are left out
+_MAX_PIXELS_OFF = 0.01
+_IMAGE_TOLERANCE = 1e-3  # RMS difference of images that agree, colors in [0, 1]
+_MIN_CONVERGED = 3  # central differences that have converged, which a verdict needs
+_BUG_TOLERANCE = 0.02  # relative difference of a gradient from the rasterizer's own central differences that is a bug
 
 
 @dataclasses.dataclass(frozen=True)
@@ -288,7 +290,7 @@ def judge(case: Case, model: ReferenceModel, compared: Compared) -> None:
     """Give every group that differs its verdict."""
     rasterizer, agrees, groups = case.rasterizer, compared.agrees, compared.groups
     if agrees:
-        _known(case, model, compared)
+        _explain_by_known_choices(case, model, compared)
     names = [name for name, row in groups.items() if row.verdict is None]
     if names and isinstance(rasterizer, Rasterizer):
         case.say("central differences")
@@ -352,7 +354,7 @@ def with_errors(
 
 def _is_same(row: ViewRow) -> bool:
     """Whether a view's image is the model's."""
-    return row.rms <= _IMAGE and row.share <= _FEW
+    return row.rms <= _IMAGE_TOLERANCE and row.share <= _MAX_PIXELS_OFF
 
 
 def _image_row(camera: Camera, image: torch.Tensor, alpha: torch.Tensor, drawn: tuple, counts: torch.Tensor) -> ViewRow:
@@ -411,7 +413,7 @@ def _group_row(theirs: torch.Tensor | None, ours: torch.Tensor, tolerance: float
     )
 
 
-def _known(case: Case, model: ReferenceModel, compared: Compared) -> None:
+def _explain_by_known_choices(case: Case, model: ReferenceModel, compared: Compared) -> None:
     """Explain what documented choices explain: the fewest of them that settle most groups."""
     groups, theirs = compared.groups, compared.theirs
     open_ones = [name for name, row in groups.items() if row.verdict is None and theirs[name] is not None]
@@ -452,7 +454,7 @@ def _decide(case: Case, model: ReferenceModel | None, compared: Compared, names:
         there = torch.zeros_like(raw[name]) if kept[name] is None else kept[name]
         row = _own_row(there, None if expected is None else expected[name], own, name)
         groups[name].differences = row
-        if len(own.entries[name]) < _ENOUGH:
+        if len(own.entries[name]) < _MIN_CONVERGED:
             groups[name].settle("undecided", f"{row.left_out} of its differences did not converge")
         elif row.bug:
             groups[name].settle("gradient bug", row.what)
@@ -480,7 +482,7 @@ def _own_row(gradient: torch.Tensor, expected: torch.Tensor | None, own: Differe
     ratios = there[values.abs() > 3 * bars] / values[values.abs() > 3 * bars]
     ratio = float(ratios.median()) if len(ratios) else float("nan")
     spread = float((ratios - ratio).abs().median()) if len(ratios) else float("nan")
-    bug = error > _OWN * size + 3 * noise
+    bug = error > _BUG_TOLERANCE * size + 3 * noise
     if expected is not None:  # a small error, too, if the differences clearly side with the model
         other = float((expected.reshape(-1)[own.entries[name]] - values).norm())
         bug |= error > 3 * max(noise, other)
@@ -506,11 +508,14 @@ def _own_row(gradient: torch.Tensor, expected: torch.Tensor | None, own: Differe
 
 # -------------------------------------------------------------------------------------------------- central differences
 
-_STEPS = 4  # each half of the one before
-_FIRST = {torch.float64: 2e-3, torch.float32: 1.6e-2}  # first step, in units of what changes the image by its own size
-_EPS = {torch.float64: 1e-9, torch.float32: 2e-7}  # rounding of an image, of float32 renderers in general
-_KEPT = 0.5  # share of the pixels that an entry changes which must be kept
-_JUMP = 0.05  # share of the largest slope that no smooth change of half a step reaches
+_STEP_COUNT = 4  # steps of central differences, each half of the one before
+# first step, in units of the change of a parameter that changes the image by its own norm
+_FIRST_STEP = {torch.float64: 2e-3, torch.float32: 1.6e-2}
+# relative rounding of an image, as renderers of that precision have it
+_IMAGE_ROUNDING = {torch.float64: 1e-9, torch.float32: 2e-7}
+# share of the pixels that an entry changes which must be kept for its difference to count; chosen
+_MIN_PIXELS_KEPT = 0.5
+_JUMP_SHARE = 0.05  # share of the largest slope that no smooth change over half a step reaches; chosen
 
 
 @dataclasses.dataclass(frozen=True)
@@ -554,7 +559,7 @@ def central(
     slopes: dict[str, list[list[torch.Tensor]]] = {}
     steps: dict[str, list[list[float]]] = {}
     kept = torch.ones(cotangent.shape[:2], dtype=torch.bool)
-    noise = noise or _EPS[rasterizer.dtype]
+    noise = noise or _IMAGE_ROUNDING[rasterizer.dtype]
     for group, indices in entries.items():
         slopes[group] = []
         steps[group] = []
@@ -562,7 +567,7 @@ def central(
             differences, used = _slopes(rasterizer, raw, camera, background, group, index)
             largest = max(float(x.abs().max()) for x in differences)
             for a, b, h in zip(differences, differences[1:], used[1:], strict=False):
-                kept &= ~((a - b).abs() > _JUMP * largest + 8 * noise / h).any(-1)
+                kept &= ~((a - b).abs() > _JUMP_SHARE * largest + 8 * noise / h).any(-1)
             slopes[group].append(differences)
             steps[group].append(used)
     weight = cotangent * kept[..., None]
@@ -574,7 +579,7 @@ def central(
             sums = [float((weight * x).sum()) for x in differences]
             changed = differences[-1] != 0
             touched = int((changed & kept[..., None]).sum())
-            if touched < _KEPT * int(changed.sum()):  # what is left says nothing about this entry
+            if touched < _MIN_PIXELS_KEPT * int(changed.sum()):  # what is left says nothing about this entry
                 left_out[group] += 1
                 continue
             # Each pixel's rounding is divided by the step; random signs add up as a square root.
@@ -599,9 +604,9 @@ def _slopes(
     rasterizer: Rasterizer, raw: dict, camera: Camera, background: tuple, group: str, index: int
 ) -> tuple[list[torch.Tensor], list[float]]:
     """(I(+h) - I(-h)) / 2h for each step, as (H, W, 3), and the steps as they were after rounding."""
-    first = _FIRST[rasterizer.dtype] * _unit(raw, camera, group, index)
+    first = _FIRST_STEP[rasterizer.dtype] * _unit(raw, camera, group, index)
     found, used = [], []
-    for k in range(_STEPS):
+    for k in range(_STEP_COUNT):
         images, places = [], []
         for sign in (1, -1):
             moved = dict(raw)
@@ -649,7 +654,7 @@ def _extrapolated(sums: list[float], bars: list[float]) -> tuple[float | None, f
         if best is None or error < best[1]:
             best = value, error, k
     value, error, k = best
-    # An error of 1e-3 is far below what is a bug (verdicts._OWN).
+    # An error of 1e-3 is far below what is a bug (verdicts._BUG_TOLERANCE).
     if error <= 1e-3 * abs(value) or all(gap <= 4 * bar for gap, bar in zip(gaps, bars[1:], strict=True)):
         return value, error  # settled, or below rounding on all steps
     # A gap of 0 has a logarithm, too, far from 2.

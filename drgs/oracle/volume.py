@@ -24,14 +24,14 @@ from drgs.settings import EPS_ALPHA, RenderSettings
 
 __all__ = ["Volume", "render_volume"]
 
-_CUT = 1e-12  # optical depth on a ray below which a Gaussian is left out of it
-_INSIDE = 1e-16  # optical depth inside an interval that is taken for 0
-_FAR = 8.5  # sigma; beyond lies 1e-17 of a Gaussian
-_COARSE = 4.0  # sigma; intervals start no longer than this
-_SHORT = 1e-12  # relative to t: thinner Gaussians have no room between neighboring float64 numbers
-_ROUNDS = 200  # halvings; 60 take the largest interval to the smallest
-_RAYS = 64  # at once
-_PAIRS = 1 << 21  # (node, Gaussian) pairs at once: about 0.15 GB of intermediates
+_MIN_OPTICAL_DEPTH = 1e-12  # optical depth on a ray below which a Gaussian is left out of it
+_NEGLIGIBLE_DEPTH = 1e-16  # optical depth inside an interval that is taken for 0
+_SUPPORT_SIGMA = 8.5  # sigma; beyond lies 1e-17 of a Gaussian
+_INTERVAL_SIGMA = 4.0  # sigma; intervals start no longer than this
+_MIN_SIGMA = 1e-12  # relative to t: thinner Gaussians have no room between neighboring float64 numbers
+_MAX_HALVINGS = 200  # halvings; 60 take the largest interval to the smallest
+_RAYS_AT_ONCE = 64  # rays at once; bounds memory
+_PAIRS_AT_ONCE = 1 << 21  # (node, Gaussian) pairs at once: about 0.15 GB of intermediates
 
 # QUADPACK's pair of 10-point Gauss and 21-point Kronrod rules (Piessens et al. 1983), nodes >= 0 on [-1, 1].
 _NODES = (
@@ -156,15 +156,23 @@ def render_volume(
             assert scene.near_margin is not None  # `cull_near` has set it
             scene = scene.take(scene.near_margin > 0)
     # What can be left out, and where to sum, are choices without a derivative.
-    reach = (2 * torch.log((scene.softplus.detach() / _CUT).clamp(min=1))).sqrt()
+    reach = (2 * torch.log((scene.softplus.detach() / _MIN_OPTICAL_DEPTH).clamp(min=1))).sqrt()
     keep = within(scene, reach, view.origins, view.directions)
     scene = scene.take(keep)
     reach = reach[keep]
     if s.sh_direction == "gaussian" and view.center is not None:
         scene = scene.colored(view.center)
     parts = [
-        _chunk(scene, reach, s, view.origins[i : i + _RAYS], view.directions[i : i + _RAYS], tolerance, split)
-        for i in range(0, max(len(view.directions), 1), _RAYS)
+        _chunk(
+            scene,
+            reach,
+            s,
+            view.origins[i : i + _RAYS_AT_ONCE],
+            view.directions[i : i + _RAYS_AT_ONCE],
+            tolerance,
+            split,
+        )
+        for i in range(0, max(len(view.directions), 1), _RAYS_AT_ONCE)
     ]
     fields: dict[str, Any] = {}
     for name in parts[0]:
@@ -182,7 +190,7 @@ def _chunk(
     with torch.no_grad():  # which ones are used, and in which order, has no derivative
         tau, t, slope = _meet(scene, index.expand(len(o), -1), o, d)
         ahead = tau * _phi(t * slope)
-        used = ahead > _CUT
+        used = ahead > _MIN_OPTICAL_DEPTH
         left_out = torch.where(used, 0.0, ahead).sum(1)
         M = int(used.sum(1).max()) if used.numel() else 0
         # Those that are used, nearest first, padded with others that get tau = 0.
@@ -250,7 +258,7 @@ def _meet(scene: OracleScene, index: Tensor, o: Tensor, d: Tensor) -> tuple[Tens
     rho2 = torch.linalg.cross(local, step).square().sum(-1) / length2
     tau = scene.softplus[index] * torch.exp(-rho2 / 2)
     # Where to widen is a choice; 1e-300 keeps the quotient finite for a peak at the origin.
-    return tau, t, torch.minimum(length2.sqrt(), 1 / (_SHORT * t.detach().abs()).clamp(min=1e-300))
+    return tau, t, torch.minimum(length2.sqrt(), 1 / (_MIN_SIGMA * t.detach().abs()).clamp(min=1e-300))
 
 
 def _plan(line: _Line, tolerance: float) -> tuple:
@@ -258,17 +266,17 @@ def _plan(line: _Line, tolerance: float) -> tuple:
     rays = len(line.tau)
     error = torch.zeros(rays, dtype=torch.float64)
     nodes = torch.zeros(rays, dtype=torch.int64)
-    last = torch.where(line.tau > 0, line.t + _FAR / line.slope, 0.0)
+    last = torch.where(line.tau > 0, line.t + _SUPPORT_SIGMA / line.slope, 0.0)
     b = last.amax(1) if last.numel() else torch.zeros(rays, dtype=torch.float64)
     ray = torch.nonzero(b > 0)[:, 0]
     b = b[ray]
     a = torch.zeros(len(ray), dtype=torch.float64)
     accepted = [(ray[:0], a[:0], a[:0])]
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_HALVINGS):
         if not len(ray):
             break
         again = []
-        step = max(1, _PAIRS // line.tau.shape[1])
+        step = max(1, _PAIRS_AT_ONCE // line.tau.shape[1])
         for part in (slice(i, i + step) for i in range(0, len(ray), step)):
             r, low, high = ray[part], a[part], b[part]
             h = high - low
@@ -281,7 +289,7 @@ def _plan(line: _Line, tolerance: float) -> tuple:
             error.index_add_(0, r[nothing], weight[nothing])
             # The others add less than a hundredth of the tolerance each.
             matters = inside * front[:, None] > 1e-2 * tolerance * weight[:, None]
-            coarse = (matters & (h[:, None] * line.slope[r] > _COARSE)).any(1)
+            coarse = (matters & (h[:, None] * line.slope[r] > _INTERVAL_SIGMA)).any(1)
             final = h <= 1e-15 * high  # a few float64 numbers long: no use in halving
             look = torch.nonzero(~nothing & (~coarse | final))[:, 0]
             bad = ~nothing & coarse & ~final
@@ -314,11 +322,11 @@ def _batches(
     line: _Line, ray: Tensor, a: Tensor, h: Tensor, inside: Tensor | None = None
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Yields (index into the intervals, (Q, A) the Gaussians that change T within them, -1 where fewer)."""
-    step = max(1, _PAIRS // max(line.tau.shape[1], 1))
+    step = max(1, _PAIRS_AT_ONCE // max(line.tau.shape[1], 1))
     for i in range(0, len(ray), step):
         part = slice(i, i + step)
         depths = _depths(line, ray[part], a[part], h[part])[1] if inside is None else inside[part]
-        counts, order = (depths > _INSIDE).sum(1).sort()
+        counts, order = (depths > _NEGLIGIBLE_DEPTH).sum(1).sort()
         first = 0
         # Intervals with few Gaussians apart from those with many: the product of both sizes is the cost.
         while first < len(order):
@@ -326,13 +334,13 @@ def _batches(
             chosen = order[first : first + _size(most)]
             most = max(int(counts[first : first + len(chosen)].max()), 1)
             largest = depths[chosen].topk(most, dim=1)
-            yield i + chosen, torch.where(largest.values > _INSIDE, largest.indices, -1)
+            yield i + chosen, torch.where(largest.values > _NEGLIGIBLE_DEPTH, largest.indices, -1)
             first += len(chosen)
 
 
 def _size(count: int | Tensor) -> int:
     """Intervals at once where each has so many Gaussians."""
-    return max(1, _PAIRS // (4 * len(_NODES) * max(int(count), 8)))
+    return max(1, _PAIRS_AT_ONCE // (4 * len(_NODES) * max(int(count), 8)))
 
 
 def _integrate(

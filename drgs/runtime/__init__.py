@@ -168,7 +168,7 @@ def _take_over() -> None:
 # the garbage collector does not run by itself while something is computed, and nothing is computed while it runs.
 
 _is_paused = False  # the garbage collector, by a computation
-_COLLECTS = 10.0  # seconds, at most, that the garbage collector waits for the thread that computes
+_COLLECT_SECONDS = 10.0  # seconds, at most, that the garbage collector waits for the thread that computes
 
 
 @contextlib.contextmanager
@@ -195,7 +195,7 @@ class _Collector:
     def __call__(self, phase: str, info: Any) -> None:
         """Take what a computation takes, and give it back."""
         if phase == "start":
-            self._is_alone = _computing.acquire(timeout=_COLLECTS)
+            self._is_alone = _computing.acquire(timeout=_COLLECT_SECONDS)
         elif self._is_alone:
             self._is_alone = False
             _computing.release()
@@ -263,8 +263,8 @@ def setup(variant: str | None = None, threads: int | None = None) -> Backend:
     """
     global _active, _owner
     _refuse_fork()
-    wanted = _wanted_variant(variant)
-    count = _wanted_threads(threads)
+    wanted = _requested_variant(variant)
+    count = _requested_threads(threads)
     if wanted == "llvm_ad_rgb" and "drjit" not in sys.modules:
         require_llvm()
     prepare()
@@ -307,7 +307,7 @@ def thread_count() -> int:
     """Threads that other libraries should take: those of the backend if there is one, else DRGS_THREADS, else every
     core that this process may use.
     """
-    return _active.threads if _active else _wanted_threads(None) or _usable_cores()
+    return _active.threads if _active else _requested_threads(None) or _usable_cores()
 
 
 def backend() -> Backend:
@@ -456,7 +456,7 @@ def info() -> dict:
     return report
 
 
-def _wanted_variant(variant: str | None) -> str | None:
+def _requested_variant(variant: str | None) -> str | None:
     """The variant asked for by argument, by Mitsuba's current one or by environment; None: auto."""
     where = "setup: variant"
     if variant in (None, "auto") and "mitsuba" in sys.modules:
@@ -472,7 +472,7 @@ def _wanted_variant(variant: str | None) -> str | None:
     return variant
 
 
-def _wanted_threads(threads: int | None) -> int | None:
+def _requested_threads(threads: int | None) -> int | None:
     """The number asked for by argument or by environment; None: as many as there are cores."""
     where = "setup: threads"
     text = typing.cast("int | str | None", threads)

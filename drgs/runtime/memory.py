@@ -12,10 +12,10 @@ __all__ = ["PAIR", "PICTURES", "TANGENT", "available", "frame_bytes", "is_out_of
 # alpha and depth of 1,000 Gaussians), divided by its pixels; the constants are the least of them. Tiles: 61 to 67 bytes
 # a pixel in the order of centers, in that of rays as much and their rows; bvh: 156 to 172; gradients: 54 to 61 more.
 # Lists of Gaussians, rows (128 MB at a time) and kernels come on top, hence "at least".
-_TILES = 60
-_BVH = 155
-_GRADIENT = 50
-_FEATURE = 8
+_TILES_BYTES = 60
+_BVH_BYTES = 155
+_GRADIENT_BYTES = 50
+_FEATURE_BYTES = 8
 PICTURES = {"png": 12, "jpg": 12, "exr": 28, "webm": 90, "mp4": 90}
 """Bytes a pixel that writing a file of a format adds, measured in the same way."""
 TANGENT = 70
@@ -25,8 +25,9 @@ PAIR = 24
 _MEMINFO = Path("/proc/meminfo")
 _GROUP_OF = Path("/proc/self/cgroup")
 _GROUPS = Path("/sys/fs/cgroup")
-_OTHER = 256 << 20  # kernels, tensors of the Gaussians and whatever else a command holds
-_SMALL = 256 << 20  # of what needs less, nobody asks: looking costs more than it is worth
+_RESERVE_BYTES = 256 << 20  # bytes for kernels, tensors of the Gaussians and whatever else a command holds; chosen
+# bytes up to which free memory is not checked, because the check costs more than it is worth; chosen
+_UNCHECKED_BYTES = 256 << 20
 
 
 def frame_bytes(pixels: int, traversal: str, features: int = 0, gradients: bool = False) -> int:
@@ -38,8 +39,8 @@ def frame_bytes(pixels: int, traversal: str, features: int = 0, gradients: bool 
         features: Channels besides the colors.
         gradients: Whether it will be differentiated.
     """
-    each = _BVH if traversal == "bvh" else _TILES
-    return pixels * (each + _FEATURE * features + _GRADIENT * gradients)
+    each = _BVH_BYTES if traversal == "bvh" else _TILES_BYTES
+    return pixels * (each + _FEATURE_BYTES * features + _GRADIENT_BYTES * gradients)
 
 
 def require(where: str, needed: int, what: str, advice: str, cuda: bool = False) -> None:
@@ -52,13 +53,13 @@ def require(where: str, needed: int, what: str, advice: str, cuda: bool = False)
         advice: How it takes less.
         cuda: Ask for memory of the device, in place of the machine's.
     """
-    if needed < _SMALL:
+    if needed < _UNCHECKED_BYTES:
         return
     there = _device() if cuda else available()
-    if cuda and there is not None and needed + _OTHER > there:
+    if cuda and there is not None and needed + _RESERVE_BYTES > there:
         _release()
         there = _device()
-    if there is not None and needed + _OTHER > there:
+    if there is not None and needed + _RESERVE_BYTES > there:
         raise ValueError(
             f"{where}: there must be memory for {what}, which takes at least {_gigabytes(needed)}, "
             f"got {_gigabytes(max(there, 0))} available; {advice}"

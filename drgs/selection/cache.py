@@ -24,7 +24,7 @@ from drgs.information.sums import Information
 from drgs.io.json_files import check_json
 from drgs.selection.drift import Shapes, change_of_view
 
-__all__ = ["Cache", "NotKept", "ViewKey", "camera_key", "named_by", "size_of", "view_key"]
+__all__ = ["Cache", "NotCached", "ViewKey", "camera_key", "named_by", "size_of", "view_key"]
 
 _COLORS = "sh"  # whose information about base colors is the sum of w^2
 _OF_GAUSSIANS = (*GAUSSIAN_GROUPS, "coverage")
@@ -46,7 +46,7 @@ class ViewKey(NamedTuple):
     mask: Hashable
 
 
-class NotKept(Exception):  # noqa: N818  # no error: the caller does without the view
+class NotCached(Exception):  # noqa: N818  # no error: the caller does without the view
     """Nothing is kept of a view, and nothing is to be computed.
 
     Attributes:
@@ -58,7 +58,7 @@ class NotKept(Exception):  # noqa: N818  # no error: the caller does without the
         self.quantity = quantity
 
 
-class _Kept(NamedTuple):
+class _Entry(NamedTuple):
     """What was computed of a view, and with a bound the Gaussians that it is of."""
 
     computed: Information
@@ -94,7 +94,7 @@ class Cache:
         max_bytes: What is kept has no more; above it, what was used least recently goes.
         bound: The largest change of a view that is still used, in [0, 1]; None: nothing may change.
         computes: With a bound, whether views that have changed by more are to be computed anew. If not, what is kept is
-            used as it is, and `NotKept` is raised where nothing is.
+            used as it is, and `NotCached` is raised where nothing is.
         changes: Camera, as `camera_key` gives it -> largest change of what was used of it since this was emptied.
         forgot_saved: Whether what a file had was forgotten, because other quantities were looked for (`restore`).
         bytes: Bytes of all tensors that are kept now.
@@ -115,7 +115,7 @@ class Cache:
         must_be("Cache", "max_bytes", max_bytes, int, "bytes that may be kept, e.g. 1 << 30")
         if max_bytes < 0:
             raise ValueError(f"Cache: max_bytes must be at least 0, got {max_bytes}; 0 keeps nothing")
-        self._kept: OrderedDict[Hashable, _Kept] = OrderedDict()  # the one that was used last comes last
+        self._kept: OrderedDict[Hashable, _Entry] = OrderedDict()  # the one that was used last comes last
         self._lock = threading.RLock()  # several Python threads may select at a time
         self.max_bytes = max_bytes
         self.bound = bound
@@ -126,7 +126,7 @@ class Cache:
         self._state: _State | None = None  # of the scene, without a bound
         self._now: tuple[Scene | None, Shapes] | None = None  # with one: the scene, and what of it is compared
         self._cameras: dict[Hashable, Camera] = {}  # that are expected
-        self._seen: dict[Hashable, torch.Tensor] = {}  # camera -> (N,) how much of its image each Gaussian makes up
+        self._image_weights: dict[Hashable, torch.Tensor] = {}  # camera -> (N,) sum of w^2 of each Gaussian
         self.forgot_saved = False
         self._unclaimed: set[str] = set()  # quantities of a file that have not been looked for again
         # To the Gaussians as they are now: id of shapes -> (N,); key -> of its view.
@@ -147,7 +147,7 @@ class Cache:
         with self._lock:
             self.bytes = 0
             self._state = None
-            for kept in (self._kept, self._seen, self._changes, self._changes_of_views, self._unclaimed):
+            for kept in (self._kept, self._image_weights, self._changes, self._changes_of_views, self._unclaimed):
                 kept.clear()
 
     def find(self, scene: Scene, key: Hashable) -> Information | None:
@@ -157,7 +157,7 @@ class Cache:
             scene: The scene as it is now.
             key: All else that it depends on; with a bound, a `ViewKey`.
         Raises:
-            NotKept: If nothing is kept and nothing is to be computed.
+            NotCached: If nothing is kept and nothing is to be computed.
         """
         with self._lock:
             if isinstance(key, ViewKey):
@@ -166,7 +166,7 @@ class Cache:
             kept = self._kept.get(key)
             if isinstance(key, ViewKey) and self.bound is not None:
                 if kept is None and not self.computes:
-                    raise NotKept(key.quantity)
+                    raise NotCached(key.quantity)
                 if kept is not None and kept.shapes is not None:
                     change = self._change(key, kept.shapes)
                     if change > self.bound and self.computes:
@@ -190,13 +190,13 @@ class Cache:
             self.misses += 1
             if self.bound is None:
                 if self._state is not None and self._state.is_still(scene):
-                    self._store(key, _Kept(computed, None))
+                    self._store(key, _Entry(computed, None))
                 return
             self._compare(scene)
             if isinstance(key, ViewKey) and key.camera in self._cameras:
-                self._store(key, _Kept(computed, self._shapes()))
+                self._store(key, _Entry(computed, self._shapes()))
                 if key in self._kept and _COLORS in computed:
-                    self._seen[key.camera] = computed[_COLORS][:, 0].sum(-1).float()
+                    self._image_weights[key.camera] = computed[_COLORS][:, 0].sum(-1).float()
 
     def get(self, scene: Scene, key: Hashable, compute: Callable[[], Information]) -> Information:
         """What is kept under a key for this scene, else what `compute` returns, which is then kept."""
@@ -206,7 +206,7 @@ class Cache:
         self.keep(scene, key, computed)
         return computed
 
-    def _store(self, key: Hashable, kept: _Kept) -> None:
+    def _store(self, key: Hashable, kept: _Entry) -> None:
         """Keep something in place of what is there, and let go of what there is no room for."""
         self._forget(key)  # computed twice, by two calls at a time
         if (size := size_of(kept.computed)) > self.max_bytes:
@@ -225,10 +225,10 @@ class Cache:
         self._changes_of_views.pop(key, None)
         if (
             isinstance(key, ViewKey)
-            and key.camera in self._seen
+            and key.camera in self._image_weights
             and all(other.camera != key.camera for other in self._views())
         ):
-            self._seen.pop(key.camera, None)
+            self._image_weights.pop(key.camera, None)
 
     def _compare(self, scene: Scene) -> None:
         """Forget everything if it is another scene than last time, or one that has changed beyond comparison."""
@@ -264,11 +264,11 @@ class Cache:
             changes = [self._change(key, kept.shapes) for key, kept in self._views().items() if key.camera == view]
             return max(changes, default=math.inf)
 
-    def seen(self, scene: Scene, camera: Camera) -> torch.Tensor | None:
+    def image_weights(self, scene: Scene, camera: Camera) -> torch.Tensor | None:
         """(N,) how much of a view's image each Gaussian made up, sum of w^2, when that was computed; None: never."""
         with self._lock:
             self._compare(scene)
-            weights = self._seen.get(camera_key(camera))
+            weights = self._image_weights.get(camera_key(camera))
             if weights is None:
                 return None
             padded = weights.new_zeros(len(self._shapes()))
@@ -281,7 +281,7 @@ class Cache:
         view = camera_key(camera)
         return any(key.quantity == quantity and key.camera == view for key in self._views())
 
-    def _views(self) -> dict[ViewKey, _Kept]:
+    def _views(self) -> dict[ViewKey, _Entry]:
         """What is kept, in the order of its use: with a bound, views alone."""
         return {key: kept for key, kept in self._kept.items() if isinstance(key, ViewKey)}
 
@@ -299,7 +299,7 @@ class Cache:
             if id(before) not in self._changes:
                 self._changes[id(before)] = before.change_to(now)
             self._changes_of_views[key] = change_of_view(
-                before, now, self._changes[id(before)], self._cameras[key.camera], self._seen.get(key.camera)
+                before, now, self._changes[id(before)], self._cameras[key.camera], self._image_weights.get(key.camera)
             )
         return self._changes_of_views[key]
 
@@ -332,7 +332,7 @@ class Cache:
             if self._now is not None and all(self._now[1] is not one for one in shapes):
                 shapes.append(self._now[1])
             places = {id(one): i for i, one in enumerate(shapes)}
-            tensors = {f"seen.{views[view]}": x for view, x in self._seen.items()}
+            tensors = {f"seen.{views[view]}": x for view, x in self._image_weights.items()}
             for i, one in enumerate(shapes):
                 tensors |= {f"shapes.{i}.{name}": x for name, x in vars(one).items() if name != "sh"}
             rows: list[dict[str, Any]] = []
@@ -378,12 +378,12 @@ class Cache:
                 if bad:
                     raise ValueError(f"{where}: answer {i}: {bad[0]} must be of {len(of)} Gaussians, is not; {_ADVICE}")
                 key = ViewKey(_Saved(row["question"]), views[row["view"]], None)
-                self._store(key, _Kept(computed, of))
+                self._store(key, _Entry(computed, of))
                 if key in self._kept:
                     self._unclaimed.add(row["question"])
                     weights = tensors.get(f"seen.{row['view']}")
                     if weights is not None and weights.ndim == 1 and len(weights) <= most:
-                        self._seen[key.camera] = weights
+                        self._image_weights[key.camera] = weights
 
     def _claim(self, quantity: Hashable) -> None:
         """What a file has of this quantity is found under it from now on."""

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Combination", "joint_of"]
 
-_SAME = 1e-6  # relative standard deviation below which a block's scores are the same but for float32 images
+_CONSTANT_BELOW = 1e-6  # relative standard deviation below which a block's scores are the same but for float32 images
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,7 +105,7 @@ class Combination:
             scores = [math.fsum(gain.parts[name] for name in names) for gain in gains]
             mean, spread = statistics.fmean(scores), statistics.pstdev(scores)
             # A block that is the same for all ranks none above another.
-            factor = 1 / spread if spread > _SAME * abs(mean) else 0.0
+            factor = 1 / spread if spread > _CONSTANT_BELOW * abs(mean) else 0.0
             for name in names:
                 middle = statistics.fmean(gain.parts[name] for gain in gains)
                 for i, gain in enumerate(gains):

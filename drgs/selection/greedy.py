@@ -34,7 +34,7 @@ from drgs.selection.refining import refined
 
 __all__ = ["PoolView", "ViewInformation", "greedy"]
 
-_SHARE = 0.25  # of the memory there is, for information that could be computed again
+_MEMORY_SHARE = 0.25  # of the free memory, for information that could be computed again; chosen
 _ROUNDING = 1e-12  # relative: how far a sum of float64 gains may rise again by rounding, and a bound be missed by
 
 
@@ -221,7 +221,7 @@ def _first_round(
 def _fits(part: Information, count: int) -> bool:
     """Whether so many views' information may be held at a time: computing it twice takes longer, but no memory."""
     there = available()
-    return there is None or count * size_of(part) < _SHARE * there
+    return there is None or count * size_of(part) < _MEMORY_SHARE * there
 
 
 def _nothing(part: Information) -> dict[str, torch.Tensor]:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = ["compute_candidates", "coverage", "fisher", "fisherrf"]
 
-_FEW_PROBES = 8  # of a network's information, below which 1 / H is far too large on average
+_FEW_PROBES = 8  # probes of a network's information, up to which 1 / H is far too large on average
 
 
 def fisher(pool: Pool) -> Selection:

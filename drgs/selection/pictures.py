@@ -24,7 +24,7 @@ __all__ = ["blur", "moments", "renderers"]
 
 _COMPARED = ("exact", "fast", "gsplat", "3dgut")
 _LUMA = (0.299, 0.587, 0.114)  # of R, G and B, ITU-R BT.601
-_BLACK = 1e-12  # squared luma in [0, 1]; added to a sharpness, whose logarithm is infinite of one color
+_SHARPNESS_FLOOR = 1e-12  # squared luma in [0, 1]; added to a sharpness, whose logarithm is infinite of one color
 
 
 def moments(pool: Pool) -> Selection:
@@ -32,7 +32,7 @@ def moments(pool: Pool) -> Selection:
 
     "Magic Moments"; see `drgs.information.maps`.
     """
-    return _ranked(pool, "moments", _Moments())
+    return _ranked(pool, "moments", _RayVariance())
 
 
 def blur(pool: Pool) -> Selection:
@@ -73,7 +73,7 @@ def _ranked(pool: Pool, name: str, quantity: Quantity) -> Selection:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Moments(Quantity):
+class _RayVariance(Quantity):
     """The mean over a view's pixels of the variance along their rays."""
 
     def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
@@ -93,7 +93,7 @@ class _Blur(Quantity):
         inner = luma[1:-1, 1:-1]
         laplacian = luma[:-2, 1:-1] + luma[2:, 1:-1] + luma[1:-1, :-2] + luma[1:-1, 2:] - 4 * inner
         sharp = laplacian.var(correction=0) if laplacian.numel() else torch.zeros((), dtype=torch.float64)
-        return {"blur": -(sharp + _BLACK).log()}
+        return {"blur": -(sharp + _SHARPNESS_FLOOR).log()}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 __all__ = ["Refine", "refined"]
 
 _AXES = ("right", "down", "forward")
-_HALVED = 4  # times that steps are halved, to a 16th of the first: finer ones change a score by little
-_HIGHER = 1e-6  # share of a score that rounding may change
-_SOLID = 0.5  # opacity from which on a Gaussian is in the way
-_NEAREST = 10  # the distance to Gaussians is that to the tenth: fewer may be floaters
+_MAX_HALVINGS = 4  # times that steps are halved, to a 16th of the first: finer ones change a score by little
+_MIN_GAIN = 1e-6  # relative rise of a score that is more than rounding
+_OBSTACLE_ALPHA = 0.5  # opacity from which on a Gaussian is in the way
+_NEAREST_RANK = 10  # distance to Gaussians is that to the tenth nearest: fewer may be floaters. Chosen
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -91,7 +91,7 @@ class _Bounds:
         centers = np.stack([x.center for x in cameras])
         seen = scene.at(start.time)
         means = seen.means.detach().double().cpu().numpy() + np.asarray(seen.origin)
-        solid = means[(seen.logit_opacities.detach().sigmoid() > _SOLID).cpu().numpy()]
+        solid = means[(seen.logit_opacities.detach().sigmoid() > _OBSTACLE_ALPHA).cpu().numpy()]
         low, high = (centers.min(0), centers.max(0)) if refine.box is None else np.split(np.array(refine.box), 2)
         clearance = min((_distance(solid, center) for center in centers), default=0.0)
         return cls(low, high, start.c2w[:3, 2], refine.turn, solid, clearance)
@@ -109,9 +109,9 @@ class _Bounds:
 
 def _distance(solid: np.ndarray, center: np.ndarray) -> float:
     """To the tenth nearest Gaussian; infinite where there are fewer."""
-    if len(solid) < _NEAREST:
+    if len(solid) < _NEAREST_RANK:
         return math.inf
-    return float(np.partition(np.linalg.norm(solid - center, axis=1), _NEAREST - 1)[_NEAREST - 1])
+    return float(np.partition(np.linalg.norm(solid - center, axis=1), _NEAREST_RANK - 1)[_NEAREST_RANK - 1])
 
 
 def refined(
@@ -142,7 +142,7 @@ def refined(
     count = 0
     motions = [(kind, axis, sign) for kind in ("go", "turn") for axis in _AXES for sign in (1, -1)]
     motions = [x for x in motions if x[:2] != ("turn", "forward")]  # a roll shows the same place
-    for halved in range(_HALVED + 1):
+    for halved in range(_MAX_HALVINGS + 1):
         rose = True
         while rose:
             rose = False
@@ -153,7 +153,7 @@ def refined(
                     information = compute(camera)
                     own = score(information)
                     count += 1
-                    if own.total <= highest.total + _HIGHER * abs(highest.total):
+                    if own.total <= highest.total + _MIN_GAIN * abs(highest.total):
                         break
                     best, highest, moved, rose = camera, own, information, True
                     camera = _moved(best, kind, _AXES.index(axis), size)

@@ -22,7 +22,7 @@ from drgs.selection.pool import Pool, Selection
 __all__ = ["farthest", "random", "uniform"]
 
 _T = TypeVar("_T", bound=Hashable)
-_DIGITS = 9  # of distances: what differs less is a tie
+_TIE_DIGITS = 9  # digits that distances are rounded to: what differs less is a tie
 
 
 def farthest(pool: Pool) -> Selection:
@@ -111,7 +111,7 @@ def _farthest_in_time(pool: Pool) -> Selection:
     """
     points = places_in_time([*pool.train, *pool.candidates])
     known, new = points[: len(pool.train)], points[len(pool.train) :]
-    distances = np.linalg.norm(new[:, None] - known[None], axis=2).round(_DIGITS)
+    distances = np.linalg.norm(new[:, None] - known[None], axis=2).round(_TIE_DIGITS)
     scores = distances.min(1).tolist() if len(known) else [0.0] * len(new)
     picks = []
     left = list(range(len(new)))
@@ -123,7 +123,7 @@ def _farthest_in_time(pool: Pool) -> Selection:
         margin = score - nearest[order[1]][0] if len(order) > 1 and nearest[best] else None
         picks.append(pool.pick(best, score, margin=margin))
         left.remove(best)
-        reach = np.linalg.norm(new - new[best], axis=1).round(_DIGITS)
+        reach = np.linalg.norm(new - new[best], axis=1).round(_TIE_DIGITS)
         distances = np.c_[distances, reach]
     return Selection(picks, scores, evaluations=pool.k * len(new))
 
@@ -156,7 +156,7 @@ def _uniform_in_time(pool: Pool) -> Selection:
 
 def _pose(camera: Camera) -> bytes:
     """Equal for cameras of one pose; 0 and -0 are equal."""
-    return (np.asarray(camera.c2w).round(_DIGITS) + 0.0).tobytes()
+    return (np.asarray(camera.c2w).round(_TIE_DIGITS) + 0.0).tobytes()
 
 
 def _count(views: Sequence[Camera], key: Callable[[Camera], Hashable], value: Hashable) -> int:

@@ -288,7 +288,7 @@ def joined_frames(
 def _video_row(video: Path, picked: Picked) -> dict[str, Any]:
     """A video in frames.json. How long its sensor takes from the first line to the last one no file says."""
     row = {"video": str(video), "frame_seconds": picked.frame_seconds, "readout_seconds": None}
-    return row | {"looks": picked.looks, "wanted": picked.wanted, "frames": len(picked.frames)}
+    return row | {"looks": picked.samples, "wanted": picked.useful_frames, "frames": len(picked.frames)}
 
 
 def _picked(videos: Sequence[Path], most: int, report: Callable[[str, int, int], None]) -> list[Picked]:
@@ -300,7 +300,7 @@ def _picked(videos: Sequence[Path], most: int, report: Callable[[str, int, int],
         examined.append(
             examine(video, lambda done, total, video=video: report(f"looking at {video.name}", done, total))
         )
-    wanted = [min(one.wanted, most) for one in examined]
+    wanted = [min(one.useful_frames, most) for one in examined]
     shares = wanted
     if sum(wanted) > most:  # one of each, and the rest by what is wanted
         rest = most - len(wanted)

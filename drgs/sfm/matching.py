@@ -103,14 +103,14 @@ def extract(
         some = names[start : start + threads]
         shown = " or ".join(str(own_file((originals or folder) / name)) for name in some)
         # Every call would otherwise open a camera of its own.
-        settings["camera"] = _extractor.ask("extract_features", Path(shown), some, settings)
+        settings["camera"] = _extractor.call("extract_features", Path(shown), some, settings)
     if progress:
         progress("features", len(names), len(names))
 
 
 def start_extraction() -> None:
     """Start the process that `extract` asks, so that the time of its first call is that of features alone."""
-    _extractor.ask("ready", Path())
+    _extractor.call("ready", Path())
 
 
 def restore_focal_lengths(database: Path, folder: Path) -> None:

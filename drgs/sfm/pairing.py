@@ -23,13 +23,15 @@ MAX_EXHAUSTIVE = 60
 """Photographs of which all pairs are matched by default."""
 MAX_EXHAUSTIVE_MASKED = 150
 """The same with masks: an object alone has a tenth of the features to compare."""
-_WINDOW = 10  # next photographs that one is matched with: COLMAP's own sequential overlap
-_NARROW_WINDOW = 4  # beside those that appearance finds
-_NEAREST = 20  # by appearance
-_NEAREST_NEW = 30  # the same for photographs that come later, whose only way into the model these are
-_CENTERS = 64  # of VLAD: 64 x 128 numbers describe a photograph
-_SAMPLE = 400  # features of a photograph that the centers are found from
-_ROUNDS = 12  # of k-means
+_SEQUENTIAL_WINDOW = 10  # photographs that follow, with which one is matched: COLMAP's own sequential overlap
+_NARROW_WINDOW = 4  # the same beside matches by appearance; chosen
+_NEAREST_BY_APPEARANCE = 20  # photographs most alike, with which one is matched; chosen
+_NEAREST_FOR_NEW = 30  # the same for photographs that are added later and enter the model by these pairs alone; chosen
+# cluster centers of VLAD: 64 x 128 numbers describe a photograph; the usual number (Jegou et al. 2010)
+# cluster centers of VLAD, of 16, 64 and 256 that Jegou et al. (2010) test: 64 x 128 numbers describe a photograph
+_VLAD_CENTERS = 64
+_FEATURES_PER_PHOTO = 400  # features of a photograph that the centers are fitted to: bounds time
+_KMEANS_ROUNDS = 12  # rounds of k-means, at most; chosen
 
 
 @dataclass(frozen=True)
@@ -64,14 +66,14 @@ def choose_pairs(database: Path, names: list[str], matching: str, is_masked: boo
     if matching == "exhaustive":
         return Pairing(list(itertools.combinations(names, 2)), total)
     if matching == "sequential":
-        pairs = sequential_pairs(names, _WINDOW)
-        what = f"the {_WINDOW} next by name, and some further on"
+        pairs = sequential_pairs(names, _SEQUENTIAL_WINDOW)
+        what = f"the {_SEQUENTIAL_WINDOW} next by name, and some further on"
     else:
-        near = nearest_pairs(global_descriptors(database, names, seed), _NEAREST)
+        near = nearest_pairs(global_descriptors(database, names, seed), _NEAREST_BY_APPEARANCE)
         by_name = sequential_pairs(names, _NARROW_WINDOW)
         place = {name: index for index, name in enumerate(names)}
         pairs = sorted({*by_name, *((names[i], names[j]) for i, j in near)}, key=lambda p: (place[p[0]], place[p[1]]))
-        what = f"the {_NEAREST} nearest by appearance, and the {_NARROW_WINDOW} next by name"
+        what = f"the {_NEAREST_BY_APPEARANCE} nearest by appearance, and the {_NARROW_WINDOW} next by name"
     if len(pairs) == total:
         return Pairing(pairs, total)
     left_out = f"{len(pairs):,} of {total:,} pairs are matched: {what}; --matcher exhaustive matches all"
@@ -90,11 +92,11 @@ def choose_new_pairs(database: Path, old: list[str], new: list[str], seed: int) 
     total = len(new) * (len(new) - 1) // 2 + len(new) * len(old)
     if len(names) <= MAX_EXHAUSTIVE:
         return Pairing([(names[i], names[j]) for j in range(len(old), len(names)) for i in range(j)], total)
-    near = nearest_pairs(global_descriptors(database, names, seed), _NEAREST_NEW, firsts=len(old))
+    near = nearest_pairs(global_descriptors(database, names, seed), _NEAREST_FOR_NEW, firsts=len(old))
     pairs = sorted({*((names[i], names[j]) for i, j in near), *sequential_pairs(new, _NARROW_WINDOW)})
     if len(pairs) == total:
         return Pairing(pairs, total)
-    what = f"the {_NEAREST_NEW} nearest by appearance, and the {_NARROW_WINDOW} next by name"
+    what = f"the {_NEAREST_FOR_NEW} nearest by appearance, and the {_NARROW_WINDOW} next by name"
     left_out = f"{len(pairs):,} of {total:,} pairs with new photographs are matched: {what}"
     return Pairing(pairs, total, left_out)
 
@@ -132,8 +134,10 @@ def global_descriptors(database: Path, names: list[str], seed: int = 0) -> np.nd
     rng = np.random.default_rng(seed)
     samples = []
     for features in _features(database, names):
-        few = len(features) > _SAMPLE
-        samples.append(features[np.sort(rng.choice(len(features), _SAMPLE, replace=False))] if few else features)
+        few = len(features) > _FEATURES_PER_PHOTO
+        samples.append(
+            features[np.sort(rng.choice(len(features), _FEATURES_PER_PHOTO, replace=False))] if few else features
+        )
     centers = _centers(np.concatenate(samples), rng)
     descriptors = np.zeros((len(names), len(centers), 128), np.float32)
     for index, features in enumerate(_features(database, names)):
@@ -161,10 +165,10 @@ def _centers(features: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """(K, 128) float32 by k-means (Lloyd 1982), begun at random features; one that no feature is nearest to stays."""
     from scipy.cluster.vq import kmeans2
 
-    count = min(_CENTERS, len(features))
+    count = min(_VLAD_CENTERS, len(features))
     if not count:
         return np.zeros((0, 128), np.float32)
     first = features[np.sort(rng.choice(len(features), count, replace=False))]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that there is such a center
-        return kmeans2(features, first, iter=_ROUNDS, minit="matrix")[0]
+        return kmeans2(features, first, iter=_KMEANS_ROUNDS, minit="matrix")[0]

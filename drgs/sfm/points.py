@@ -38,15 +38,17 @@ __all__ = [
 ]
 
 _MIN_TRIANGULATED = 50  # points: fewer may be chance matches, and nothing is proposed beside them
-_ENOUGH = 2_000  # triangulated points that need no others beside them
+_ENOUGH_TRIANGULATED = 2_000  # triangulated points that need no others beside them; chosen, not tuned
 _MAX_RANDOM = 20_000  # points where nothing is known: density control moves them to where they are needed
-_NEIGHBORS = 10  # photographs that each one is matched with, the nearest by place and direction
+_MATCHED_NEIGHBORS = 10  # photographs that each one is matched with, the nearest by place and direction; chosen
 _FEATURE_SIZE = 1600  # pixels of the longer side that features are detected at, as for structure from motion
-_COMPARED = 20_000  # points of depth maps that photographs are compared by
-_SOME = 100  # photographs, at most, whose depth maps they are drawn from: every map is read once more to be compared
-_CELLS = 20  # cells along the longer side of a photograph, whose nearest point that it shows hides what is behind
-_TRACK_DEPTH = 0.01  # of the depth, by which a point may differ from what its cell shows: more lets thin things through
-_MAP_DEPTH = 0.05  # of the depth, by which a point may differ from a depth map: sensors are wrong by 1 to 3 %
+_MAX_COMPARED_POINTS = 20_000  # points of depth maps that photographs are compared by; chosen: bounds time
+_MAX_DEPTH_MAPS = 100  # photographs, at most, whose depth maps they are drawn from: every map is read twice
+# cells along the longer side of a photograph; a cell's nearest point hides what is behind it. Chosen
+_OCCLUSION_CELLS = 20
+# relative difference of depth to the nearest point of a cell; larger lets hidden points pass behind thin things
+_TRACK_DEPTH_TOLERANCE = 0.01
+_MAP_DEPTH_TOLERANCE = 0.05  # relative difference of depth to a depth map: sensors are wrong by 1 to 3 %
 
 
 def initial_points(
@@ -192,7 +194,7 @@ class _Proposer:
         share = uncovered_share(self.views, tracked, shown)
         # Where all is empty, the share of what is not is 0.
         as_dense = len(points) * min(1.0, share / max(1 - share, 1e-9))
-        count = round(min(max(_ENOUGH - len(points), as_dense), share * self.max_points))
+        count = round(min(max(_ENOUGH_TRIANGULATED - len(points), as_dense), share * self.max_points))
         keep = random_subset(len(points), self.max_points - count, self.rng)
         room = None if self.hull is None else self.hull.points(count, self.rng, self.progress)
         more, more_colors = room or propose_near_triangulated(self.views, tracked, shown, count, self.rng)
@@ -347,19 +349,22 @@ def _shown_beside(views: list[View], points: np.ndarray, shown: np.ndarray) -> t
     visible = shown.copy()
     for row, view in enumerate(views):
         inside, pixels, depth = _inside(view, points)
-        cells = (pixels * _CELLS / max(view.camera.width, view.camera.height)).astype(int) @ (1, _CELLS)
-        nearest = np.full(_CELLS * _CELLS, np.inf)
+        cells = (pixels * _OCCLUSION_CELLS / max(view.camera.width, view.camera.height)).astype(int) @ (
+            1,
+            _OCCLUSION_CELLS,
+        )
+        nearest = np.full(_OCCLUSION_CELLS * _OCCLUSION_CELLS, np.inf)
         mine = shown[row, inside]
         np.minimum.at(nearest, cells[mine], depth[mine])
-        visible[row, inside[np.abs(depth / nearest[cells] - 1) < _TRACK_DEPTH]] = True
+        visible[row, inside[np.abs(depth / nearest[cells] - 1) < _TRACK_DEPTH_TOLERANCE]] = True
     return points, visible
 
 
 def _shown_by_depth(views: list[View], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Points of depth maps, an even share a map, and which views show them, by their own depth maps."""
     points = []
-    some = views[:: -(-len(views) // _SOME)]
-    share = -(-_COMPARED // len(some))
+    some = views[:: -(-len(views) // _MAX_DEPTH_MAPS)]
+    share = -(-_MAX_COMPARED_POINTS // len(some))
     for view in some:
         if (depth := view.depth()) is not None:
             known = np.flatnonzero(depth)
@@ -371,7 +376,7 @@ def _shown_by_depth(views: list[View], rng: np.random.Generator) -> tuple[np.nda
         if (depth := view.depth()) is not None:
             inside, pixels, own = _inside(view, drawn)
             columns, rows = pixels.astype(int).T
-            shown[row, inside] = np.abs(depth[rows, columns] / own - 1) < _MAP_DEPTH
+            shown[row, inside] = np.abs(depth[rows, columns] / own - 1) < _MAP_DEPTH_TOLERANCE
     return drawn, shown
 
 
@@ -414,7 +419,7 @@ def _triangulated(views: list[View], matches: Matches, progress: Progress | None
     if progress:
         progress("features", len(new), len(new))
     poses = np.stack([picture.camera.c2w for picture in matches.pictures])
-    pairs = nearby_pairs(poses[:, :3, 3], poses[:, :3, 2], _NEIGHBORS)
+    pairs = nearby_pairs(poses[:, :3, 3], poses[:, :3, 2], _MATCHED_NEIGHBORS)
     matches.match(pairs, progress)
     with Bar("triangulation"):
         return matches.triangulate(pairs)

@@ -25,11 +25,12 @@ __all__ = [
 
 FEWEST = 3
 """Triangulated points of a view that say how far away its other pixels may be."""
-_MOST = 1_000  # triangulated points of a view that are looked at
-_NEAREST = 4  # of these in the image, one of which says how far away a pixel is: on this side of an edge or on that
-_CELLS = 16  # along each side of an image
-_JITTER = 0.05  # relative standard deviation of that distance: surfaces are slanted
-_CHUNK = 2_000  # pixels at a time
+_MAX_POINTS_PER_VIEW = 1_000  # triangulated points of a view that are used: bounds time; chosen
+_NEAREST_IN_IMAGE = 4  # of these, one of which, at random, gives a pixel's distance: on this side of an edge or on that
+# cells along each side of an image; pixels in a cell without a triangulated point get proposals. Chosen
+_CELLS_PER_SIDE = 16
+_DISTANCE_JITTER = 0.05  # relative standard deviation of that distance: surfaces are slanted; chosen
+_PIXELS_AT_ONCE = 2_000  # pixels compared with the points at once: bounds memory
 
 
 def propose_near_triangulated(
@@ -65,11 +66,11 @@ def propose_near_triangulated(
             continue
         pixels = rng.choice(allowed, number)
         if len(depths) >= FEWEST:
-            kept = random_subset(len(depths), _MOST, rng)
+            kept = random_subset(len(depths), _MAX_POINTS_PER_VIEW, rng)
             depth = depths[kept][_one_of_nearest(places[kept], pixels, camera.width, rng)]
         else:
             depth = rng.choice(anywhere, number)
-        proposed.append(back_project(camera, pixels, depth * np.exp(_JITTER * rng.normal(size=number))))
+        proposed.append(back_project(camera, pixels, depth * np.exp(_DISTANCE_JITTER * rng.normal(size=number))))
         colors.append(view.image().reshape(-1, 3)[pixels])
     if not proposed:
         return np.empty((0, 3)), np.empty((0, 3), dtype=np.float32)
@@ -88,10 +89,10 @@ def uncovered_share(views: list[View], points: np.ndarray, shown: np.ndarray) ->
 
 def _uncovered_pixels(view: View, camera: Camera, places: np.ndarray) -> np.ndarray:
     """Flat indices of the pixels inside the mask in whose cell none of the places (P,2) is."""
-    across, down = (-(-size // _CELLS) for size in (camera.width, camera.height))
-    taken = np.zeros((_CELLS, _CELLS), bool)
+    across, down = (-(-size // _CELLS_PER_SIDE) for size in (camera.width, camera.height))
+    taken = np.zeros((_CELLS_PER_SIDE, _CELLS_PER_SIDE), bool)
     # Points that project outside count for the cell at the edge: the size need not be a multiple of the cells.
-    columns, rows = (places // (across, down)).astype(int).clip(0, _CELLS - 1).T
+    columns, rows = (places // (across, down)).astype(int).clip(0, _CELLS_PER_SIDE - 1).T
     taken[rows, columns] = True
     is_open = ~np.kron(taken, np.ones((down, across), bool))[: camera.height, : camera.width]
     if view.mask_path is not None:
@@ -102,11 +103,11 @@ def _uncovered_pixels(view: View, camera: Camera, places: np.ndarray) -> np.ndar
 def _one_of_nearest(places: np.ndarray, pixels: np.ndarray, width: int, rng: np.random.Generator) -> np.ndarray:
     """Index, for each flat pixel, of one of the places (P,2) that are nearest to it."""
     centers = np.stack([pixels % width, pixels // width], axis=-1) + 0.5
-    count = min(_NEAREST, len(places))
+    count = min(_NEAREST_IN_IMAGE, len(places))
     which = rng.integers(0, count, len(pixels))
     chosen = np.empty(len(pixels), np.int64)
-    for start in range(0, len(pixels), _CHUNK):
-        part = slice(start, start + _CHUNK)
+    for start in range(0, len(pixels), _PIXELS_AT_ONCE):
+        part = slice(start, start + _PIXELS_AT_ONCE)
         squares = ((centers[part, None] - places[None]) ** 2).sum(axis=2)
         nearest = np.argpartition(squares, count - 1, axis=1)[:, :count]
         chosen[part] = nearest[np.arange(len(nearest)), which[part]]
@@ -197,15 +198,19 @@ def random_subset(count: int, limit: int, rng: np.random.Generator) -> np.ndarra
 
 # ---------------------------------------------------------------- visual hull
 
-_FEWEST_VIEWS = 3  # two silhouettes leave most of what is between them
-_LEAST_EMPTY = 0.2  # share of the pixels that show the background; below it, it may be a color like others
-_BACKGROUND = 0.06  # largest difference of a channel from its color: a sensor's noise, a compressed edge
-_SOME = 8  # photographs that say whether there is a background at all
-_WIDTH = 400  # pixels; averages of several are less noisy
-_CONTRADICTED = 0.1  # share of the photographs that may deny a place that two have agreed about: edges are soft
-_ROUND = 50_000  # places at a time
-_ROUNDS = 40  # at most: 2 million places in all
-_FEWEST_POINTS = 100  # of all rounds; fewer say that silhouettes do not agree
+_FEWEST_VIEWS = 3  # silhouettes: two leave most of what is between them
+# share of the pixels that show the background; below it, it may be a color like others. Chosen
+_MIN_BACKGROUND_SHARE = 0.2
+# largest difference of a channel, of 1, from the background: noise, a compressed edge. Chosen
+_BACKGROUND_TOLERANCE = 0.06
+_BACKGROUND_PROBES = 8  # photographs that decide whether there is a background at all
+_SILHOUETTE_WIDTH = 400  # pixels across a silhouette: means of several pixels have less noise
+# share of the photographs whose silhouette may exclude a point that is kept: edges are soft. Chosen
+# share of the photographs showing a point whose silhouettes may exclude it: edges are soft. Chosen
+_MAX_CONTRADICTING = 0.1
+_POINTS_PER_ROUND = 50_000  # random points a round: bounds memory
+_MAX_ROUNDS = 40  # rounds, at most: 2 million points in all
+_FEWEST_POINTS = 100  # points of all rounds; fewer mean that the silhouettes do not agree
 
 
 @dataclass(frozen=True)
@@ -249,8 +254,11 @@ class VisualHull:
             return None
         if progress:
             progress("silhouettes", 0, len(views))
-        some = views[:: -(-len(views) // _SOME)]
-        if np.mean([_is_background(view, view.image(*_size(view.camera))).mean() for view in some]) < _LEAST_EMPTY:
+        some = views[:: -(-len(views) // _BACKGROUND_PROBES)]
+        if (
+            np.mean([_is_background(view, view.image(*_size(view.camera))).mean() for view in some])
+            < _MIN_BACKGROUND_SHARE
+        ):
             return None
         smaller, images, is_empty, counts, reaches = [], [], [], [], []
         for number, (view, camera) in enumerate(zip(views, cameras, strict=True)):
@@ -289,7 +297,7 @@ class VisualHull:
             shown, columns, rows = self._pixels(index, places)
             number[shown] += 1
             contradictions[shown] += self.is_empty[index][rows, columns]
-        return contradictions > _CONTRADICTED * number
+        return contradictions > _MAX_CONTRADICTING * number
 
     def colors(self, places: np.ndarray) -> np.ndarray:
         """(P, 3) float32 medians of what photographs show at places (P, 3), each of which one shows."""
@@ -314,8 +322,8 @@ class VisualHull:
             photographs leave no room that they agree on.
         """
         kept, total = [], 0
-        for _ in range(_ROUNDS):
-            places = self.center + self.reach * _in_ball(_ROUND, rng)
+        for _ in range(_MAX_ROUNDS):
+            places = self.center + self.reach * _in_ball(_POINTS_PER_ROUND, rng)
             number = self.support(places)
             kept.append(places[number >= max(2, number.max() / 2)])
             total += len(kept[-1])
@@ -342,13 +350,13 @@ class VisualHull:
 
 def _size(camera: Camera) -> tuple[int, int]:
     """Width and height at which its photograph is looked at."""
-    width = min(_WIDTH, camera.width)
+    width = min(_SILHOUETTE_WIDTH, camera.width)
     return width, max(1, round(camera.height * width / camera.width))
 
 
 def _is_background(view: View, image: np.ndarray) -> np.ndarray:
     """(H, W) bool, which pixels of an image have the color of the background."""
-    return (np.abs(image - np.asarray(view.background, np.float32)) <= _BACKGROUND).all(axis=2)
+    return (np.abs(image - np.asarray(view.background, np.float32)) <= _BACKGROUND_TOLERANCE).all(axis=2)
 
 
 def _in_ball(count: int, rng: np.random.Generator) -> np.ndarray:

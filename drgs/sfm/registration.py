@@ -180,7 +180,7 @@ def _registered(
         pairing = choose_new_pairs(database, old, list(new), options.seed)
         match(database, pairing.pairs, seed=options.seed, progress=report)
         times.end("matching")
-        pipeline = _held_pipeline(options.seed, cameras)
+        pipeline = _options_with_fixed_poses(options.seed, cameras)
         mapping = MappingProgress(len(names), report, status, before.num_reg_images())
         models = map_photos(database, readable, partial / "models", pipeline, mapping, base=scene / "sparse/0")
         times.end("mapping")
@@ -212,7 +212,7 @@ def _link_photographs(scene: Path, new: dict[str, Path], partial: Path) -> None:
         link_or_copy(file, partial / "photos" / name)
 
 
-def _held_pipeline(seed: int, cameras: list[Any]) -> Any:
+def _options_with_fixed_poses(seed: int, cameras: list[Any]) -> Any:
     """pycolmap's options of mapping that holds the poses that are there, and these lenses."""
     from drgs.data.colmap_bindings import pycolmap
 

@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 # Scales of 0 have no logarithm, opacities of 0 and 1 no logit: gsplat takes them, and nobody sees these instead.
-_LEAST_SCALE = 1e-20
+_LEAST_SCALE = 1e-20  # scene units
 _LEAST_OPACITY = 1e-12
 _MOST_OPACITY = 1 - 2.0**-26
 

@@ -19,8 +19,10 @@ from drgs.checks.arguments import ArgumentError
 
 __all__ = ["factors", "strained"]
 
-_LEAST = 1e-24  # share of the largest eigenvalue that one of 0 gets: a flat Gaussian has 1e-12 of its size as thickness
-_TINIEST = 1e-40  # scene units squared, least eigenvalue: of a covariance of 0
+_MIN_EIGENVALUE_SHARE = (
+    1e-24  # share of the largest eigenvalue that one of 0 gets: a flat Gaussian has 1e-12 of its size as thickness
+)
+_MIN_EIGENVALUE = 1e-40  # scene units squared, least eigenvalue: of a covariance of 0
 
 
 def factors(
@@ -52,7 +54,7 @@ def factors(
     _refuse(where, skewed, fixed, "symmetric to 1e-5 of its largest element")
     values, axes = torch.linalg.eigh(0.5 * (fixed + fixed.mT))
     _refuse(where, values[..., 0] < -1e-6 * size, fixed, "without a negative eigenvalue")
-    values = torch.maximum(values, _LEAST * values[..., 2:]).clamp_min(_TINIEST)
+    values = torch.maximum(values, _MIN_EIGENVALUE_SHARE * values[..., 2:]).clamp_min(_MIN_EIGENVALUE)
     # A reflection of an axis is no rotation, and changes no Gaussian.
     mirrored = torch.linalg.det(axes) < 0
     axes = torch.cat([axes[..., :2], torch.where(mirrored[..., None, None], -axes[..., 2:], axes[..., 2:])], -1)

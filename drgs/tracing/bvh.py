@@ -39,13 +39,16 @@ from drgs.tracing.walk import Part
 
 __all__ = ["BvhTraversal", "Proxies", "proxy_scene"]
 
-_STEP = 1.2e-7  # of the coordinates of where a ray starts: one unit in the last place
-_GRAZE = 1e-7  # of (distance / radius)^2: what rounding takes from the discriminant, with a margin
-_FAR = 4e3  # distance / radius from which float32 loses more than 1e-3 of a hit
-_THIN = 1e-3  # smallest proxy radius, relative to the distance it is traced over
-_LISTED = 1000  # primitives that every ray is offered before it is traced, where origins differ
-_NEARLY = 6  # hits that a ray in order of entry is sorted among: proxies come in that of their own entries
-_AROUND = 1.05  # half axes of a proxy within which an origin counts as inside
+# relative rounding of the coordinates of a ray's origin: one unit in the last place of float32
+_ORIGIN_ROUNDING = 1.2e-7
+_GRAZING = 1e-7  # relative to (distance / radius)^2: what rounding takes from the discriminant, with a margin
+_FAR_RATIO = 4e3  # distance / radius from which float32 loses more than 1e-3 of a hit
+_MIN_RADIUS = 1e-3  # smallest proxy radius, relative to the distance it is traced over
+# primitives around an origin that are listed and tested by every ray before the tree is traced, where origins differ;
+# chosen
+_MAX_LISTED = 1000
+_ENTRY_BUFFER = 6  # hits that a ray in order of entry is sorted among: proxies come nearly in that order
+_INSIDE_MARGIN = 1.05  # half axes of a proxy within which an origin counts as inside: 5 % more than it needs
 
 
 class BvhTraversal:
@@ -103,7 +106,7 @@ class BvhTraversal:
             stream,
             ordered=True,
             center_key=self.center_key,
-            buffer=_NEARLY if s.order == "entry" else None,
+            buffer=_ENTRY_BUFFER if s.order == "entry" else None,
         )
         return [part]
 
@@ -202,7 +205,7 @@ def proxy_scene(
     proxies = _grown(radii, means, distance)
     around = _around(to, quats, proxies, spread, distance, tails)
     # Of a single origin all are candidates of every ray, and listed they are cheaper than traced.
-    most = _LISTED if spread > 0 else len(around)
+    most = _MAX_LISTED if spread > 0 else len(around)
     if len(around) > most:
         # The largest are listed all the same: a move back behind them would cost the others their precision.
         around = around[np.argsort(radii[:, around].max(0), kind="stable")]
@@ -261,8 +264,8 @@ def _grown(radii: np.ndarray, means: np.ndarray, distance: np.ndarray) -> np.nda
     reach = np.minimum(distance, size)
     # Grazing rays are lost to rounding unless the proxy is larger than the Gaussian by as much; 1e-4 is for the rest of
     # what float32 does to a hit.
-    graze = _GRAZE * (reach / np.maximum(radii.min(0), _THIN * reach)) ** 2
-    return np.maximum(radii * (1 + 1e-4 + graze), _THIN * reach)
+    graze = _GRAZING * (reach / np.maximum(radii.min(0), _MIN_RADIUS * reach)) ** 2
+    return np.maximum(radii * (1 + 1e-4 + graze), _MIN_RADIUS * reach)
 
 
 def _around(
@@ -271,7 +274,7 @@ def _around(
     """Indices of ellipsoids that a point within `spread` of 0 may be inside of; boxes, or spheres, stand for them."""
     widest = radii.max(0)
     if spheres:
-        return np.flatnonzero(distance <= 2 * spread + _AROUND * widest)
+        return np.flatnonzero(distance <= 2 * spread + _INSIDE_MARGIN * widest)
     near = np.flatnonzero(distance <= 2 * spread + 2 * widest)
     w, x, y, z = quats[:, near]
     axes = np.array(
@@ -282,7 +285,7 @@ def _around(
         ]
     )
     local = abs((axes * to[:, near]).sum(1))
-    return near[(local <= _AROUND * radii[:, near] + spread).all(0)]
+    return near[(local <= _INSIDE_MARGIN * radii[:, near] + spread).all(0)]
 
 
 class _ProxyStream:
@@ -301,7 +304,7 @@ class _ProxyStream:
             self.start = self._enter(proxies, ray.carried[-6:-3])
             self.o = [dr.fma(d, self.start, x) for x, d in zip(ray.carried[-6:-3], self.d, strict=True)]
             size = dr.maximum(dr.maximum(abs(self.o[0]), abs(self.o[1])), abs(self.o[2]))
-            self.step = _STEP * dr.maximum(size, proxies.scale)
+            self.step = _ORIGIN_ROUNDING * dr.maximum(size, proxies.scale)
 
     def opened(self) -> _ProxyStream:
         """Itself."""
@@ -405,9 +408,9 @@ def _warn_of_rounding(ellipsoids: np.ndarray, alive: np.ndarray, origins: np.nda
     a, b, c = ellipsoids[7:]
     middle = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
     ratio = (np.sqrt((to * to).sum(0)) / np.maximum(middle, 1e-300))[alive]  # a scale may underflow to 0
-    if (share := float((ratio > _FAR).sum()) / max(len(ratio), 1)) > 0.01:
+    if (share := float((ratio > _FAR_RATIO).sum()) / max(len(ratio), 1)) > 0.01:
         warnings.warn(
-            f"render: traversal='bvh' must have Gaussians wider than 1/{_FAR:g} of their distance in two axes, got "
-            f"{share:.0%} thinner, down to 1/{ratio.max():.1g}; expect errors in their hits or use traversal='tiles'",
+            f"render: traversal='bvh' must have Gaussians wider than 1/{_FAR_RATIO:g} of their distance in two axes, "
+            f"got {share:.0%} thinner, down to 1/{ratio.max():.1g}; expect errors in their hits or use traversal='tiles'",
             stacklevel=2,
         )

@@ -218,9 +218,9 @@ class Call:
 
     def local_directions(self) -> torch.Tensor:
         """(P, 3) directions in camera axes; where there is none, any that is a number."""
-        return self._local_and_known()[0]
+        return self._local_rays_and_mask()[0]
 
-    def _local_and_known(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def _local_rays_and_mask(self) -> tuple[torch.Tensor, torch.Tensor]:
         """The same, and where there is one, (P, 1)."""
         d = local_directions(self.camera)
         known = torch.isfinite(d).all(1, keepdim=True)
@@ -240,9 +240,9 @@ class Call:
         """
         camera = self.camera
         if self.pixel_rays is None:
-            found, known = self._local_and_known()
+            local_rays, known = self._local_rays_and_mask()
             ends = start, rigid_pose(camera, "w2c_end")
-            pose, o, d = rolling_view(camera, *ends, found if local is None else local)
+            pose, o, d = rolling_view(camera, *ends, local_rays if local is None else local)
         else:
             pose = start
             o, d, known = checked_pixel_rays(self.pixel_rays, camera)

@@ -213,7 +213,7 @@ class Compositor:
         if "visibility" in want:
             out["visibility"] = dr.zeros(lib.Float, count)
         keep = "replay" in want and len(self.parts) == 1
-        image = self._no_rows(self.rays) if self._held else None
+        image = self._no_rows(self.rays) if self._weights_are_held else None
         for channels in self.passes:
             done = []
             for part in self._parts(channels):  # gets longer where rays are redone
@@ -278,7 +278,7 @@ class Compositor:
         return part.again(again)
 
     @property
-    def _held(self) -> bool:
+    def _weights_are_held(self) -> bool:
         """Whether weights are."""
         return any(part.weights is not None for part in self.parts)
 
@@ -311,7 +311,7 @@ class Compositor:
         carried = [dr.zeros(lib.Float, self.rays) for _ in self.carried]
         absolute = None if self.absolute is None else dr.zeros(lib.Float, dr.width(self.absolute))
         dr.eval(g)
-        slopes = self._no_rows(dr.width(grads["features"]) // self.width) if self._held else None
+        slopes = self._no_rows(dr.width(grads["features"]) // self.width) if self._weights_are_held else None
         for channels, done in zip(self.passes, self.finals, strict=True):
             for part, states in done:
                 with dr.suspend_grad():  # this is the derivative; nothing differentiates it again
@@ -438,8 +438,8 @@ class Compositor:
                 b[name] = x + dr.zeros(lib.Float, dr.width(self.buffers[name]))
         dr.eval(records, rest, carried)
         results = [self._images() for _ in buffers]
-        images = [self._no_rows(self.rays) for _ in buffers] if self._held else []
-        features = [b["features"] for b in (self.buffers, *rest)] if self._held else []
+        images = [self._no_rows(self.rays) for _ in buffers] if self._weights_are_held else []
+        features = [b["features"] for b in (self.buffers, *rest)] if self._weights_are_held else []
         for channels in self.passes:
             depth = self.want & {"depth"} if channels.color else frozenset()
             if channels.channels and not self.couple:

@@ -8,7 +8,7 @@ scene's parameters pass through it as those of Gaussians do.
 The bridge is `dr.wrap`, from Dr.Jit to torch. (The other direction keeps the description of its outputs in one global
 of all threads; this one does not.) As it is, it goes backward once: torch frees its graph, and gradients of a second
 time would be added to those of the first. Probes go backward many times, so what is wrapped keeps its graph, from the
-first time on (`_Kept`): K probes evaluate the function twice, K tangents K + 1 times.
+first time on (`_RetainedGraph`): K probes evaluate the function twice, K tangents K + 1 times.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ class Field:
         self.names = tuple(names)
         self.shift = shift
         self.fixed = dict(fixed or {})
-        self.seen: _Tensors = {}  # the fields, once they are computed: a call's parameters are constant
+        self.cached: _Tensors = {}  # the fields, once they are computed: a call's parameters are constant
 
     def __call__(self, parameters: dict) -> dict:
         """Dr.Jit tensors by name to Dr.Jit tensors by name, with AD in both modes, by those that it is enabled of."""
         moving = {name: x for name, x in parameters.items() if dr.grad_enabled(x)}
         # Numbers cost no derivative.
         still = {name: x.torch() for name, x in parameters.items() if name not in moving}
-        return wrapped(lambda some: self.values({**still, **some}), self.seen)(moving)
+        return wrapped(lambda some: self.values({**still, **some}), self.cached)(moving)
 
     def values(self, parameters: _Tensors) -> _Tensors:
         """The fields in torch; `time` among the parameters is that of the view, as a scalar."""
@@ -69,26 +69,26 @@ class Field:
         return {name: fields[name] for name in self.names}
 
 
-def wrapped(function: Callable[[_Tensors], _Tensors], seen: _Tensors | None = None) -> Callable[[dict], dict]:
+def wrapped(function: Callable[[_Tensors], _Tensors], cached: _Tensors | None = None) -> Callable[[dict], dict]:
     """A torch function of tensors by name as a function of Dr.Jit tensors by name, by `dr.wrap`.
 
     Args:
         function: What is wrapped, made of operations that torch differentiates in both modes.
-        seen: What it returns, where that is known already; if empty it is filled.
+        cached: What it returns, where that is known already; if empty it is filled.
     Returns:
         Differentiated by Dr.Jit in both modes; backward any number of times.
     """
-    seen = {} if seen is None else seen
+    cached = {} if cached is None else cached
 
-    def kept(inputs: _Tensors) -> _Tensors:
+    def retained(inputs: _Tensors) -> _Tensors:
         if any(torch.autograd.forward_ad.unpack_dual(x).tangent is not None for x in inputs.values()):
             return {name: _dual(x) for name, x in function(inputs).items()}
         with torch.enable_grad():  # `dr.wrap` calls it as the thread is, and differentiates it later
-            outputs = _Kept.apply(function, seen, tuple(inputs), *inputs.values())
-        return dict(zip(seen, outputs, strict=True))
+            outputs = _RetainedGraph.apply(function, cached, tuple(inputs), *inputs.values())
+        return dict(zip(cached, outputs, strict=True))
 
     wrap: Callable = dr.wrap(source="drjit", target="torch")
-    return wrap(kept)
+    return wrap(retained)
 
 
 def _dual(x: torch.Tensor) -> torch.Tensor:
@@ -97,18 +97,18 @@ def _dual(x: torch.Tensor) -> torch.Tensor:
     return x if tangent is not None else torch.autograd.forward_ad.make_dual(value, torch.zeros_like(value))
 
 
-class _Kept(torch.autograd.Function):
+class _RetainedGraph(torch.autograd.Function):
     """A function whose graph stays, so that it can be differentiated again; each time by itself."""
 
     @staticmethod
-    def forward(ctx: Any, function: Callable, seen: _Tensors, names: tuple, *values: torch.Tensor) -> tuple:
-        if not seen:
-            seen.update(function(dict(zip(names, values, strict=True))))
+    def forward(ctx: Any, function: Callable, cached: _Tensors, names: tuple, *values: torch.Tensor) -> tuple:
+        if not cached:
+            cached.update(function(dict(zip(names, values, strict=True))))
         ctx.function = function
         ctx.names = names
         ctx.values = values
         ctx.graph = None
-        return tuple(x.detach() for x in seen.values())  # an output that is an input would be taken for it
+        return tuple(x.detach() for x in cached.values())  # an output that is an input would be taken for it
 
     @staticmethod
     def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple:  # type: ignore[override]

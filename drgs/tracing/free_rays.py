@@ -28,7 +28,7 @@ from drgs.tracing.records import cross, dot
 
 __all__ = ["FreeRays"]
 
-_ROUNDING = 4e-7  # of float32, in what is subtracted
+_ROUNDING = 4e-7  # of float32, relative, in a difference of two numbers: a few units in the last place
 
 
 class FreeRays(LensRays):

@@ -21,8 +21,8 @@ from drgs.tracing.primitives import Ray
 
 __all__ = ["INTEGRAL", "Integral"]
 
-_ROOT_HALF = 0.7071067811865476
-_BELL = 0.3989422804014327  # 1 / sqrt(2 pi)
+_ROOT_HALF = 0.7071067811865476  # sqrt(1 / 2)
+_INV_SQRT_2PI = 0.3989422804014327  # 1 / sqrt(2 pi)
 
 
 class Integral(Peak):
@@ -65,7 +65,7 @@ class Integral(Peak):
         passed = 0.5 + 0.5 * dr.erf(u * _ROOT_HALF)
         left = strength * gauss * dr.exp(-strength * gauss * passed)
         along = left * passed
-        across = left * dr.exp(-0.5 * u * u) * _BELL
+        across = left * dr.exp(-0.5 * u * u) * _INV_SQRT_2PI
         local = times(extra, 1, p)
         ne = times(extra, 0, e)
         le = times(extra, 1, e)

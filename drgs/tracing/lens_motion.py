@@ -19,8 +19,9 @@ from drgs.cameras.lenses import LENS_MODELS, distorted, equirectangular, linear_
 
 __all__ = ["LensMotion"]
 
-_CONVERGED = 1e-3  # pixels off which a ray may be seen; beyond, the lens has no inverse there, and nothing moves
-_FLAT = 1e-9  # a determinant or slope below has no inverse
+# px by which a ray's projection may miss its pixel; beyond, the lens has no inverse there, and nothing moves
+_MAX_RESIDUAL = 1e-3
+_MIN_SLOPE = 1e-9  # a determinant or slope below has no inverse
 
 
 class LensMotion:
@@ -49,7 +50,7 @@ class LensMotion:
             seen, self.slope = self.radial(self.angle, tuple(camera.distortion))
             plane = self._round(plane, tuple(camera.distortion))
             self.off: list[torch.Tensor] = [seen - torch.hypot(*plane)]
-            self.fixed = ~((self.off[0].abs() * focal < _CONVERGED) & (self.slope.abs() > _FLAT))
+            self.fixed = ~((self.off[0].abs() * focal < _MAX_RESIDUAL) & (self.slope.abs() > _MIN_SLOPE))
             self.slope = torch.where(self.fixed, 1.0, self.slope)
             return
         self.at = [local[:, k] / local[:, 2] for k in range(2)]
@@ -66,7 +67,7 @@ class LensMotion:
         self.off = [a - b for a, b in zip(seen, plane, strict=True)]
         (a, b), (c, d) = self.slopes
         self.determinant = a * d - b * c
-        near = (torch.hypot(*self.off) * focal < _CONVERGED) & (self.determinant.abs() > _FLAT)
+        near = (torch.hypot(*self.off) * focal < _MAX_RESIDUAL) & (self.determinant.abs() > _MIN_SLOPE)
         self.fixed = ~near
         self.determinant = torch.where(near, self.determinant, 1.0)
 

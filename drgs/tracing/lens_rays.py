@@ -44,10 +44,10 @@ __all__ = [
     "tile_boxes",
 ]
 
-NARROW = 0.17  # least d_z of a narrow lens: 80 degrees
-_CELL = 4  # pixels, about, of the least cells of a table of displacements
-_MOST_CELLS = 1024  # in a row of it
-_HELD = 256 << 20  # bytes of tables that are kept for the next view
+NARROW = 0.17  # least d_z of the unit directions of a narrow lens: 80 degrees off the axis (cos 80 = 0.17)
+_CELL_PIXELS = 4  # pixels, about, across the smallest cells of a table of displacements; chosen
+_MAX_CELLS = 1024  # cells in a row of it; chosen: bounds memory
+_MAX_TABLE_BYTES = 256 << 20  # bytes of tables that are kept for the next view; chosen
 _held: OrderedDict[tuple, LensRays] = OrderedDict()
 _lock = threading.Lock()
 
@@ -66,7 +66,7 @@ def lens_of(lib: Lib, camera: Camera, tile: int) -> LensRays | None:
         lens = LensRays(lib, camera, tile)
     with _lock:
         _held[key] = lens
-        while sum(x.size for x in _held.values()) > _HELD and len(_held) > 1:
+        while sum(x.size for x in _held.values()) > _MAX_TABLE_BYTES and len(_held) > 1:
             _held.popitem(last=False)
     return lens
 
@@ -132,7 +132,7 @@ class LensRays:
         low = np.maximum([x.min(initial=np.inf) for x in guides.T], -size)
         high = np.minimum([x.max(initial=-np.inf) for x in guides.T], 2 * size)
         span = np.maximum(high - low, 1.0)
-        count = np.clip(np.ceil(span / _CELL), 1, _MOST_CELLS).astype(np.int64)
+        count = np.clip(np.ceil(span / _CELL_PIXELS), 1, _MAX_CELLS).astype(np.int64)
         self.corner = low
         self.per_pixel = count / span
         cell = np.floor((np.clip(guides, low, high) - low) * self.per_pixel).astype(np.int64)

@@ -17,7 +17,7 @@ from drgs.tracing.arrays import Float, Lib, Mask
 from drgs.tracing.harmonics import sh_basis, sh_color
 from drgs.tracing.records import dot
 
-__all__ = ["Activated", "Lens", "Patch", "Projected", "Ray", "Screen", "SeenColor"]
+__all__ = ["Activated", "Lens", "Patch", "Projected", "Ray", "Screen", "ViewColor"]
 
 _THINNEST = math.log(1e-30)  # of log-scales
 
@@ -125,7 +125,7 @@ class Patch(NamedTuple):
         return dr.fma(hx, abs(a), dr.fma(hy, abs(b), hw[0] * abs(c - a * ax - b * ay)))
 
 
-class SeenColor(NamedTuple):
+class ViewColor(NamedTuple):
     """The color of each Gaussian in a view, evaluated towards its mean, in float32.
 
     Attributes:
@@ -278,7 +278,7 @@ class Activated:
         """(N,) distance of the means from the camera."""
         return dr.sqrt(dot(self.center, self.center))
 
-    def color(self, coefficients: int) -> SeenColor:
+    def color(self, coefficients: int) -> ViewColor:
         """Colors towards the means, from so many SH coefficients (1, 4, 9 or 16)."""
         Float, v = self.lib.Float, self.view
         # The direction in world axes: R_wc times the camera-frame mean.
@@ -290,7 +290,7 @@ class Activated:
         direction = [Float(x * scale) for x in d]
         basis = sh_basis(direction, coefficients)
         rgb = sh_color(basis, lambda k, c: Float(self.column("sh", k * 3 + c, 3 * coefficients)))
-        return SeenColor(direction, Float(scale), basis, rgb)
+        return ViewColor(direction, Float(scale), basis, rgb)
 
 
 def _rotated(view: list, axes: list) -> list:

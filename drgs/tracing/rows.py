@@ -24,7 +24,7 @@ from drgs.tracing.weights import PIXELS, signed
 
 __all__ = ["MemoryBudget", "SortedHits", "SortedRows"]
 
-_TILES = 64  # that a thread sorts at a time
+_TILES_PER_TASK = 64  # tiles that a thread sorts at a time; chosen
 
 
 class MemoryBudget:
@@ -220,11 +220,11 @@ def _sort_by_tile(words: torch.Tensor, lengths: torch.Tensor, counts: torch.Tens
     ends = [0, *(PIXELS * lengths).cumsum(0).tolist()]
 
     def sort(first: int) -> None:
-        for tile in range(first, min(first + _TILES, len(most))):
+        for tile in range(first, min(first + _TILES_PER_TASK, len(most))):
             if most[tile] > 1:
                 flat[ends[tile] : ends[tile + 1]].reshape(PIXELS, -1)[:, : most[tile]].sort(axis=1)
 
-    lots = range(0, len(most), _TILES)
+    lots = range(0, len(most), _TILES_PER_TASK)
     if min(threads, len(lots)) < 2:
         for first in lots:
             sort(first)

@@ -9,7 +9,7 @@ from drgs.cameras.shutters import BY_COLUMN, line_times
 
 __all__ = ["middle_pose", "rolling_view"]
 
-_SMALL = 1e-6  # of a squared sine or angle, below which series replace quotients of zeros
+_SERIES_BELOW = 1e-6  # of a squared sine or angle, below which series replace quotients of zeros
 
 
 def rolling_view(
@@ -49,7 +49,7 @@ def _poses(start: torch.Tensor, end: torch.Tensor, times: torch.Tensor) -> torch
     sine = 0.5 * torch.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     cosine = 0.5 * (turn.diagonal().sum() - 1)
     squared = (sine * sine).sum()
-    small = squared < _SMALL
+    small = squared < _SERIES_BELOW
     length = torch.where(small, 1.0, squared).sqrt()
     # asin(s) / s: of no turn at all the quotient has no derivative, but its series does.
     ratio = torch.where(small, 1 + squared * (1 / 6 + squared * (3 / 40)), torch.atan2(length, cosine) / length)
@@ -58,7 +58,7 @@ def _poses(start: torch.Tensor, end: torch.Tensor, times: torch.Tensor) -> torch
     zero = torch.zeros_like(x)
     generator = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
     angles2 = (times * times * (axis * axis).sum())[:, None, None]
-    small = angles2 < _SMALL
+    small = angles2 < _SERIES_BELOW
     angles = torch.where(small, 1.0, angles2).sqrt()
     first = torch.where(small, 1 - angles2 / 6 + angles2**2 / 120, angles.sin() / angles)
     second = torch.where(small, 0.5 - angles2 / 24 + angles2**2 / 720, (1 - angles.cos()) / angles**2)

@@ -30,9 +30,9 @@ from drgs.tracing.records import dot
 
 __all__ = ["silhouette"]
 
-_PAD = 1e-3  # px; rounding of float32 bounds
+_BOUND_PAD = 1e-3  # px added to bounds for the rounding of float32
 _NOWHERE = 1e30  # px, beyond the image
-_WHOLE = 4.0  # radians; the fisheye sees no farther than pi
+_FULL_CIRCLE = 4.0  # radians, for no bound: the fisheye sees no farther than pi
 
 
 class _Plane(NamedTuple):
@@ -95,7 +95,12 @@ def _in_pixels(screen: Screen, middle: list[Float], half: list[Float]) -> list[F
     grow_x = abs(fx) * half[0] + abs(skew) * half[1]
     x = fx * middle[0] + skew * middle[1] + cx
     y = fy * middle[1] + cy
-    return [x - grow_x - _PAD, y - abs(fy) * half[1] - _PAD, x + grow_x + _PAD, y + abs(fy) * half[1] + _PAD]
+    return [
+        x - grow_x - _BOUND_PAD,
+        y - abs(fy) * half[1] - _BOUND_PAD,
+        x + grow_x + _BOUND_PAD,
+        y + abs(fy) * half[1] + _BOUND_PAD,
+    ]
 
 
 def _grown(half_axes: list[Float], reach: Float) -> list[Float]:
@@ -151,8 +156,10 @@ def _fisheye(c: list[Float], axes: list[list[Float]], seen: _Plane) -> tuple[lis
         # x atan(r) / r, r^2 = x^2 + y^2, grows with x; it is the larger the nearer y is to 0 on the positive side.
         near = dr.maximum(dr.maximum(other_low, -other_high), 0)
         far = dr.maximum(abs(other_low), abs(other_high))
-        plane.append((_seen_at(low, dr.select(low > 0, far, near)), _seen_at(high, dr.select(high > 0, near, far))))
-    whole = [(dr.select(front, a, -_WHOLE), dr.select(front, b, _WHOLE)) for a, b in plane]
+        plane.append(
+            (_equidistant_x(low, dr.select(low > 0, far, near)), _equidistant_x(high, dr.select(high > 0, near, far)))
+        )
+    whole = [(dr.select(front, a, -_FULL_CIRCLE), dr.select(front, b, _FULL_CIRCLE)) for a, b in plane]
     sector = _sector(c, axes)
     low = [dr.maximum(a[0], b[0]) for a, b in zip(whole, sector, strict=True)]
     high = [dr.minimum(a[1], b[1]) for a, b in zip(whole, sector, strict=True)]
@@ -167,19 +174,19 @@ def _panorama(c: list[Float], axes: list[list[Float]]) -> tuple[list[Float], lis
     longitude = dr.atan2(turned[1], turned[0])
     west, east = longitude + dr.atan(sector.left), longitude + dr.atan(sector.right)
     around = sector.axial | (west < -math.pi) | (east > math.pi)
-    west, east = dr.select(around, -_WHOLE, west), dr.select(around, _WHOLE, east)
+    west, east = dr.select(around, -_FULL_CIRCLE, west), dr.select(around, _FULL_CIRCLE, east)
     # Latitude counts downwards, from the horizon; the angle from the upper pole, upwards, from it.
     top = dr.select(sector.axial, sector.theta - sector.width, sector.first)
     bottom = dr.select(sector.axial, sector.theta + sector.width, sector.last)
     north, south = top - math.pi / 2, bottom - math.pi / 2
     whole = sector.surrounds
     return (
-        [west, dr.select(whole, -_WHOLE, north)],
-        [east, dr.select(whole, _WHOLE, south)],
+        [west, dr.select(whole, -_FULL_CIRCLE, north)],
+        [east, dr.select(whole, _FULL_CIRCLE, south)],
     )
 
 
-def _seen_at(x: Float, y: Float) -> Float:
+def _equidistant_x(x: Float, y: Float) -> Float:
     """First coordinate under the equidistant fisheye of a point (x, y) of the plane z = 1."""
     r = dr.sqrt(x * x + y * y)
     # atan(r) / r is 1 at 0 and below it elsewhere.
@@ -217,7 +224,7 @@ def _sector(c: list[Float], axes: list[list[Float]]) -> list[tuple[Float, Float]
     """Least and largest x, and y, of the sector under the equidistant fisheye."""
     s = _cone(c, axes)
     # Around the axis: no farther from it than the cone that holds both pairs of planes.
-    disc = dr.select(s.surrounds, _WHOLE, dr.minimum(s.theta + s.width, math.pi))
+    disc = dr.select(s.surrounds, _FULL_CIRCLE, dr.minimum(s.theta + s.width, math.pi))
     cos_delta = dr.minimum(s.cos_left, s.cos_right)
     outward = dr.select(s.axial, -disc, s.first * cos_delta), dr.select(s.axial, disc, s.last)
     left, right = s.last * s.left * s.cos_left, s.last * s.right * s.cos_right

@@ -13,8 +13,8 @@ __all__ = ["BEYOND", "EMPTY", "ascending", "name_of", "positive", "push", "word_
 
 EMPTY = -1.0  # "no hit"; order keys of hits are >= 0
 BEYOND = 1e308  # above the word of any hit
-_FEW = 4  # threads; more of them sort faster together, by digits, than one does in vector registers
-_LEAST = 1.2e-38  # of keys: below, float32 is not normal
+_VECTOR_SORT_THREADS = 4  # threads up to which one sort in vector registers is faster than a radix sort by all of them
+_MIN_KEY = 1.2e-38  # of keys: below, float32 is not normal
 
 
 def word_of(lib: Lib, key: Float, name: UInt32) -> Float:
@@ -22,7 +22,7 @@ def word_of(lib: Lib, key: Float, name: UInt32) -> Float:
     before those of the name. Processors exchange floats faster than integers. `EMPTY` for a key below 0.
     """
     # Where the float32 is not normal the float64 would not be, and might become 0.
-    key = dr.select(key >= 0, dr.maximum(key, _LEAST), EMPTY)
+    key = dr.select(key >= 0, dr.maximum(key, _MIN_KEY), EMPTY)
     bits = lib.UInt64(dr.reinterpret_array(lib.UInt32, key)) << 32
     return dr.reinterpret_array(lib.Float64, bits | lib.UInt64(name))
 
@@ -56,7 +56,7 @@ def ascending(lib: Lib, keys: UInt64) -> UInt64:
         # Dr.Jit's sort by digits is forty launches, which take ten times as long as sorting.
         top = lib.UInt64(1 << 63)  # torch knows signed numbers only
         return lib.UInt64(lib.Int64(torch.sort(lib.Int64(keys ^ top).torch()).values)) ^ top
-    if runtime.backend().threads > _FEW:
+    if runtime.backend().threads > _VECTOR_SORT_THREADS:
         keys = dr.sort(keys)
         dr.eval(keys)
         return keys

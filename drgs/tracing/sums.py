@@ -16,9 +16,9 @@ from drgs.tracing.arrays import Float, Lib, Mask, UInt32
 
 __all__ = ["add_row"]
 
-_PACKET = 16  # floats that are added at once, at most
-_FEW = 2  # floats of a packet that are added faster one by one
-_COPIES = 256 << 20  # bytes that the copies of a buffer may take
+_PACKET_FLOATS = 16  # floats that are added at once, at most
+_SINGLY_UP_TO = 2  # floats of a packet up to which adding them one by one is faster
+_MAX_COPY_BYTES = 256 << 20  # bytes that the copies of a buffer, one a thread, may take; chosen
 
 
 def add_row(
@@ -41,12 +41,12 @@ def add_row(
     if not _has_copies(buffer):
         width = 1
     else:
-        width = math.gcd(stride, first, _PACKET)
+        width = math.gcd(stride, first, _PACKET_FLOATS)
         mode = dr.ReduceMode.Expand
     for k in range(0, len(values), width):
         packet = values[k : k + width]
         used = [j for j, x in enumerate(packet) if x is not None]
-        if len(used) <= _FEW or width == 1:
+        if len(used) <= _SINGLY_UP_TO or width == 1:
             for j in used:
                 dr.scatter_add(buffer, packet[j], row * stride + (first + k + j), active, mode=mode)
             continue
@@ -58,4 +58,4 @@ def add_row(
 
 def _has_copies(buffer: Float) -> bool:
     """Whether every thread may have a copy of a buffer."""
-    return dr.backend_v(buffer) == dr.JitBackend.LLVM and 4 * dr.width(buffer) * dr.thread_count() <= _COPIES
+    return dr.backend_v(buffer) == dr.JitBackend.LLVM and 4 * dr.width(buffer) * dr.thread_count() <= _MAX_COPY_BYTES

@@ -40,17 +40,21 @@ TABLES = 128 << 20
 """Bytes of the rows of pixels that are sorted at a time, and of a table that the adjoint fills in exact order
 (information: twice that, with a semantic channel four times); a single tile's may have more.
 """
-_CARD = 8
-"""On a card bands are up to so many times as wide, because many lanes must run at once: as many times as `_FOR_EACH`
-fits into its memory. To sort the hits of a band torch takes up to a tenth of that.
+_MAX_GPU_BANDS = 8
+"""On a card bands are up to so many times as wide, because many lanes must run at once: as many times as
+`_BYTES_PER_BAND` fits into its memory. To sort the hits of a band torch takes up to a tenth of that.
 """
-_FOR_EACH = 10 << 30  # bytes
-_CORNERS = {1: [(0, 0)], 2: [(0, 0), (0, 4)], 4: [(0, 0), (4, 0), (0, 4), (4, 4)]}  # of pixels that share a lane
-_NOWHERE = 2**64 - 1  # key of no entry: sorted behind all others
-_HELD = 128 << 20  # bytes of the orders of all pixels, which derivatives need again
-_TAILS = 5e-6  # what the tails left out of a pixel may add up to
-_LARGE = 8  # tiles of a box, on average, from which on each is looked at
-_HUGE = 16  # likewise, from which on blocks of them are, first
+_BYTES_PER_BAND = 10 << 30  # bytes
+# offsets, px, of the pixels that share a lane
+_LANE_PIXELS = {1: [(0, 0)], 2: [(0, 0), (0, 4)], 4: [(0, 0), (4, 0), (0, 4), (4, 4)]}
+_NO_KEY = 2**64 - 1  # key of no entry: sorted behind all others
+# bytes of the orders of all pixels that are held, because derivatives need them again; chosen
+_MAX_ORDER_BYTES = 128 << 20
+# largest sum of the opacities of the tails that are left out of a pixel: half of the image's bound of 1e-5
+# (docs/numerics.md)
+_MAX_TAIL_SUM = 5e-6  # largest sum of opacities of the tails left out of a pixel: half of the bound of images, 1e-5
+_TEST_TILES_FROM = 8  # tiles of a box, on average, from which on each tile is tested against the ellipse
+_TEST_BLOCKS_FROM = 16  # likewise, from which on blocks of tiles are tested first
 _BLOCK = 8  # tiles along the edge of a block
 
 
@@ -60,7 +64,7 @@ class TileTraversal:
     Args:
         pinhole: Opaque Float64 (fx, skew, cx, fy, cy).
         lens: The camera's, if it is no pinhole; of rays without a common origin `FreeRays`.
-        trimmed: Leave tails out, in `ray` order, whose opacities add up to `_TAILS` at most in a pixel.
+        trimmed: Leave tails out, in `ray` order, whose opacities add up to `_MAX_TAIL_SUM` at most in a pixel.
     """
 
     def __init__(
@@ -100,7 +104,7 @@ class TileTraversal:
         size = self.width, self.height
         self.lists = build(self.lib, self.projected, self.settings, *size, records, self.trimmed, self.lens)
         self.certificate["pairs"] = self.lists.pairs
-        self.budget = MemoryBudget(_room(_HELD) if replayed else 0)
+        self.budget = MemoryBudget(_room(_MAX_ORDER_BYTES) if replayed else 0)
         if self.settings.order == "ray":
             self.certificate |= {"rays": self.rays, "redone": 0}  # rows hold every hit
 
@@ -194,7 +198,7 @@ class TileTraversal:
         # 16 consecutive lanes, a packet, are 4x4 pixels.
         x = (tile % lists.columns) * TILE + (block % 2) * 4 + k % 4
         y = (tile // lists.columns) * TILE + (block // 2) * 4 + k // 4
-        corners = _CORNERS[share]
+        corners = _LANE_PIXELS[share]
         pixels = [(x + a, y + b) for a, b in corners]
         inside = [(px < self.width) & (py < self.height) for px, py in pixels]
         flat = [py * self.width + px for px, py in pixels]
@@ -331,9 +335,9 @@ def build(
     what = f"({count} Gaussians, {width}x{height} pixels)"
     # A box holds many tiles that its ellipse misses, most of all where a Gaussian reaches behind the camera. Small
     # boxes hold few, and looking for them costs more than they do.
-    tested = boxes.pairs > _LARGE * boxes_seen
+    tested = boxes.pairs > _TEST_TILES_FROM * boxes_seen
     loaded = [dr.gather(lib.Float, record, order * layout.RECORD + k) for k in range(layout.RECORD)]
-    if boxes.pairs > _HUGE * boxes_seen and lens is None:
+    if boxes.pairs > _TEST_BLOCKS_FROM * boxes_seen and lens is None:
         across = -(-columns // _BLOCK)
         found = boxes.of_blocks().keys(across, _Tiles(lib, settings, loaded, size=_BLOCK * TILE), what)
         if not dr.width(found):
@@ -365,7 +369,7 @@ def _shorter(
 ) -> Lists:
     """Shorter lists: an extent that bounds the sum of the tails of all Gaussians is longer than a tile needs, which
     lists few of them. Beyond the extent a Gaussian has at most the opacity 1e-5 / N (projection.py); beyond a squared
-    one that is less by c, exp(c / 2) times as much, so that n tails add up to _TAILS where c = 2 ln(_TAILS N / 1e-5 n).
+    one that is less by c, exp(c / 2) times as much, so that n tails add up to _MAX_TAIL_SUM where c = 2 ln(_MAX_TAIL_SUM N / 1e-5 n).
 
     Args:
         tile: (pairs,) of each entry.
@@ -374,7 +378,7 @@ def _shorter(
         lens: The camera's, if it is no pinhole.
     """
     listed = lib.Float(lists.end - lists.start)
-    cut = dr.maximum(2 * dr.log(_TAILS / 1e-5 * count / dr.maximum(listed, 1)), 0)
+    cut = dr.maximum(2 * dr.log(_MAX_TAIL_SUM / 1e-5 * count / dr.maximum(listed, 1)), 0)
     loaded = load_record(lib, record, lists.index, lib.Bool(True))
     tiles = _Tiles(lib, settings, loaded, dr.gather(lib.Float, cut, tile), lens)
     x, y = lib.Int32(tile % lists.columns), lib.Int32(tile // lists.columns)
@@ -519,7 +523,7 @@ class _Boxes:
         if self.pairs == 0:
             return dr.zeros(lib.UInt64, 0)
         offset = dr.cumsum(self.amount) - self.amount
-        keys = dr.full(lib.UInt64, _NOWHERE, self.pairs)
+        keys = dr.full(lib.UInt64, _NO_KEY, self.pairs)
         x0, x1 = self.x
 
         def body(k: UInt32, x: Int32, y: Int32) -> tuple[UInt32, Int32, Int32]:
@@ -534,7 +538,7 @@ class _Boxes:
         with dr.suspend_grad():  # lists have no derivative
             dr.while_loop(start, lambda k, x, y: k < self.amount, body)
         dr.eval(keys)
-        return keys if tiles is None else dr.gather(lib.UInt64, keys, dr.compress(keys != _NOWHERE))
+        return keys if tiles is None else dr.gather(lib.UInt64, keys, dr.compress(keys != _NO_KEY))
 
 
 def _room(size: int) -> int:
@@ -542,7 +546,7 @@ def _room(size: int) -> int:
     if runtime.backend().name != "cuda":
         return size
     whole = memory.of_card()
-    return size * (_CARD if whole is None else min(max(whole // _FOR_EACH, 1), _CARD))
+    return size * (_MAX_GPU_BANDS if whole is None else min(max(whole // _BYTES_PER_BAND, 1), _MAX_GPU_BANDS))
 
 
 def _area(lib: Lib, x: Sequence[Int32], y: Sequence[Int32]) -> UInt32:

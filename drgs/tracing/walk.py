@@ -32,12 +32,12 @@ from drgs.tracing.weights import PIXELS, Weights
 
 __all__ = ["BUFFER", "NOWHERE", "ListStream", "Part", "Slots", "Traversal", "pixels_a_lane"]
 
-BUFFER = 20  # hits that a ray is sorted among
-_DEEP = 48  # of rays for which these were too few
-_MANY = 1000  # such rays, from which on a kernel of their own is worth compiling
+BUFFER = 20  # hits that a ray is sorted among; a ray for which these are too few is walked again (docs/numerics.md)
+_DEEP_BUFFER = 48  # the same where these were too few: on fits 40 to 80 % of the rays (commit 07ccb400)
+_DEEP_FROM = 1000  # such rays, from which on compiling a kernel of their own is worth its time
 NOWHERE = 0xFFFFFFFF  # place in a list of a ray that composited nothing
-_WORD = 32  # bits of a word beside the key: the lane and the Gaussian
-_MAX_HITS = 1 << 25  # of one sorted list; longer ones are split by rays
+_WORD_BITS = 32  # bits of a word beside the key: the lane and the Gaussian
+_MAX_SORTED_HITS = 1 << 25  # of one sorted list; longer ones are split by rays
 
 
 def pixels_a_lane(basis: int = 0) -> int:
@@ -195,10 +195,10 @@ class Part:
             stream,
             ordered=True,
             center_key=self.center_key,
-            buffer=_DEEP,
+            buffer=_DEEP_BUFFER,
             first=False,
         )
-        return [part] if count >= _MANY and self.buffer < _DEEP else part._listed(count)
+        return [part] if count >= _DEEP_FROM and self.buffer < _DEEP_BUFFER else part._listed(count)
 
     def _listed(self, count: int) -> list[Part]:
         """Parts with the same rays along sorted lists of all their hits."""
@@ -209,7 +209,7 @@ class Part:
             total = int(dr.sum(lib.UInt64(hits))[0])
             gaussians = dr.width(self.records) // RECORD
             bits = max(1, (gaussians - 1).bit_length())
-            if (total > _MAX_HITS or (count - 1) >> max(_WORD - bits, 0)) and count > 1:
+            if (total > _MAX_SORTED_HITS or (count - 1) >> max(_WORD_BITS - bits, 0)) and count > 1:
                 half = dr.arange(lib.UInt32, count // 2)
                 rest = dr.arange(lib.UInt32, count - dr.width(half)) + dr.width(half)
                 return [part for lanes in (half, rest) for part in self.again(lanes)]

@@ -10,7 +10,7 @@ these W (entries, 64)
 
 are dense products, which a processor does at its full speed. The adjoint of the colors reads s, one number a hit,
 instead of D features and D cotangents. Weights are held for as many tiles at a time as `MATRIX` bytes have room for;
-products take those entries that any pixel of the tile composites, `_WORK` bytes of their features at a time.
+products take those entries that any pixel of the tile composites, `_PRODUCT_BYTES` bytes of their features at a time.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from drgs.tracing.arrays import Float, Lib, UInt32
 
 __all__ = ["MATRIX", "PIXELS", "Weights", "in_rows", "signed", "without_graph"]
 
-PIXELS = 64  # of a tile
+PIXELS = 64  # pixels of a tile, 8 x 8
 MATRIX = 128 << 20
 """Bytes of the weights that are held at once; more where the list of a single tile has more."""
-_WORK = 4 << 20  # bytes of the features of the entries that one product takes
-_SLACK = 8  # tiles of one product: the most entries may be more than the fewest by 1/8, or by as many entries
+_PRODUCT_BYTES = 4 << 20  # bytes of the features of the entries that one product takes; chosen
+_GROUPING_SLACK = 8  # tiles of one product: the most entries may be more than the fewest by 1/8, or by as many entries
 
 
 @dataclasses.dataclass
@@ -53,7 +53,7 @@ class _Group:
     def slices(self, width: int) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
         """(rows, Gaussians) of as many entries at a time as there is room for."""
         tiles, entries = self.rows.shape
-        step = max(1, _WORK // (4 * width * tiles))
+        step = max(1, _PRODUCT_BYTES // (4 * width * tiles))
         for k in range(0, entries, step):
             yield self.rows[:, k : k + step].reshape(-1), self.index[:, k : k + step].reshape(-1)
 
@@ -174,9 +174,11 @@ class Weights:
         self._width = width
         while k < filled:
             most = int(counts[k])
-            fewest = max(most - max(most // _SLACK, _SLACK), 1)
+            fewest = max(most - max(most // _GROUPING_SLACK, _GROUPING_SLACK), 1)
             similar = len(tiles) - int(torch.searchsorted(ascending, fewest)) - k
-            count = max(min(similar, _WORK // (4 * width * max(most, PIXELS))), 1)  # rows of features, or of pixels
+            count = max(
+                min(similar, _PRODUCT_BYTES // (4 * width * max(most, PIXELS))), 1
+            )  # rows of features, or of pixels
             own = tiles[k : k + count]
             j = torch.arange(most, device=tiles.device)
             at = torch.where(j < counts[k : k + count, None], starts[own, None] + j, -1)  # -1: the row that is 0

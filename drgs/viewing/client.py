@@ -20,8 +20,8 @@ from drgs.ellipsoids import Y_00, Gaussians, semi_axes
 __all__ = ["ClientGaussians", "Pose", "camera_of", "looking", "pose_of"]
 
 _WIDEST = math.radians(150.0)  # widest view of a client; a wider one is drawn so wide
-_LARGEST = 1 << 15  # pixels of a side of a window
-_FARTHEST = 1e30  # world units, largest coordinate: far beyond any scene, and within float32 (3e38)
+_MAX_WINDOW = 1 << 15  # pixels of a side of a window
+_MAX_COORDINATE = 1e30  # world units, largest coordinate: far beyond any scene, and within float32 (3e38)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -56,16 +56,16 @@ class Pose:
             given = np.concatenate([np.ravel(np.asarray(x, np.float64)) for x in (wxyz, position, fov, width, height)])
         except (TypeError, ValueError):
             return None
-        if given.shape != (10,) or not np.isfinite(given).all() or np.abs(given).max() > _FARTHEST:
+        if given.shape != (10,) or not np.isfinite(given).all() or np.abs(given).max() > _MAX_COORDINATE:
             return None
         quaternion = given[:4]
         place = given[4:7]
         angle, across, down = given[7:]
         length = float(np.linalg.norm(quaternion))
         if (
-            length < 1 / _FARTHEST
+            length < 1 / _MAX_COORDINATE
             or not 0 < angle < math.pi
-            or not 1 <= min(across, down) <= max(across, down) <= _LARGEST
+            or not 1 <= min(across, down) <= max(across, down) <= _MAX_WINDOW
         ):
             return None
         size = int(across), int(down)
@@ -121,10 +121,10 @@ def looking(pose: Pose, aspect: float) -> float:
     return min(2 * math.atan(tangent * max(1.0, pose.aspect / aspect)), _WIDEST)
 
 
-_LARGE = 64.0  # units of the client's lengths that the larger Gaussians have as their standard deviation
-_QUANTILE = 0.999  # quantile of the sizes that says which Gaussians those are
-_MOST = 60_000.0  # largest entry of a covariance: half floats end at 65,504
-_SMALLEST = 1e-30  # smallest size of the larger Gaussians, in the world's unit: its inverse is a float32, too
+_CLIENT_SIGMA = 64.0  # units of the client's lengths that the larger Gaussians have as their standard deviation
+_LARGE_QUANTILE = 0.999  # quantile of the sizes that says which Gaussians those are
+_MAX_COVARIANCE = 60_000.0  # largest entry of a covariance: half floats end at 65,504
+_MIN_SIZE = 1e-30  # smallest size of the larger Gaussians, in the world's unit: its inverse is a float32, too
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -160,15 +160,15 @@ class ClientGaussians:
         with torch.no_grad():  # what a browser is sent has no derivative, and NumPy takes no tensor that has one
             scales = g.scales.double()  # may be infinite: float32 ends at the exponential of 88
             sizes = scales.amax(1).cpu().numpy()
-            large = float(np.quantile(sizes, _QUANTILE)) if len(sizes) else 1.0
-            factor = _LARGE / large if _SMALLEST < large < 1 / _SMALLEST else 1.0
+            large = float(np.quantile(sizes, _LARGE_QUANTILE)) if len(sizes) else 1.0
+            factor = _CLIENT_SIGMA / large if _MIN_SIZE < large < 1 / _MIN_SIZE else 1.0
             # An infinite scale times a 0 of the rotation would be NaN; the products stay below half floats' end.
-            axes = semi_axes(g.quats.double(), (scales * factor).clamp_max(_MOST**0.5))
-            covariances = (axes @ axes.transpose(1, 2)).float().clamp(-_MOST, _MOST).cpu().numpy()
+            axes = semi_axes(g.quats.double(), (scales * factor).clamp_max(_MAX_COVARIANCE**0.5))
+            covariances = (axes @ axes.transpose(1, 2)).float().clamp(-_MAX_COVARIANCE, _MAX_COVARIANCE).cpu().numpy()
             if rgbs is None:
                 color = (0.5 + Y_00 * g.sh[:, 0]).clamp(0, 1)  # bytes would wrap around
                 rgbs = (255 * color).round().to(torch.uint8).cpu().numpy()
             # Beyond float32 a center would be infinite, which the client draws nothing of, neighbors included.
-            centers = (g.means.double() * factor).clamp(-_FARTHEST, _FARTHEST).float().cpu().numpy()
+            centers = (g.means.double() * factor).clamp(-_MAX_COORDINATE, _MAX_COORDINATE).float().cpu().numpy()
             opacities = g.opacities.float()[:, None].cpu().numpy()
         return cls(centers, covariances, rgbs, opacities, 1.0 / factor)

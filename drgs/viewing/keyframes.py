@@ -22,12 +22,13 @@ if TYPE_CHECKING:
 
 __all__ = ["KeyframeFolder"]
 
-_STEP = 2.0  # seconds from a keyframe to the next
+# Chosen by eye.
+_DEFAULT_STEP = 2.0  # seconds from a keyframe to the next
 _SHORTEST, _LONGEST = 0.1, 600.0  # of such a step
-_MANY = 100  # keyframes; of the longest steps they are less long than a file may say
-_SEGMENTS = 24  # of the way's line, from a keyframe to the next
-_COLOR = (66, 135, 245)  # RGB of the way and its keyframes: the blue of photographs
-_FRAME = 1 / 20  # seconds, in a preview
+_MAX_KEYFRAMES = 100  # keyframes; of the longest steps they are less long than a file may say
+_PATH_SEGMENTS = 24  # line segments of the drawn path, from a keyframe to the next
+_PATH_COLOR = (66, 135, 245)  # RGB of the path and its keyframes: the blue of photographs
+_PREVIEW_FRAME = 1 / 20  # seconds a frame of a preview
 
 
 class KeyframeFolder:
@@ -61,7 +62,7 @@ class KeyframeFolder:
             self._text = gui.add_html("")
             self._step = gui.add_number(
                 "seconds to the next",
-                _STEP,
+                _DEFAULT_STEP,
                 min=_SHORTEST,
                 max=_LONGEST,
                 step=0.1,
@@ -109,10 +110,10 @@ class KeyframeFolder:
 
     async def _added(self, _: Any) -> None:
         self.close()
-        if len(self.keyframes) >= _MANY:
+        if len(self.keyframes) >= _MAX_KEYFRAMES:
             return
         step = self._step.value
-        step = float(step) if isinstance(step, int | float) and _SHORTEST <= step <= _LONGEST else _STEP
+        step = float(step) if isinstance(step, int | float) and _SHORTEST <= step <= _LONGEST else _DEFAULT_STEP
         seconds = self.keyframes[-1].seconds + step if self.keyframes else 0.0
         self.keyframes.append(dataclasses.replace(self._here(), seconds=seconds))
         self._show()
@@ -142,7 +143,7 @@ class KeyframeFolder:
         began = time.monotonic()
         while (gone := (time.monotonic() - began) / flight.seconds) < 1:
             self._go(flight.at(np.array([gone]))[0], False)
-            await asyncio.sleep(_FRAME)
+            await asyncio.sleep(_PREVIEW_FRAME)
         self._go(flight.at(np.array([1.0]))[0], True)
         self.close()
 
@@ -155,7 +156,7 @@ class KeyframeFolder:
         count = len(self.keyframes)
         long = f", {self.flight.seconds:.1f} s" if count > 1 else ""
         self._text.content = panel.status(f"{count} keyframe{'' if count == 1 else 's'}{long}")
-        self._add.disabled = count >= _MANY
+        self._add.disabled = count >= _MAX_KEYFRAMES
         for button, least in ((self._drop, 1), (self._fly, 2), (self._save, 1)):
             button.disabled = count < least
         if self._line is not None:
@@ -163,10 +164,10 @@ class KeyframeFolder:
             self._line = None
         if count < 2:
             return
-        shares = np.linspace(0.0, 1.0, _SEGMENTS * count)
+        shares = np.linspace(0.0, 1.0, _PATH_SEGMENTS * count)
         way = np.array([key.position for key in self.flight.at(shares)]) - self._origin
         with contextlib.suppress(RuntimeError):  # the browser has gone
             self._line = self.client.scene.add_line_segments(
-                "/flight", np.stack([way[:-1], way[1:]], axis=1), _COLOR, thickness=2.0, thickness_units="screen"
+                "/flight", np.stack([way[:-1], way[1:]], axis=1), _PATH_COLOR, thickness=2.0, thickness_units="screen"
             )
             self._show_line(not self.is_flying)

@@ -35,13 +35,13 @@ if TYPE_CHECKING:
 __all__ = [
     "UNCERTAINTY",
     "ColorScale",
-    "Done",
+    "DrawingProgress",
     "Drawing",
     "Layer",
     "Steps",
     "Uncertainty",
     "bands",
-    "drawn",
+    "rendered_in_bands",
     "layers_of",
     "over",
     "stages",
@@ -49,7 +49,7 @@ __all__ = [
 ]
 
 
-class Done(NamedTuple):
+class DrawingProgress(NamedTuple):
     """How far a picture is.
 
     Attributes:
@@ -61,11 +61,12 @@ class Done(NamedTuple):
     rows: np.ndarray | None = None
 
 
-Steps = Generator[Done, None, np.ndarray]
+Steps = Generator[DrawingProgress, None, np.ndarray]
 """Yields its progress between its steps, and returns what it has made."""
 
-_FIRST = 16_000  # pixels of the first picture
-_BAND = 48_000  # pixels that are drawn in one step
+# A first picture is there at once, and a step ends soon enough for a newer request; chosen.
+_FIRST_PIXELS = 16_000  # pixels of the first picture
+_BAND_PIXELS = 48_000  # pixels that are drawn in one step
 
 
 def stages(camera: Camera, most: int) -> list[Camera]:
@@ -76,11 +77,11 @@ def stages(camera: Camera, most: int) -> list[Camera]:
         most: Largest number of pixels; no picture is larger than the window either.
     """
     last = at_most(camera, most)
-    first = at_most(camera, _FIRST)
+    first = at_most(camera, _FIRST_PIXELS)
     return [first, last] if 2 * first.width * first.height < last.width * last.height else [last]
 
 
-def bands(camera: Camera, pixels: int = _BAND) -> list[Camera]:
+def bands(camera: Camera, pixels: int = _BAND_PIXELS) -> list[Camera]:
     """Cameras that show the rows of a view from top to bottom, each at most so many pixels, but a row at least."""
     rows = max(1, pixels // camera.width)
     parts = []
@@ -89,7 +90,7 @@ def bands(camera: Camera, pixels: int = _BAND) -> list[Camera]:
     return parts
 
 
-def drawn(
+def rendered_in_bands(
     scene: Scene,
     camera: Camera,
     settings: RenderSettings,
@@ -118,7 +119,7 @@ def drawn(
         below += part.height
         if colors is not None:
             shown.append(colors(parts[-1]))
-        yield Done(below / camera.height, np.concatenate(shown) if shown else None)
+        yield DrawingProgress(below / camera.height, np.concatenate(shown) if shown else None)
     return np.concatenate(parts)
 
 
@@ -138,9 +139,9 @@ def over(before: np.ndarray, rows: np.ndarray, height: int) -> np.ndarray:
 
 
 UNCERTAINTY = "uncertainty"
-_WIDE_PIXELS = 200_000  # pixels of a picture of features: 100 MB of 128 channels
+_FEATURE_PIXELS = 200_000  # pixels of a picture of features: 100 MB of 128 channels
 _VARIANCE = "variance of the color, as a multiple of the photographs' noise, logarithmic"
-_ROW = 4096  # Gaussians that are colored at once: bounds the memory of their features
+_GAUSSIANS_AT_ONCE = 4096  # Gaussians that are colored at once: bounds the memory of their features
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,7 +167,7 @@ class Drawing:
     scale: ColorScale | None = None
 
 
-Drawings = Generator[Done, None, Drawing]
+Drawings = Generator[DrawingProgress, None, Drawing]
 """Yields its progress between its steps, and returns the picture."""
 
 Draw = Callable[["Scene", "Camera", "RenderSettings"], Drawings]
@@ -213,7 +214,7 @@ def layers_of(
     }
     for kind, colors_of in semantic.items():
         tint = None if kind == "overlay" else _tint_of(colors_of)
-        layers.append(Layer(kind, hints.get(kind, kind), _semantic(colors_of), _WIDE_PIXELS, tint))
+        layers.append(Layer(kind, hints.get(kind, kind), _semantic(colors_of), _FEATURE_PIXELS, tint))
     if uncertainty is not None:
         hint = "variance that the photographs leave to each pixel's color: bright is uncertain, dark is well known"
         layers.append(Layer(UNCERTAINTY, hint, _mapped(uncertainty), pixels))
@@ -227,7 +228,7 @@ def tinted(layer: Layer, gaussians: Gaussians) -> np.ndarray | None:
 
 def _rgb(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
     read = lambda out: pictures.to_bytes(out.rgb.cpu().numpy())  # noqa: E731
-    return Drawing((yield from drawn(scene, camera, settings, read, colors=lambda rows: rows)))
+    return Drawing((yield from rendered_in_bands(scene, camera, settings, read, colors=lambda rows: rows)))
 
 
 def _depth(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
@@ -235,20 +236,20 @@ def _depth(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
         assert out.depth is not None  # asked for
         return np.stack([out.depth.cpu().numpy(), out.alpha.cpu().numpy()], axis=-1)
 
-    values = yield from drawn(scene, camera, settings, read)
+    values = yield from rendered_in_bands(scene, camera, settings, read)
     picture, (near, far) = pictures.depth_colors(values[..., 0], values[..., 1])
     return Drawing(picture, ColorScale(far, near, "distance, in the scene's unit"))
 
 
 def _missing(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
     read = lambda out: 1 - out.alpha.cpu().numpy()  # noqa: E731
-    shares = yield from drawn(scene, camera, settings, read, colors=pictures.inferno)
+    shares = yield from rendered_in_bands(scene, camera, settings, read, colors=pictures.inferno)
     return Drawing(pictures.inferno(shares), ColorScale(0.0, 1.0, "share of the light, none to all"))
 
 
 def _semantic(colors_of: Callable[[Output], np.ndarray]) -> Draw:
     def draw(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
-        return Drawing((yield from drawn(scene, camera, settings, colors_of, True, lambda rows: rows)))
+        return Drawing((yield from rendered_in_bands(scene, camera, settings, colors_of, True, lambda rows: rows)))
 
     return draw
 
@@ -256,7 +257,7 @@ def _semantic(colors_of: Callable[[Output], np.ndarray]) -> Draw:
 def _mapped(uncertainty: Uncertainty) -> Draw:
     def draw(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
         variance = uncertainty.map(camera)
-        yield Done(1.0)
+        yield DrawingProgress(1.0)
         picture, (low, high) = pictures.map_colors(variance)
         return Drawing(picture, ColorScale(low, high, _VARIANCE))
 
@@ -270,7 +271,9 @@ def _tint_of(colors_of: Callable[[Output], np.ndarray]) -> Callable[[Gaussians],
     def tint(g: Gaussians) -> np.ndarray:
         assert g.features is not None  # else there is no such layer
         rows = []
-        for features in g.features.detach().split(_ROW):  # colors for a browser: NumPy takes no tensor with a gradient
+        for features in g.features.detach().split(
+            _GAUSSIANS_AT_ONCE
+        ):  # colors for a browser: NumPy takes no tensor with a gradient
             rgb = torch.zeros(1, len(features), 3)
             alpha = torch.ones(1, len(features))
             rows.append(colors_of(Output(rgb=rgb, alpha=alpha, features=features[None]))[0])
@@ -279,8 +282,8 @@ def _tint_of(colors_of: Callable[[Output], np.ndarray]) -> Callable[[Gaussians],
     return tint
 
 
-_SKETCH_VIEWS = 24  # at most: a sketch takes seconds
-_SKETCH_PIXELS = 2400  # of each of its views, at most
+_SKETCH_VIEWS = 24  # training views that a sketch of the uncertainty uses, at most: it takes seconds. Chosen
+_SKETCH_PIXELS = 2400  # pixels of each of these views, at most; chosen
 
 
 class Uncertainty:

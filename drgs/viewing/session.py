@@ -42,16 +42,17 @@ REST = 0.3
 """Seconds that a camera rests before our picture is drawn."""
 
 _PRESETS = ("exact", "fast", "gsplat", "3dgut")
-_ROWS_EVERY = 1.0  # seconds between two pictures of rows that are done
-_PHOTOGRAPH = 360  # pixels of its width in the panel
-_WAY_COLOR = (240, 60, 60)  # RGB of the arrow to a place for a next photograph
-_FRUSTUM = 0.05  # size of a camera's frustum, of its distance to what is looked at
-_COVERS = 0.5  # share of half a view's narrower side: a frustum that reaches farther is hidden
-_NARROW = 576  # pixels of a window that viser lays its panel over, as over a phone's
-_ROUND = 48  # times in a round of playing, at most
-_FOVS = 1.0, 150.0  # degrees of a keyframe: such as files have, and no wider than our pictures
-_UNKNOWN = 640, 480  # pixels of a window that has not said how large it is
-_PAUSE = 0.08  # seconds between two times that are played, at least: twelve a second
+# Sizes and seconds are chosen by eye.
+_ROWS_INTERVAL = 1.0  # seconds between two updates of a picture that is being drawn
+_PHOTO_WIDTH = 360  # pixels of a photograph's width in the panel
+_ARROW_COLOR = (240, 60, 60)  # RGB of the arrow to a place for a next photograph
+_FRUSTUM_SIZE = 0.05  # size of a camera's frustum, of its distance to the point that the view turns around
+_MAX_FRUSTUM_COVER = 0.5  # share of half the view's narrower side: a frustum that reaches farther is hidden
+_NARROW_WINDOW = 576  # pixels of a window's width up to which viser lays its panel over the view, as on a phone
+_MAX_PLAYED_TIMES = 48  # times in one round of playing, at most
+_FOV_RANGE = 1.0, 150.0  # degrees of a keyframe's field of view
+_DEFAULT_WINDOW = 640, 480  # pixels of a window that has not reported its size
+_PLAY_INTERVAL = 0.08  # seconds between two times that are played, at least: twelve a second
 
 
 class Session:
@@ -99,7 +100,7 @@ class Session:
         self.time = subject.nearest_time(None)
         self._slider: Any = None
         self._button: Any = None
-        self.pose, self.size = self._seen_pose() or (subject.first.pose, _UNKNOWN)
+        self.pose, self.size = self._client_pose() or (subject.first.pose, _DEFAULT_WINDOW)
         self._has_begun = False  # has been at the first view
         self._widen()
         self._build(preset)
@@ -126,7 +127,7 @@ class Session:
         """Build what stands in the panel."""
         gui = self.client.gui
         subject = self.subject
-        is_narrow = self.size[0] <= _NARROW
+        is_narrow = self.size[0] <= _NARROW_WINDOW
         self._header = gui.add_html(panel.header(subject))
         names = [layer.name for layer in subject.layers]
         presets = list(dict.fromkeys([preset, *_PRESETS]))
@@ -224,7 +225,7 @@ class Session:
         self._draw_later(0.0)
 
     async def _camera_moved(self, _: Any) -> None:
-        seen = self._seen_pose()
+        seen = self._client_pose()
         if seen is None:  # not a camera: what is shown stays
             return
         pose, size = seen
@@ -267,7 +268,7 @@ class Session:
         """Go through all times, again and again, as fast as the Gaussians of each can be sent."""
         assert self._slider is not None
         first, last = self.subject.times[0], self.subject.times[-1]
-        count = min(_ROUND, len(self.subject.times))
+        count = min(_MAX_PLAYED_TIMES, len(self.subject.times))
         times = np.linspace(first, last, max(count, 2))
         at = int(np.searchsorted(times, self.time or first))
         while True:
@@ -276,7 +277,7 @@ class Session:
             self._slider.value = self.time
             self._hide()
             self._send_gaussians()
-            await asyncio.sleep(_PAUSE)
+            await asyncio.sleep(_PLAY_INTERVAL)
             while self._worker.has((self, "gaussians")):
                 await asyncio.sleep(0.02)
 
@@ -296,7 +297,7 @@ class Session:
         self._legend.content = panel.legend(subject.placed_views, subject.ranking.title if subject.ranking else "")
         eyes = np.array([placed.camera.center - subject.origin for placed in subject.placed_views]).reshape(-1, 3)
         away = np.linalg.norm(eyes - subject.first.target, axis=1)
-        size = _FRUSTUM * (float(np.median(away)) if len(away) else 1.0) or 1.0
+        size = _FRUSTUM_SIZE * (float(np.median(away)) if len(away) else 1.0) or 1.0
         for number, (placed, color) in enumerate(zip(subject.placed_views, colors, strict=True)):
             pose = pose_of(placed.camera, subject.origin)
             frustum = self.client.scene.add_camera_frustum(
@@ -336,7 +337,7 @@ class Session:
         self._ways = self.client.scene.add_arrows(
             "/ways",
             points.astype(np.float32),
-            _WAY_COLOR,
+            _ARROW_COLOR,
             shaft_radius=0.06 * size,
             head_radius=0.2 * size,
             head_length=0.5 * size,
@@ -344,7 +345,7 @@ class Session:
 
     def _show_frusta(self) -> None:
         """Show all frusta, or none, but for those that the camera stands in or near: they would cover what it sees."""
-        near = self._reach / (_COVERS * math.tan(0.5 * self.pose.fov) * min(1.0, self.pose.aspect))
+        near = self._reach / (_MAX_FRUSTUM_COVER * math.tan(0.5 * self.pose.fov) * min(1.0, self.pose.aspect))
         for frustum in self._frusta:
             away = float(np.linalg.norm(np.asarray(frustum.position) - self.pose.position))
             shown = self._are_shown.value and away > near
@@ -370,7 +371,7 @@ class Session:
             camera.position = pose.position
             camera.wxyz = pose.wxyz
             camera.fov = looking(pose, self.size[0] / self.size[1])
-        self.pose, self.size = self._seen_pose() or (pose, self.size)  # what it sends back is no movement of its own
+        self.pose, self.size = self._client_pose() or (pose, self.size)  # what it sends back is no movement of its own
         self._show_frusta()
         if self._slider is not None and sight.camera.time is not None and self._playing is None:
             self._slider.value = self.subject.nearest_time(sight.camera.time)
@@ -386,7 +387,7 @@ class Session:
         """Where the camera is, as a keyframe of a flight."""
         pose = self.pose
         wxyz = pose.wxyz / np.linalg.norm(pose.wxyz)
-        fov = float(np.clip(math.degrees(pose.fov), *_FOVS))
+        fov = float(np.clip(math.degrees(pose.fov), *_FOV_RANGE))
         return Keyframe(pose.position + self.subject.origin, wxyz, fov, 0.0, self.time)
 
     def _fly_to(self, key: Keyframe, is_last: bool) -> None:
@@ -396,7 +397,7 @@ class Session:
             camera.position = key.position - self.subject.origin
             camera.wxyz = key.wxyz
             camera.fov = math.radians(key.fov)
-        self.pose, self.size = self._seen_pose() or (self.pose, self.size)
+        self.pose, self.size = self._client_pose() or (self.pose, self.size)
         self._hide()
         if self._slider is not None and key.time is not None:
             self._stop_playing()
@@ -407,7 +408,7 @@ class Session:
     def _read_photograph(self, read: Callable[[int], np.ndarray]) -> Iterator[None]:
         """Job: a photograph into the panel."""
         try:
-            image = to_bytes(read(_PHOTOGRAPH))
+            image = to_bytes(read(_PHOTO_WIDTH))
         except (OSError, ValueError) as error:
             self.say(str(error))
             return
@@ -506,7 +507,7 @@ class Session:
             text = f"{layer.name}{of}, {preset}: "
             pixels = camera.width * camera.height
             since = time.perf_counter()
-            drawing = yield from self._told(
+            drawing = yield from self._with_progress(
                 layer.draw(subject.scene, camera, settings),
                 f"{text}drawing {camera.width}x{camera.height}",
                 rate * pixels,
@@ -539,7 +540,7 @@ class Session:
         if before is not None:
             self._show(wanted, over(before, rows, height), self.scale)
 
-    def _told(
+    def _with_progress(
         self, steps: Drawings, text: str, expected: float, show: Callable[[np.ndarray], None]
     ) -> Generator[None, None, Drawing]:
         """Steps of a drawing, saying how much of it is done, and how long the rest will take.
@@ -559,7 +560,7 @@ class Session:
             now = time.perf_counter()
             left = (now - began) * (1 - share) / share
             if share < 1:
-                if rows is not None and now - shown >= _ROWS_EVERY:
+                if rows is not None and now - shown >= _ROWS_INTERVAL:
                     show(rows)
                     shown = now
                 self.say(f"{text}: {share:.0%}, about {duration(max(left, 1))} left ...")
@@ -570,7 +571,7 @@ class Session:
         uncertainty = self.subject.uncertainty
         return self.layer.name == UNCERTAINTY and uncertainty is not None and not uncertainty.is_complete
 
-    def _seen_pose(self) -> tuple[Pose, tuple[int, int]] | None:
+    def _client_pose(self) -> tuple[Pose, tuple[int, int]] | None:
         """Pose of the client's camera and pixels of its window; None where it has said nothing that is one."""
         camera = self.client.camera
         return Pose.stated(camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height)
