@@ -1,4 +1,4 @@
-"""What a view would add to what is known: information gain from Fisher information.
+"""Information gain of a view, given the information of the known views: criteria of Fisher information, in nats.
 
 The public side of `drgs.information.gains` and `drgs.information.criteria`, which say what each is.
 """

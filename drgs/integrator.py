@@ -188,8 +188,8 @@ def render_with_offsets(
     mean_absolute: torch.Tensor | None = None,
     strains: torch.Tensor | None = None,
 ) -> Output:
-    """What `render` gives, with derivatives by what is no parameter of Gaussians: by projected means, which density
-    control of rasterizers reads, and by covariances.
+    """`render` with derivatives by more than parameters of Gaussians: by projected means, which density control of
+    rasterizers reads, and by covariances.
 
     Args:
         gaussians, camera, settings, outputs, rays: Arguments of `render`.

@@ -94,7 +94,7 @@ class DrgsIntegrator(mi.ad.integrators.common.RBIntegrator):  # type: ignore[nam
         return mi.Color3f(*[dr.gather(lib.Float, out["rgb"], 3 * i + c) for c in range(3)]), out["alpha"]
 
     def to_string(self) -> str:
-        """What Mitsuba prints of a scene."""
+        """Mitsuba's text of a scene."""
         return f"DrgsIntegrator[{self.settings}]"
 
 

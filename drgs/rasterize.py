@@ -53,7 +53,7 @@ _DILATION = 0.3  # px^2
 
 @dataclasses.dataclass(frozen=True)
 class _Mode:
-    """What a `render_mode` draws.
+    """The outputs of a `render_mode`.
 
     Attributes:
         color: Colors.
@@ -321,7 +321,7 @@ def rasterization(
 
 @dataclasses.dataclass(frozen=True)
 class _Options:
-    """What all views of a call have in common.
+    """The settings that all views of a call share.
 
     Attributes:
         settings: The renderer.
@@ -457,13 +457,13 @@ class _View:
         return means @ pose[:, :3].T + pose[:, 3], center.to(self.splats.means.dtype)
 
     def _projected(self, depths: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor | None]:
-        """`meta`, and what opacities are multiplied with."""
+        """`meta`, and the factor of opacities (compensation), None without one."""
         if self.options.with_ut or self.camera.is_distorted or self.camera.is_rolling:
             return _projected_by_points(self.splats, self.camera, depths, self.options.near), None
         return _projected_by_jacobian(self.splats, self.camera, self.options.settings, self.options.antialiased)
 
     def _is_drawn(self, meta: dict[str, torch.Tensor], depths: torch.Tensor) -> torch.Tensor:
-        """(N,) which Gaussians are drawn: the renderer itself knows no far plane and no smallest radius."""
+        """(N,) bool, which Gaussians are drawn: the renderer itself has no far plane and no smallest radius."""
         depths = meta["depths"] if self.options.settings.planar else depths
         kept = depths <= self.options.far
         if self.options.settings.planar or self.options.near > 0:
@@ -484,14 +484,14 @@ def _evaluated(coefficients: torch.Tensor, degree: int, towards: torch.Tensor) -
 
 
 def _expanded_to_batches(x: torch.Tensor, degree: int | None, lead: tuple[int, ...]) -> torch.Tensor:
-    """Coefficients (N, K, D) that all batches share, for each of them; others as they are."""
+    """Coefficients (N, K, D) that all batches share, expanded to each of them; others as they are."""
     if degree is not None and lead and isinstance(x, torch.Tensor) and x.ndim == 3:
         return x.expand(*lead, *x.shape)
     return x
 
 
 def _colors_of_view(x: torch.Tensor, batch: int, camera: int, degree: int | None) -> torch.Tensor:
-    """Colors of one view, of those by batch, or by batch and camera."""
+    """Colors of one view, from those by batch, or by batch and camera."""
     by_camera = x.ndim == (4 if degree is None else 5)
     return x[batch, camera] if by_camera else x[batch]
 
@@ -504,7 +504,9 @@ def _means2d_leaf(
     lead: tuple[int, ...],
     count: int,
 ) -> torch.Tensor | None:
-    """(..., C, N, 2) what becomes `meta["means2d"]`, where a backward pass may ask for its gradient."""
+    """(..., C, N, 2) zeros that become `meta["means2d"]`, whose gradient a backward pass may request; None where it
+    cannot.
+    """
     wanted = torch.is_grad_enabled() and any(x.requires_grad for x in (means, viewmats, opacities))
     if not wanted or not settings.planar or is_wrapped(means):
         return None

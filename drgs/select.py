@@ -141,7 +141,7 @@ def select(
 
 
 def _scoring(scoring: Scoring | None, fields: dict[str, Any]) -> Scoring:
-    """The one that was passed, or one of the fields that were."""
+    """The scoring that was passed, or one of the fields that were."""
     known = [field.name for field in dataclasses.fields(Scoring)]
     if unknown := [name for name in fields if name not in known]:
         raise TypeError(f"select() got an unexpected keyword argument {unknown[0]!r}; Scoring has {', '.join(known)}")

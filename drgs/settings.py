@@ -103,7 +103,7 @@ _RANGES = {
 
 @dataclasses.dataclass(frozen=True)
 class RenderSettings:
-    """What `drgs.render` computes, and where it cuts off.
+    """Settings of `drgs.render`: response, order, traversal and cut-offs.
 
     Attributes:
         response: `peak` (a = alpha exp(-rho^2/2) at the ray's peak), `integral` (a = 1 - exp(-optical depth from the

@@ -1,4 +1,4 @@
-"""Mitsuba scenes, written here, that generate posed data sets; here is what they are built from.
+"""Building blocks of the Mitsuba scenes that generate posed data sets.
 
 Paint is float32 sRGB in [0, 255], (height, width, 3). A mesh is a tuple of positions (n, 3), faces
 (m, 3), texture coordinates (n, 2) with v = 0 at the bottom of the picture, and unit normals (n, 3)

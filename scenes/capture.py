@@ -48,11 +48,11 @@ _FOV_X = 55.0  # degrees across the image width
 _MAX_DEPTH = 4  # vertices of a path after the camera
 _EXPOSURE = 0.55  # factor on radiance of a camera with fixed exposure
 _GAMMA = 2.2  # tone curve: value = light^(1 / 2.2)
-_POINTS = 4000
+_POINTS = 4000  # sparse points that are drawn
 _PIXEL = 0.2  # standard deviation of what is observed, in pixels
 _CENTER = np.array([0.0, 0.0, 0.13])  # what the camera looks at
 _WALL = 0.95  # y of the wall
-_FLOOR = -0.75
+_FLOOR = -0.75  # z of the floor
 _LAMP = np.array([-0.6, -5.0, 2.5])
 _ADAPTED = 0.5  # share of a view's brightness, as a log, that auto exposure takes out
 _DRIFT = 0.26  # standard deviation of what exposure does besides, in log light

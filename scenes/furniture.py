@@ -17,6 +17,7 @@ __all__ = [
 ]  # fmt: skip
 
 MATTE = {"type": "diffuse"}
+# Materials as Mitsuba takes them; alpha is the roughness of the microfacets.
 SATIN = {"type": "roughplastic", "alpha": 0.35, "nonlinear": True}
 GLAZE = {"type": "roughplastic", "alpha": 0.15, "nonlinear": True}
 METAL = {"type": "roughplastic", "alpha": 0.25, "nonlinear": True}

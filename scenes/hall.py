@@ -39,18 +39,18 @@ _PATH = 5 * 2 * BALL * (_TIMES - 1)  # meters along the wall in the sequence
 _REACH = 1.1  # meters to the left and right of the middle that it flies
 _FRONT = -0.75  # y of its path
 _HEIGHT = 0.75  # meters that it bounces
-_BOUNCES = 3.5
+_BOUNCES = 3.5  # bounces of the ball in the sequence
 _DOOR = (-0.15, 0.5, 1.35)  # left, right and upper edge of the opening, which is a niche in the wall
 _DEEP = 0.35  # meters
 _OPENS = (0.2, 0.55)  # when the door begins to open, and is open
 _OPEN = 105.0  # degrees
-_LAMP_ON = 0.5
+_LAMP_ON = 0.5  # time, in [0, 1], at which the lamp is switched on
 _LAMP = (-0.85, -0.3, 1.25)  # center of the globe
 _GLOBE = 0.11  # its radius
 _GLOWS = np.array([13.0, 9.5, 5.5])  # radiance when it is on
 _SIDE = 2.2  # x of the side walls
-_HIGH = 2.2
-_ACCENTS = ((196, 62, 46), (44, 98, 150), (222, 162, 48), (60, 130, 84), (132, 62, 114))
+_HIGH = 2.2  # meters, height of the ceiling
+_ACCENTS = ((196, 62, 46), (44, 98, 150), (222, 162, 48), (60, 130, 84), (132, 62, 114))  # RGB, like the colors below
 _WALLS = ((222, 212, 190), (196, 212, 210), (220, 200, 190))
 
 

@@ -35,6 +35,7 @@ CONFUSIONS = teacher.Confusions(
      ("mug", "canister", "bottle")),
 )  # fmt: skip
 
+# RGB, like the colors below; pairs and triples are darker to lighter tones
 _ACCENTS = ((190, 62, 46), (44, 98, 140), (222, 162, 48), (60, 120, 84), (122, 62, 104), (214, 108, 60))
 _LIGHT = ((236, 230, 216), (222, 206, 178), (206, 218, 214), (232, 216, 206))
 _JELLIES = (((150, 16, 40), (214, 60, 78)), ((36, 110, 40), (120, 176, 70)), ((190, 92, 10), (240, 166, 60)))

@@ -42,6 +42,7 @@ _WALLS = (
     ((176, 196, 206), "plain"),
     ((214, 190, 170), "plain"),
 )
+# RGB, like the colors around
 _FABRICS = ((86, 110, 138), (150, 92, 74), (96, 122, 96), (168, 150, 122), (122, 88, 120))
 _ACCENTS = ((206, 152, 60), (188, 78, 60), (64, 128, 132), (226, 214, 190), (108, 76, 128))
 _WOODS = (((92, 56, 32), (172, 116, 70)), ((132, 92, 56), (208, 164, 112)), ((54, 38, 30), (112, 80, 58)))
@@ -53,10 +54,10 @@ _FLOORS = (
 _CLAYS = ((178, 84, 56), (46, 92, 142), (60, 122, 104), (208, 168, 70), (148, 60, 70))
 
 
-TEST_EVERY = 5
+TEST_EVERY = 5  # every fifth photograph is a test view
 _FOV_X = 72.0  # degrees across the image width
 _CEILING = 0.4  # radiance of a white ceiling that glows: it stands for the light of many bounces
-_EXPOSURE = 1.8
+_EXPOSURE = 1.8  # factor on radiance of the camera
 _MAX_DEPTH = 3  # vertices of a path after the camera
 _CLEARANCE = 0.35  # meters between a camera and the nearest surface, at least
 _POINTS = 8000  # sparse points that are drawn

@@ -29,7 +29,8 @@ _VERSION = 1  # bump when the pictures change: finished folders of another versi
 _FOV_X = 50.0  # degrees across the image width
 _CENTER_SHIFT = (0.018, -0.014)  # principal point off the image center, in widths and heights
 _MAX_DEPTH = 4  # vertices of a path after the camera; a fifth would add 0.5 % of light
-_EXPOSURE = 0.85
+_EXPOSURE = 0.85  # factor on radiance of the camera
+# meters; turn in degrees about z
 _BOOK = {"size": (0.20, 0.145, 0.034), "center": (0.225, -0.10, 0.045), "turn": -24.0}
 
 _MATTE = {"type": "diffuse"}

@@ -1,4 +1,4 @@
-"""Teacher features for made scenes: what a network of LSeg's kind would say, errors and all.
+"""Teacher features for generated scenes: those of a network of LSeg's kind, errors included.
 
 A class has a unit embedding of 512 dimensions; any two have a cosine of about 0.6, classes that are easily confused
 (`GROUPS`) one of about 0.8, as texts of CLIP do. The map of a view starts from the shares of the clean classes in each
@@ -40,7 +40,7 @@ __all__ = [
     "tensor_bytes",
 ]
 
-DIMENSIONS = 512
+DIMENSIONS = 512  # channels of a feature, as CLIP ViT-B has
 GROUPS = (
     ("wall", "ceiling", "curtain"),
     ("floor", "rug"),
@@ -54,7 +54,7 @@ CONFUSED = {
     "picture": "window", "door": "wall", "sofa": "chair", "cushion": "sofa", "chair": "table", "table": "cabinet",
     "cabinet": "shelf", "shelf": "cabinet", "book": "shelf", "lamp": "vase", "vase": "lamp", "plant": "vase",
 }  # fmt: skip
-_NORM = 4.0
+_NORM = 4.0  # length of a feature vector, on average; as `drgs.features.encoders.MAP_NORM`
 _PATCH = 1.405  # a normal field of unit variance exceeds its 92 % quantile there
 _PLACE = 1.881  # and its 97 % quantile there
 _PATCH_ALONE = 1.239  # and its 89.2 % quantile: what both together leave right, 0.92 * 0.97
@@ -62,7 +62,7 @@ _PATCH_ALONE = 1.239  # and its 89.2 % quantile: what both together leave right,
 
 @dataclasses.dataclass(frozen=True)
 class Confusions:
-    """What a teacher takes for what.
+    """Which classes a teacher confuses.
 
     Attributes:
         partner: Class -> the one that it is taken for, of every class.

@@ -1,4 +1,4 @@
-"""What a camera must be: its intrinsics, proportions, pose and lens, each refused in one line."""
+"""Checks of a camera: its intrinsics, proportions, pose and lens, each refused in one line."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ _ROTATION_TOLERANCE = 1e-4  # of R R^T: what four digits a number leave; more is
 _ROW_TOLERANCE = 1e-6  # of the row 0 0 0 1, which only rounding may have touched
 # Beyond these, which no camera reaches, squares and ratios of float64 lose their meaning.
 IMAGE_MAX = 2**31  # pixels
-_FOCAL_MIN = 1e-4
-_FOCAL_MAX = 1e6
-_DISTANCE_MAX = 1e15
-_DISTORTION_MAX = 1e6
+_FOCAL_MIN = 1e-4  # pixels
+_FOCAL_MAX = 1e6  # pixels
+_DISTANCE_MAX = 1e15  # scene units
+_DISTORTION_MAX = 1e6  # a coefficient, without a unit
 _SINGULAR = 1e-6  # a determinant below has no inverse to speak of
 _TURN_MAX = math.radians(170)  # of a camera within an exposure
 

@@ -1,4 +1,4 @@
-"""Sizes of views: how large their images are looked at."""
+"""Sizes of views: the size at which their images are used."""
 
 from __future__ import annotations
 

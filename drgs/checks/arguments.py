@@ -37,7 +37,7 @@ def must_be(where: str, name: str, value: Any, kinds: type | tuple[type, ...], h
 
 
 def kind_of(value: Any) -> str:
-    """A value in a few words: its type, and what tells most about it."""
+    """A value in a few words: its type, and its shape, length or text."""
     if value is None:
         return "None"
     shape = getattr(value, "shape", None)

@@ -1,4 +1,4 @@
-"""Frozen records that are nested by subject, and what their fields say of themselves as options.
+"""Frozen records that are nested by subject, whose fields are options of the command line.
 
 A field is declared once, by `option`: its default, its text, its range, and how a command line spells it. From that are
 read the command line and its help (`drgs.commands.command_line`), the ranges that a record checks, and, by the names
@@ -49,7 +49,7 @@ _FIRST_HEADING = "Run"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Spec:
-    """What a field says of itself as an option, beside its name, type and default.
+    """An option's text, range, flag and heading, beside its name, type and default.
 
     Attributes:
         help: What it does, in a sentence or two.
@@ -85,7 +85,7 @@ class Spec:
 
 
 class _Part(typing.NamedTuple):
-    """What the arguments of `part` say."""
+    """The arguments of `part`."""
 
     only: frozenset[str] | None
     rare: bool
@@ -202,7 +202,7 @@ def check_ranges(record: Any) -> None:
 
 
 class Record:
-    """What a frozen dataclass inherits whose fields may be records again.
+    """Base of frozen dataclasses whose fields may be records again.
 
     Names of fields are unique in all of them, so that `max_gaussians` says enough: `replace` takes any.
 
@@ -293,7 +293,7 @@ def _renamed(message: str, inner: Any, kind: Any) -> str:
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """What to do about a name that is unknown: `did you mean max_gaussians?`."""
+    """Advice for an unknown name: `did you mean max_gaussians?`."""
     near = difflib.get_close_matches(name, list(known), 1, 0.5)
     return f"did you mean {near[0]}?" if near else "none has a name like it"
 

@@ -1,4 +1,6 @@
-"""Registries of what is chosen by name, which other packages add rows to: policies, loaders, codecs, responses."""
+"""Registries of functions and classes by name, to which other packages add rows: policies, loaders, codecs,
+responses.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,7 @@ T = TypeVar("T")
 
 
 class Registry(MutableMapping[str, T], Generic[T]):
-    """Name -> what it stands for, in the order in which rows were added.
+    """Name -> the function or class of that name, in the order in which rows were added.
 
     A row of this package is written where the table is made, as the value itself or as `module:attribute`, which is
     imported when it is first asked for: a table that the command line reads for its names loads nothing heavy. Another

@@ -1,4 +1,6 @@
-"""What a worker must have in common with the process that sends it work, for the same bits to come back."""
+"""Versions and hardware that a worker must share with the process that sends it work, for the same bits to come
+back.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,7 @@ class Disagreement(ValueError):
 
 @functools.cache
 def statement() -> dict[str, dict[str, str]]:
-    """What this process computes with, as it was when it was first asked.
+    """Versions, code and hardware of this process, as they were at the first call.
 
     Returns:
         `must` agree: versions, a hash of the code, the variant, Dr.Jit's threads; `may` differ: the machine.
@@ -46,8 +48,8 @@ def statement() -> dict[str, dict[str, str]]:
 
 
 def _code() -> str:
-    """Version, commit, and a hash of what is really there: a checkout may have been edited, an installation has none
-    of its commit.
+    """Version, commit, and a hash of the actual source files: a checkout may be edited, and an installation has no
+    commit.
     """
     root = Path(__file__).resolve().parents[1]
     found = hashlib.sha256()

@@ -113,7 +113,7 @@ def _not_shared(worker: str, folder: Path) -> str:
 
 
 class _Round:
-    """Cells that are on their way, and what comes back."""
+    """Cells that are being computed, and their results."""
 
     def __init__(
         self,
@@ -179,7 +179,7 @@ class _Round:
         future.add_done_callback(lambda _: self.news.put(("done", number)))
 
     def report_start(self, number: int, cell: Cell, worker: str, address: str) -> None:
-        """Tell that a worker has begun with a cell, and whether it has the cell of one that is gone."""
+        """Report that a worker has begun a cell, and whether it took over that of a worker that is gone."""
         before = self.begun.get(number)
         self.begun[number] = (worker, address)
         again = "" if before is None else ", again"
@@ -188,7 +188,7 @@ class _Round:
         self.say(f"{number} of {self.count}: {cell.name} on worker {worker}{again}")
 
     def take_in(self, number: int, cell: Cell) -> None:
-        """Take in what has become of a cell: its row, a reason why there is none, or one to hand it out again."""
+        """Handle the end of a cell's task: its row, a reason why there is none, or one to hand it out again."""
         future = self.pending.pop(number)
         try:
             found = self.cluster.finished(future, f"cell {cell.name}")
@@ -222,7 +222,7 @@ class _Round:
             self.say(f"{result_line(self.study, cell, found['row'])}, worker {found['worker']}")
 
     def fail(self, cell: Cell, why: str) -> None:
-        """Tell that a cell has failed, and remember it."""
+        """Report that a cell has failed, and remember it."""
         self.say(f"{cell.name}: failed: {why}")
         self.failed[cell] = why
 

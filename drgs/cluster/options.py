@@ -1,4 +1,4 @@
-"""The options that ask for workers, checked before anything is loaded, which takes seconds."""
+"""Options for workers, checked before anything is loaded, which takes seconds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is sent to workers, as bytes: pickled once, sent once to each worker in pieces, opened there when first used.
+"""Data sent to workers, as bytes: pickled once, sent once to each worker in pieces, unpickled there at first use.
 
 Tensors travel as NumPy arrays. A worker keeps the last few payloads, so that a scene is there for all of its views.
 """
@@ -104,7 +104,7 @@ def keep(digest: str, number: int, count: int, data: bytes) -> None:
 
 
 def opened_payload(digest: str) -> Any:
-    """What a payload holds, the same object each time.
+    """The unpickled object of a payload, the same one each time.
 
     Raises:
         Missing: If the worker has not got it.

@@ -1,4 +1,4 @@
-"""Workers behind a scheduler: what they have in common with this process, what they are sent, what they return.
+"""Workers behind a scheduler: the check that they agree with this process, the data they get, the results they return.
 
 Quantities of single views are computed by them: the scene goes to each of them once, views come back one by one. A few
 views for each worker are on their way at any time, so that this process holds no more results than without workers.
@@ -142,7 +142,7 @@ class Cluster:
         return [address for address, node in nodes.items() if node == host]
 
     def check(self) -> None:
-        """Ask every worker what it computes with.
+        """Compare every worker's statement with this process's.
 
         Raises:
             Disagreement: If one differs in what must agree.
@@ -223,7 +223,7 @@ class Cluster:
             ) from None
 
     def check_alive(self) -> None:
-        """Find out whether there is still somebody who works.
+        """Raise unless a worker is alive.
 
         Raises:
             ConnectionError: If the scheduler has gone, or there have been no workers for `WORKER_SECONDS`.

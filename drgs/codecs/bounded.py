@@ -1,4 +1,4 @@
-"""Decompression that stops where a header says the data end: what a file claims is never allocated on its word."""
+"""Decompression that stops at the size that a header states: no claimed size is allocated unchecked."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class GzipReader:
         return out
 
     def rest(self, limit: int) -> bytes:
-        """What is left, which may be at most so long.
+        """The remaining bytes, at most so many.
 
         Raises:
             ValueError: If there is more, or the stream does not end.
@@ -163,7 +163,7 @@ class Archive:
 
 
 def _said(error: Exception) -> str:
-    """What a library says, in one line."""
+    """A library's error in one line."""
     return " ".join(str(error).split())[:_SHOWN]
 
 

@@ -1,4 +1,4 @@
-"""Few values that stand for many: codebooks of numbers, palettes of vectors, and an order in which neighbors are close.
+"""Vector quantization: codebooks of numbers, palettes of vectors, and an order in which neighbors are close.
 
 Lloyd's algorithm throughout (Lloyd, "Least squares quantization in PCM", 1982): each value goes to the entry nearest to
 it, each entry to the mean of its values. Every step is deterministic: the same Gaussians give the same file.
@@ -16,12 +16,12 @@ _BINS = 1 << 16  # of a histogram: 256 to an entry of the codebook
 _CODEBOOK_STEPS = 40  # of Lloyd's algorithm, on the histogram
 _PALETTE_STEPS = 6  # of the same, on all rows, which takes most of the time of writing
 _BLOCK = 4096  # rows that are compared with all centers at a time
-_SEED = 0
+_SEED = 0  # of k-means' first centers: the same Gaussians give the same bytes
 _MORTON_BITS = 20  # an axis: a few Gaussians far away shall not leave one cell for all others
 
 
 def codebook(values: np.ndarray, weights: np.ndarray | None = None, size: int = 256) -> tuple[np.ndarray, np.ndarray]:
-    """At most `size` numbers that stand for values, ascending, and which of them stands for each.
+    """At most `size` numbers that approximate values, ascending, and the index of the nearest for each.
 
     Args:
         values: (N, ...) finite, N >= 1.
@@ -61,7 +61,7 @@ def _lloyd(values: np.ndarray, weights: np.ndarray, size: int) -> np.ndarray:
 
 
 def palette(rows: np.ndarray, weights: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """At most `size` vectors that stand for rows, and which of them stands for each.
+    """At most `size` vectors that approximate rows, and the index of the nearest for each.
 
     In two levels, which takes a hundredth of the comparisons: clusters of rows first, and in each as many vectors as
     its share of what would be lost. A row is compared with the vectors of its own cluster.

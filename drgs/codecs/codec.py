@@ -1,4 +1,4 @@
-"""What a format of files of Gaussians is: a row of `drgs.codecs.CODECS`."""
+"""A format of files of Gaussians: a row of `drgs.codecs.CODECS`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["Codec"]
 
 @dataclasses.dataclass(frozen=True)
 class Codec:
-    """How files of one format are told from others, read and, of some, written.
+    """How files of one format are recognized, read and, of some, written.
 
     Gaussians are in the axes of 3DGS PLY files on both sides: right, down, front.
 

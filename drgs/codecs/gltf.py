@@ -32,9 +32,9 @@ __all__ = ["GLB", "encode_glb", "load_glb"]
 
 _AXES = (-1, -1, 1)  # signs of x, y and z between glTF and PLY
 _NAME = "KHR_gaussian_splatting"
-_FLOAT = 5126
-_BYTE = 5121
-_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_FLOAT = 5126  # component type of float32 in glTF (GL_FLOAT)
+_BYTE = 5121  # of uint8 (GL_UNSIGNED_BYTE)
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}  # numbers of an element, by accessor type
 # Component type -> its dtype and, where it is normalized, what 1 is.
 _KINDS = {5126: ("<f4", 1), 5120: ("i1", 127), 5121: ("u1", 255), 5122: ("<i2", 32767), 5123: ("<u2", 65535)}
 _LEAST = float(np.finfo(np.float32).tiny)  # what a scale of 0 is taken for

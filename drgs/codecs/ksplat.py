@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 __all__ = ["KSPLAT", "load_ksplat"]
 
-_HEADER = 4096
-_SECTION = 1024
+_HEADER_BYTES = 4096  # bytes of the header of a file
+_SECTION_BYTES = 1024  # bytes of the header of a section
 _LEAST_HALF = 2.0**-26  # the middle of what rounds to 0 as a half float
 _DAMAGED = "it is truncated or damaged, copy it again"
 
@@ -65,7 +65,7 @@ def load_ksplat(path: Path) -> Gaussians:
         ValueError: If it is damaged, of another version or level, or a value is not finite (the first index is named).
     """
     data = path.read_bytes()
-    if len(data) < _HEADER or data[0] != 0 or data[1] < 1:
+    if len(data) < _HEADER_BYTES or data[0] != 0 or data[1] < 1:
         raise ValueError(
             f"{path}: must be a .ksplat file of version 0.1, got {tuple(data[:2])} in {len(data)} bytes; {_DAMAGED}"
         )
@@ -73,10 +73,10 @@ def load_ksplat(path: Path) -> Gaussians:
     low, high = struct.unpack_from("<ff", data, 36)
     if level > 2:
         raise ValueError(f"{path}: the compression level of a .ksplat file must be 0, 1 or 2, got {level}; {_DAMAGED}")
-    if _HEADER + sections * _SECTION > len(data):
+    if _HEADER_BYTES + sections * _SECTION_BYTES > len(data):
         raise ValueError(f"{path}: the header claims {sections} sections, the file holds {len(data)} bytes; {_DAMAGED}")
     found = []
-    start = _HEADER + sections * _SECTION
+    start = _HEADER_BYTES + sections * _SECTION_BYTES
     for i in range(sections):
         section, start = _section(path, data, i, level, start)
         found.append(section)
@@ -100,7 +100,7 @@ def load_ksplat(path: Path) -> Gaussians:
 
 def _section(path: Path, data: bytes, index: int, level: int, start: int) -> tuple[_Section, int]:
     """A section's header, compared with the file, and where the next one's data begin."""
-    at = _HEADER + index * _SECTION
+    at = _HEADER_BYTES + index * _SECTION_BYTES
     count, room, capacity, buckets, block, bucket_bytes = struct.unpack_from("<IIIIfH", data, at)
     (steps,) = struct.unpack_from("<I", data, at + 24)
     full, partial, degree = struct.unpack_from("<IIH", data, at + 32)

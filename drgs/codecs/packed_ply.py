@@ -29,8 +29,8 @@ __all__ = ["PACKED_PLY", "encode_packed_ply", "load_packed_ply"]
 
 _log = logging.getLogger(__name__)
 
-_CHUNK = 256
-_LARGEST_SCALE = 20.0
+_CHUNK_GAUSSIANS = 256  # Gaussians that share one range of values, as SuperSplat's format has it
+_MAX_LOG_SCALE = 20.0
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _ADVICE = "export it again from SuperSplat (superspl.at/editor)"
 
@@ -62,7 +62,7 @@ def load_packed_ply(path: Path) -> Gaussians:
         if lists:
             raise ValueError(f"{path}: the {name} column {lists[0]} must be a number, is a list; {_ADVICE}")
     chunks, vertex = ply["chunk"].data, ply["vertex"].data
-    chunk = np.arange(count) // _CHUNK
+    chunk = np.arange(count) // _CHUNK_GAUSSIANS
     # In the order of this machine's bytes, and without a sign: the bits are shifted apart.
     position, rotation, scale, color = (vertex[name].astype(np.uint32) for name in _PACKED)
     rgba = np.stack([color >> shift & 255 for shift in (24, 16, 8, 0)], axis=1)
@@ -99,8 +99,10 @@ def _check(path: Path, elements: dict[str, PlyElement]) -> tuple[int, int]:
                 f"{kinds[0]}, {missing[0]} is missing; {_ADVICE}"
             )
     count, chunks = elements["vertex"].rows, elements["chunk"].rows
-    if chunks * _CHUNK < count:
-        raise ValueError(f"{path}: must have a chunk for every {_CHUNK} Gaussians, got {chunks} for {count}; {_ADVICE}")
+    if chunks * _CHUNK_GAUSSIANS < count:
+        raise ValueError(
+            f"{path}: must have a chunk for every {_CHUNK_GAUSSIANS} Gaussians, got {chunks} for {count}; {_ADVICE}"
+        )
     sh = elements.get("sh")
     if sh is None:
         return count, 1
@@ -151,7 +153,7 @@ def encode_packed_ply(g: Gaussians) -> bytes:
     sh = g.sh.numpy()[order].astype(np.float64)
     log_scales = g.log_scales.numpy()[order].astype(np.float64)
     outside = {
-        "log scales": int((np.abs(log_scales) > _LARGEST_SCALE).sum()),
+        "log scales": int((np.abs(log_scales) > _MAX_LOG_SCALE).sum()),
         "SH coefficients": int((np.abs(sh[:, 1:]) > 4 + 1 / 64).sum()),
     }
     for name, count in outside.items():
@@ -159,10 +161,10 @@ def encode_packed_ply(g: Gaussians) -> bytes:
             _log.warning("compressed PLY: %d %s were out of its range and went to its end", count, name)
     fields = {
         "xyz": g.means.numpy()[order].astype(np.float64),
-        "scale": np.clip(log_scales, -_LARGEST_SCALE, _LARGEST_SCALE),
+        "scale": np.clip(log_scales, -_MAX_LOG_SCALE, _MAX_LOG_SCALE),
         "rgb": sh[:, 0] * Y_00 + 0.5,
     }
-    starts = np.arange(0, len(g), _CHUNK)
+    starts = np.arange(0, len(g), _CHUNK_GAUSSIANS)
     ranges, parts = list[np.ndarray](), dict[str, np.ndarray]()
     for name, values in fields.items():
         if not len(g):
@@ -171,7 +173,7 @@ def encode_packed_ply(g: Gaussians) -> bytes:
             continue
         low, high = (how.reduceat(values, starts, axis=0).astype(np.float32) for how in (np.minimum, np.maximum))
         ranges += [low, high]
-        first, last = (np.repeat(x, _CHUNK, axis=0)[: len(g)].astype(np.float64) for x in (low, high))
+        first, last = (np.repeat(x, _CHUNK_GAUSSIANS, axis=0)[: len(g)].astype(np.float64) for x in (low, high))
         parts[name] = np.clip((values - first) / np.where(last > first, last - first, 1), 0, 1)
     # float64: a logit that was read from a byte must go back to that byte.
     opacities = g.logit_opacities.double().sigmoid().numpy()[order]

@@ -1,5 +1,5 @@
-"""The PLY of 3DGS: Gaussians by columns with names. Headers are not believed: what they claim is compared with the size
-of the file before anything is allocated.
+"""The PLY of 3DGS: Gaussians by named columns. Claimed sizes are compared with the file's before anything is
+allocated.
 """
 
 from __future__ import annotations

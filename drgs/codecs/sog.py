@@ -39,9 +39,8 @@ __all__ = ["SOG", "load_sog"]
 
 _log = logging.getLogger(__name__)
 _MAX_META_BYTES = 4 << 20  # bytes
-_LOG_SCALE_RANGE = (
-    8.0  # of log scales below the largest: fits make disks whose thickness is 1e-9, and 256 entries are few
-)
+# of log scales below the largest: fits make disks whose thickness is 1e-9, and 256 entries are few
+_LOG_SCALE_RANGE = 8.0
 _GAUSSIANS_PER_ROW = 3  # Gaussians for each row of the palette; chosen
 _FEWEST_ROWS, _MOST_ROWS = 64, 1 << 16
 _PALETTE = 64  # rows of SH side by side
@@ -92,7 +91,7 @@ class _Reader:
             raise ValueError(f"{path}: meta.json: count must be in [1, 2^28], got {self.count}; {_ADVICE}")
 
     def gaussians(self) -> Gaussians:
-        """What the scene holds."""
+        """The Gaussians of the scene."""
         low, high = (self._image("means", i) for i in (0, 1))  # first: they are as large as the count says
         degree = self._degree()
         check_count(self.path, self.count, SH_COUNTS[degree])
@@ -158,7 +157,7 @@ class _Reader:
         return quats_of_smallest(codes[:, 3].astype(int) - 252, (codes[:, :3] / 127.5 - 1.0) / 2**0.5)
 
     def _degree(self) -> int:
-        """Degree of the SH; version 1 tells it by the width of the palette's image."""
+        """Degree of the SH; in version 1 by the width of the palette's image."""
         if not self.has_sh:
             return 0
         if self.version == 1:

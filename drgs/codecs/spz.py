@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 __all__ = ["SPZ", "encode_spz", "load_spz"]
 
 _AXES = (1, -1, -1)  # signs of x, y and z between SPZ and PLY
-_COLOR_SCALE = 0.15  # SPZ stores f_dc times 0.15, as Niantic's writer
+_COLOR_SCALE = 0.15  # the format holds the DC coefficient times 0.15
 _ANTIALIASED, _EXTENDED = 1, 2  # flags
 _HARMLESS = {0xADBE0002}  # extensions that change no value: limits of an orbit
 _POSITION_BITS = 12  # of a position behind the point, as Niantic's writer has it; readers exist that take no more

@@ -1,4 +1,4 @@
-"""What the poses of photographs say about a capture: what was looked at, from where, which way is up, along which path.
+"""Layout of a capture by its poses: the point looked at, the stations, the up direction, the path.
 
 Poses and image sizes only; no image is opened.
 """

@@ -1,5 +1,5 @@
-"""Reading files that may lie: sizes are compared with what the file holds before anything is allocated, and poses are
-numbers within reason.
+"""Reading files that may be wrong: claimed sizes are compared with the file's before anything is allocated; poses must
+be finite and rigid.
 """
 
 from __future__ import annotations

@@ -232,7 +232,8 @@ def write_held_out(folder: str | os.PathLike, names: Iterable[str], command: str
 
 
 def apply_held_out(dataset: Dataset) -> None:
-    """Note in the views of a data set what its `held_out.json` says, if it has one and its own files say nothing.
+    """Mark the views that `held_out.json` lists as held out, if there is one and the data set's own files have no
+    split.
 
     Raises:
         ValueError: If the file is damaged, or names a view that is not there.

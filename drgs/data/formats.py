@@ -1,4 +1,4 @@
-"""What a format of data sets is: a row of `drgs.data.LOADERS`."""
+"""A format of data sets: a row of `drgs.data.LOADERS`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["Format"]
 
 @dataclasses.dataclass(frozen=True)
 class Format:
-    """How data sets of one format are told from others, and read.
+    """How data sets of one format are recognized and read.
 
         LINES = Format(lambda path: (path / "views.txt").is_file(), load_lines, looks_for=("views.txt",))
 

@@ -27,7 +27,7 @@ _BYTES = 12  # a pixel: planes as decoded, interleaved, turned, and the copy tha
 # the tag; what begins EXIF in a JPEG, and its most bytes
 _ORIENTATION = 0x0112
 _EXIF = b"Exif\0\0"
-_MARKER = 65_533
+_MAX_EXIF_BYTES = 65_533
 _COPY = "it is damaged, or no such photograph: copy it again, or convert it to JPEG"
 _SHOWN = 120  # characters of a library's own message
 
@@ -66,7 +66,7 @@ def encoded_jpeg(path: Path, quality: int, report: Any) -> np.ndarray:
     exif = image.info.get("exif") or b""  # None of an HEIC without, as messengers make it
     if exif and not exif.startswith(_EXIF):
         exif = _EXIF + exif
-    exif = exif if len(exif) <= _MARKER else b""
+    exif = exif if len(exif) <= _MAX_EXIF_BYTES else b""
     encoded = io.BytesIO()
     image.convert("RGB").save(encoded, "JPEG", quality=quality, subsampling=0, exif=exif)
     return np.frombuffer(encoded.getbuffer(), np.uint8)

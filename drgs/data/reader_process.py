@@ -61,7 +61,7 @@ class Child:
         return self._process.pid if self._process is not None and self._owner == os.getpid() else None
 
     def call(self, what: str, path: Path, *rest: Any, progress: Callable[[int], None] = lambda _: None) -> Any:
-        """Call a function of the module in its process; its result, a value of JSON or an array.
+        """Call a function of the module in its process and return its result, a value of JSON or an array.
 
         Args:
             what: Name of the function.
@@ -199,7 +199,7 @@ def _memory() -> int:
 
 
 class _WarningCollector(logging.Handler):
-    """Keeps what is logged."""
+    """A log handler that keeps warnings."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
@@ -209,7 +209,7 @@ class _WarningCollector(logging.Handler):
         self._texts.append(record.getMessage())
 
     def taken(self) -> list[str]:
-        """What was logged since."""
+        """Warnings since the last call."""
         texts = self._texts
         self._texts = []
         return texts

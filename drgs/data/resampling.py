@@ -97,7 +97,7 @@ def resize_area(data: np.ndarray, width: int, height: int) -> np.ndarray:
 _BORDER = 1.0
 # Of an undistorted image, the share that its photo did not see: ordinary lenses leave below a tenth in the corners.
 _LOST_WARNED = 0.25
-_LOST_MAX = 0.9
+_LOST_MAX = 0.9  # the share from which on nothing useful is left, and the image is refused; chosen
 _CHANNELS = 64  # of a feature map that are moved at once: 44 MB of 480x360
 
 _log = logging.getLogger(__name__)

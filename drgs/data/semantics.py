@@ -1,4 +1,4 @@
-"""What a data set says about classes: a teacher's feature maps, label images, and the names of the numbers in these."""
+"""Classes of a data set: a teacher's feature maps, label images, and the names of their numbers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = ["CLASS_FILES", "NO_CLASS", "SEGMENTS", "Semantics", "plain_labels", "
 SEGMENTS = "seg"
 """Folder of Dynamic 3D Gaussians' labels, in which 1 is what moves."""
 _NUMBERS = 1 << 16  # what a pixel of a label image can say
-_SHOWN = 5
+_SHOWN = 5  # class names that a message names
 _FINER = 8  # times: photographs are reduced so far (images_8) while their maps stay
 
 _log = logging.getLogger(__name__)
@@ -36,7 +36,7 @@ _log = logging.getLogger(__name__)
 
 @dataclasses.dataclass(frozen=True)
 class Semantics:
-    """What a data set says about classes. Nothing but folders has been looked at; files are opened by the properties.
+    """Classes of a data set: feature maps, label images and names. Files are opened by the properties, at first use.
 
     Attributes:
         teacher: Name of the folder of the teacher's maps, empty without.
@@ -151,7 +151,7 @@ class Semantics:
             )
 
     def numbered(self, raw: np.ndarray, path: Path) -> np.ndarray:
-        """Labels (H, W) int64 of what a label image holds.
+        """(H, W) int64 labels from the pixels of a label image.
 
         Args:
             raw: (H, W) uint8 or uint16.

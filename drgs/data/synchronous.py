@@ -31,7 +31,7 @@ CAMERA_NAME = re.compile(r"cam[a-z_-]*\d{1,9}", re.IGNORECASE)
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """What one of several synchronous cameras has taken.
+    """Frames and pose of one of several synchronous cameras.
 
     Attributes:
         name: Name of the camera.
@@ -118,7 +118,7 @@ def synchronous(
 
 
 def _attach_image(view: View, recording: Recording, number: int, lazy: bool) -> bool:
-    """Give a view its camera and its image, or say that there is none."""
+    """Set a view's camera and image; False if there is no image."""
     where = f"{recording.where}: camera {recording.name}"
     camera, source = recording.cameras[number], recording.source
     if isinstance(source, VideoFile):
@@ -145,7 +145,7 @@ _MIN_CORRELATION_GAIN = 0.25
 
 @dataclasses.dataclass(frozen=True)
 class LateCamera:
-    """A camera whose frames show what the others show later or earlier.
+    """A camera whose frames are late or early against those of the others.
 
     Attributes:
         name: The camera's.
@@ -160,7 +160,7 @@ class LateCamera:
     without: float
 
     def words(self, spacing: float = 1.0) -> str:
-        """What is wrong and what to do, in one line.
+        """The finding and its remedy, in one line.
 
         Args:
             spacing: Frames of the video from one picture to the next.

@@ -165,7 +165,9 @@ def _check_direction(file: Path, cameras: list[Camera], points: np.ndarray | Non
 
 
 def _visible_share(cameras: list[Camera], points: np.ndarray | None) -> float:
-    """Share of points that cameras show, on average; without points, of cameras that look at one place before them."""
+    """Mean share of points that cameras show; without points, of cameras that have one common point in front of
+    them.
+    """
     if points is not None and len(points):
         shares = []
         for camera in cameras:

@@ -33,8 +33,8 @@ _MISSING = (0.02, 8)  # share or number of frames that a header may claim too ma
 _NEAR = 16  # frames ahead that are decoded rather than sought
 _SAME = 0.01  # milliseconds between time stamps of one frame
 # videos that are held open, and of which is known what is in them
-_OPEN = 4
-_KNOWN = 1024
+_MAX_OPEN = 4
+_MAX_KNOWN = 1024
 _REPORT_EVERY = 50  # frames between two reports
 _COPY = "it is truncated or damaged, copy it again"
 
@@ -55,7 +55,7 @@ def walk(path: Path, version: Sequence[int], is_mp4: bool, report: Callable[[int
     """
     key = (path, *version)
     if key not in _walked:
-        while len(_walked) >= _KNOWN:
+        while len(_walked) >= _MAX_KNOWN:
             _walked.popitem(last=False)
         _walked[key] = _walk(path, is_mp4, report)
     return _walked[key]
@@ -77,7 +77,7 @@ def _reader(path: Path, version: Sequence[int], is_mp4: bool, report: Callable[[
     """An open video; of those read last, some stay open."""
     key = (path, *version)
     if key not in _readers:
-        while len(_readers) >= _OPEN:
+        while len(_readers) >= _MAX_OPEN:
             _readers.popitem(last=False)
         video = walk(path, version, is_mp4, report)
         _readers[key] = _Reader(path, video["stamps"], video["count"], is_mp4)

@@ -78,7 +78,8 @@ def report_missing_images(where: Path, missing: list[Path], left: int, strict: b
 
 
 def check_parallax(views: list[View]) -> None:
-    """Warn about views that stand in one place, from which no depth can be problem; refuse views that are all the same.
+    """Warn about views that stand in one place, from which no depth can be determined; refuse views that are all the
+    same.
 
     Views of one pose at several times are one place: a camera that stands still before something that moves.
 

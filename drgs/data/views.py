@@ -1,4 +1,4 @@
-"""Views: cameras with images, masks, depth and feature maps and labels, which are read when they are asked for."""
+"""Views: cameras with images, masks, depth and feature maps and labels, which are read at first use."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ __all__ = ["View"]
 
 @dataclass
 class View:
-    """One photograph: its camera and where its files are. Nothing is decoded before a method asks.
+    """One photograph: its camera and where its files are. Nothing is decoded before a method is called.
 
     Attributes:
         camera: The camera as calibrated, of the size of the image file, lens included.

@@ -1,4 +1,4 @@
-"""What people see: progress, tables and pictures."""
+"""Output for people: progress, tables and pictures."""
 
 from drgs.checks.imports import modules_of
 

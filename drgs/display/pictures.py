@@ -101,7 +101,7 @@ def write_png(path: str | os.PathLike, image: np.ndarray) -> None:
 
 
 def png_bytes(image: np.ndarray) -> bytes:
-    """What `write_png` writes."""
+    """The bytes that `write_png` writes."""
     import cv2
 
     pixels = image if image.dtype == np.uint8 else to_bytes(image)

@@ -19,7 +19,7 @@ __all__ = ["Bar", "duration", "quietly"]
 
 FIRST = 1.0  # seconds after which a stage is worth its first line
 EVERY = 10.0  # seconds between two lines at first; they become rarer, up to LEAST_OFTEN
-LEAST_OFTEN = 30.0
+LEAST_OFTEN = 30.0  # seconds between two lines of a long stage
 _STEADY_AFTER = 24  # steps after which a rate is believed: kernels are compiled in a fit's first ones. Chosen
 _bars: list[Bar] = []  # that are open, the innermost last
 _output: _Lines | _Terminal | Any = None  # None while none of them is shown

@@ -148,7 +148,7 @@ def overlay(image: np.ndarray, labels: np.ndarray, count: int, strength: float =
 
 
 def mask_picture(image: np.ndarray, mask: np.ndarray, color: tuple[int, int, int] = (255, 120, 0)) -> np.ndarray:
-    """The picture with what a mask has in a color, and the rest darker and gray.
+    """The picture with the pixels of a mask in a color, and the rest darker and gray.
 
     Args:
         image: (H, W, 3) picture, uint8 or float in [0, 1].
@@ -162,7 +162,7 @@ def mask_picture(image: np.ndarray, mask: np.ndarray, color: tuple[int, int, int
 
 
 def with_legend(picture: np.ndarray, names: Sequence[str], labels: Iterable[int] | None = None) -> np.ndarray:
-    """The picture with colors and names of classes at its right, in as many columns as its height asks for.
+    """The picture with colors and names of classes at its right, in as many columns as its height requires.
 
     Args:
         picture: (H, W, 3) uint8 picture.

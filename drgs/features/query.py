@@ -1,4 +1,4 @@
-"""What belongs to a text: a score for every Gaussian, and every pixel, by its decoded feature.
+"""Search by text: a score for every Gaussian, and every pixel, by its decoded feature.
 
 Two scores, named with every result:
 
@@ -129,7 +129,7 @@ class TextQuery:
 
     @property
     def rule(self) -> str:
-        """What is selected, in words."""
+        """The rule of selection, in words."""
         if self.negatives is None:
             return f"cosine >= {self.threshold:g}"
         if self.threshold is None:

@@ -34,7 +34,7 @@ _CHUNK = 1 << 22  # numbers that a step holds: 16 MB of float32, 8,192 pixels of
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Classes:
-    """What pixels can be called.
+    """Names of classes, with their text embeddings if any.
 
     Attributes:
         names: Names of classes 1..K; class k is `names[k - 1]`.

@@ -1,4 +1,4 @@
-"""Feature maps of a teacher on disk: what a network said about each cell of a photograph, read where it is touched.
+"""Feature maps of a teacher on disk: a vector for each cell of a photograph, read where it is used.
 
 A file holds one tensor (C, h, w) as `torch.save` writes it, in half or single precision. The encoders of Feature 3DGS
 (Zhou et al., CVPR 2024) write half precision for LSeg, 512 channels at 480x360, and single precision for SAM, 256

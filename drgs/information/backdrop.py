@@ -1,4 +1,4 @@
-"""An unknown color behind everything: what the Gaussians leave open is no reason to be sure.
+"""An unknown color behind everything: where the Gaussians are transparent, a view still has something to learn.
 
 Information is about Gaussians that exist. Where a view shows none, a pixel is as unknown as it can be, and its variance
 was 0. With a color b_c behind everything, one for each cell c of directions, known to a variance of 1 / lambda before
@@ -66,7 +66,7 @@ ComputeViews = Callable[[Quantity, Sequence["Camera"]], Iterable[Information]]
 
 @dataclasses.dataclass(frozen=True)
 class Sphere:
-    """What the colors are painted on, in world units.
+    """The sphere that carries the unknown colors, in world units.
 
     Attributes:
         center: x, y, z.
@@ -124,7 +124,7 @@ def _place(camera: Camera) -> tuple[list, list, float]:
 
 @dataclasses.dataclass(frozen=True)
 class SurfaceDepths(Quantity):
-    """{"depths": (P,)}: depths of what is solid in a small picture of a view, whatever its settings are."""
+    """{"depths": (P,)}: depths of surfaces (alpha of at least a half) in a small rendering of a view."""
 
     def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
         """Float32 on the CPU."""

@@ -1,4 +1,4 @@
-"""What views can be judged and chosen by, by name; loads nothing heavy, for the options of the command line read it.
+"""Names of policies, criteria, methods, blocks and estimates; loads nothing heavy: the command line reads them here.
 
 What stands behind a name is imported when it is first looked up. Rows that other packages add are found by entry points
 (`drgs.checks.registry`), and have no part in what is the default.

@@ -77,7 +77,9 @@ def jacobian_columns(
 
 @dataclasses.dataclass(frozen=True)
 class PoseInformation(Quantity):
-    """{"pose": (6, 6)}: what a view says about the pose of its camera, as `drgs.fisher.pose_information`."""
+    """{"pose": (6, 6)}: Fisher information of a view about the pose of its camera, as
+    `drgs.fisher.pose_information`.
+    """
 
     where: ClassVar[str] = "fisher.pose_information"
 

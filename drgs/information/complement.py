@@ -41,7 +41,9 @@ found in two ways, apart by up to 1e-6 of the entry on scenes of 20,000 Gaussian
 
 
 def remaining(whole: torch.Tensor, lost: torch.Tensor) -> torch.Tensor:
-    """What is left of entries of a diagonal; 0, not a rest of either sign, where that is all rounding."""
+    """Entries of a diagonal less the share that a view's unknowns explain; 0 where the rest is rounding, of either
+    sign.
+    """
     rest = whole - lost
     return torch.where(rest > _ROUNDING * whole, rest, 0.0)
 

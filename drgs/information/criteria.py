@@ -1,4 +1,4 @@
-"""Criteria: what a parameter adds to the score of a view, and what a score needs to be computed.
+"""Criteria: the score that a parameter adds to a view, and the inputs that a score needs.
 
 Imports nothing heavy, for the options of the command line read the names; `drgs.gain` computes by the functions.
 """

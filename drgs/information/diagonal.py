@@ -1,4 +1,5 @@
-"""What a view says about the parameters of its Gaussians: the diagonal of J^T J, its dense blocks, and coverage.
+"""Fisher information of a view about the parameters of its Gaussians: the diagonal of J^T J, dense blocks, and
+coverage.
 
 Methods of the diagonal:
 

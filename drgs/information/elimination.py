@@ -1,4 +1,4 @@
-"""The rows of a view as an image that can be differentiated, freed of what its own unknowns explain.
+"""The rows of a view as a differentiable image, without the part that the view's own unknowns explain.
 
 The equations are in `drgs.information.complement`. N of the pose is forward mode, that of the exposure the image
 itself. The six numbers of the pose are a rotation about the camera's center and a translation: the same span as the
@@ -34,7 +34,7 @@ __all__ = ["BLOCK_INPUTS", "ViewRows", "backdrop_taken", "eliminated_of"]
 
 @torch.no_grad()  # information is a number
 def eliminated_of(call: Call, scales: torch.Tensor, nuisances: Nuisances) -> Eliminated:
-    """What the unknowns of a view with pixels and Gaussians explain of its rows.
+    """The part of a view's rows, with pixels and Gaussians, that its unknowns explain.
 
     Args:
         call: The call of the view, whose channels are the rows: colors, then features.
@@ -149,7 +149,7 @@ class ViewRows:
             )
 
     def lost(self, groups: Mapping[str, Group]) -> Information:
-        """Group -> what the unknowns take of the diagonal, shaped like it.
+        """Group -> information that the unknowns take from the diagonal, shaped like it.
 
         Features that are no rows are known by themselves only, and nothing is taken of them.
         """
@@ -174,7 +174,7 @@ class ViewRows:
         return whole * (slopes @ P.T).square().mean(1)
 
     def lost_of_columns(self, columns: torch.Tensor, colors: bool) -> torch.Tensor:
-        """(K,) what the unknowns take of the squared lengths of columns, and so of J^T J's diagonal.
+        """(K,) information that the unknowns take from the squared lengths of columns, and so of J^T J's diagonal.
 
         Args:
             columns: (K, H, W, 3 + D) float64 columns of J, times the mask.
@@ -187,7 +187,7 @@ class ViewRows:
         return self.eliminated.lost(rows)
 
     def taken_of_blocks(self, groups: Mapping[str, Group]) -> torch.Tensor:
-        """(N, 13, 13) what the unknowns take of the blocks.
+        """(N, 13, 13) information that the unknowns take from the blocks.
 
         Args:
             groups: Those of `BLOCK_INPUTS`.

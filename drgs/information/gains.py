@@ -1,4 +1,4 @@
-"""What a view would add to what is known: information gain from Fisher information.
+"""Information gain of a view, given the information of the known views: criteria of Fisher information, in nats.
 
 Symbols: H Fisher information of the training views, Hc of a candidate (sums of squared derivatives of the image, unit
 noise on every channel), l the prior's precision lambda, in the inverse squared unit of its parameter. `drgs.gain` is
@@ -56,9 +56,8 @@ _CHUNK = 1 << 15  # parameters scored at a time: what fits in a core's cache is 
 _ROUNDING = 1e-6  # share of a block's diagonal that float32 sums leave of an eigenvalue that is 0, on a real scene
 _LARGEST_RIDGE = 1e-2  # share of a block's diagonal: more than a percent is not rounding any more
 _BLOCKS_AT_ONCE = 1 << 12  # blocks of 1,352 bytes in each of several tensors: 3 times as fast as all, on 50,000
-_SINGULAR = (
-    1e-13  # share of a column's length that float64 leaves of one that depends on others: 100 times its rounding
-)
+# share of a column's length that float64 leaves of one that depends on others: 100 times its rounding
+_SINGULAR = 1e-13
 
 
 @dataclasses.dataclass(frozen=True)

@@ -55,7 +55,7 @@ class HitSums:
         self._buffer: Float | None = None
 
     def sink(self, replay: Replay, walk: Walk) -> _Along:
-        """What takes the rows of one walk of a view; its `buffer` is to be evaluated afterwards."""
+        """The sink for the rows of one walk of a view; its `buffer` is to be evaluated afterwards."""
         lib, home = replay.lib, replay.call.home
         if self._buffer is None:
             self._buffer = dr.zeros(lib.Float, max(1, len(self.images) * len(self.wanted) * _WIDTH))

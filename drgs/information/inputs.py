@@ -1,4 +1,4 @@
-"""What weighs pixels in Fisher information: masks of views and weights of channels, or one sentence about them."""
+"""Checks of the weights of pixels in Fisher information: masks of views and weights of channels."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ def extras(
 
 
 class Row(NamedTuple):
-    """What a hit says about its Gaussian on one ray.
+    """The row of the Jacobian of a hit: slopes by its Gaussian's parameters on one ray.
 
     Attributes:
         slopes: d a / d geometry; None without geometry.

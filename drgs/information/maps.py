@@ -1,4 +1,4 @@
-"""Maps in the pixels of a view: the predictive variance, and what other rules look at.
+"""Maps in the pixels of a view: the predictive variance, and the scores of other methods (FisherRF, Magic Moments).
 
 Moments of the features along rays say how far what a pixel is made of differs from what the pixel shows:
 Var_c = sum_i w_i f_ic^2 - (sum_i w_i f_ic)^2 in a pixel, w_i the weights of compositing. As sum w <= 1 it is >= 0, and

@@ -1,4 +1,4 @@
-"""What a view says about the network that moves a scene's Gaussians: Fisher information, by random probes.
+"""Fisher information of a view about the weights of a deformation network, by random probes.
 
 phi, the network's parameters, is the scene's tensors named `phi.grid.*` and `phi.mlp.*`. The image's rows are its
 colors and, with semantics, its decoded features, each divided by its noise; J is their Jacobian by phi, through the
@@ -302,7 +302,7 @@ class _Rows:
 
     @property
     def pixels(self) -> int:
-        """How many there are."""
+        """Number of pixels."""
         return self.camera.width * self.camera.height
 
     @property

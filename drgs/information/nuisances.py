@@ -1,4 +1,4 @@
-"""What of a photograph is unknown besides the scene, as one frozen record; imports nothing heavy."""
+"""Unknowns of a photograph besides the scene (exposure, pose), as one frozen record; imports nothing heavy."""
 
 from __future__ import annotations
 

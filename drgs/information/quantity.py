@@ -1,4 +1,5 @@
-"""Quantities of a view: what can be computed of one, how that adds up over views, and the context that they share.
+"""Quantities of a view: how one is computed, how it adds up over views, and the context that quantities of a view
+share.
 
 A `Quantity` is a frozen dataclass of plain data. Caches keep what is computed of a view by it, other processes are sent
 it, and everything that looks at views computes them by it: `drgs.fisher`, the scores of candidates, all maps.
@@ -63,7 +64,7 @@ class HitProbes(Protocol):
     semantics: SemanticMetric | None
 
     def information(self) -> Information:
-        """What the quantity computes; a traversal of its own fills the sums if none has."""
+        """The computed quantity; a traversal of its own fills the sums if none has."""
 
 
 class ViewContext:
@@ -134,7 +135,7 @@ class Quantity:
     needs_known_views: bool = True
 
     def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
-        """What depends on one view alone, by name: caches keep it, other processes return it."""
+        """The tensors of one view alone, by name: caches keep them, other processes return them."""
         raise NotImplementedError(f"blocks: {type(self).__name__} must have a method `compute`, has none; add it")
 
     def summand(self, computed: Information, camera: Camera, mask: torch.Tensor | None) -> Information:

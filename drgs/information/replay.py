@@ -72,7 +72,7 @@ class WalkSums(Protocol):
     """Sums over the hits of a view, to which each of its walks adds."""
 
     def sink(self, replay: Replay, walk: Walk) -> WalkSink:
-        """What adds the hits of a walk of the view."""
+        """The sink that adds up the hits of a walk of the view."""
 
 
 class Replay:
@@ -335,7 +335,7 @@ class Replay:
 
     @property
     def feature_scale(self) -> float:
-        """What sum w^2 is multiplied by to be the information about a channel of the features."""
+        """Factor from sum w^2 to the information about a channel of the features."""
         return 1.0 if self.semantics is None else self.semantics.scale
 
     def sh_spread(self, weights: torch.Tensor) -> torch.Tensor:

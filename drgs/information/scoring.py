@@ -40,7 +40,7 @@ _EXACT = RenderSettings.preset("exact")  # made once: every record of options ha
 
 @dataclasses.dataclass(frozen=True)
 class Scoring(Record):
-    """How much a view counts: what is computed of it, and how that becomes a number.
+    """How views are scored: which blocks of information are computed, by which criterion, prior and weights.
 
     `prior`: None is 1e-2 of criterion `v_opt`, for colors that are known to 0.3 beforehand and photographs to 0.03;
     else 1e-6, as in FisherRF. Policy `coverage` takes its `value`, not its `groups`.

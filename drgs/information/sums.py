@@ -13,7 +13,7 @@ Information = Mapping[str, torch.Tensor]
 
 
 def add(total: dict[str, torch.Tensor], part: Information) -> None:
-    """Add what one more view, or one more block, says to what others have said, group by group.
+    """Add the information of one more view, or one more block, to a sum, group by group.
 
     Args:
         total: Group -> float64 tensor; changed, groups that are new become its own.
@@ -35,7 +35,7 @@ def add(total: dict[str, torch.Tensor], part: Information) -> None:
 
 
 def together(by_block: Mapping[str, Information]) -> dict[str, torch.Tensor]:
-    """What all blocks together say, of what each says alone."""
+    """The information of all blocks together, from that of each alone."""
     total: dict[str, torch.Tensor] = {}
     for part in by_block.values():
         add(total, part)

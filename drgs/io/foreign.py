@@ -1,4 +1,4 @@
-"""Files that are something else than what a reader expects: named as what they are, with the way round.
+"""Recognize files of another kind than a reader expects, name their kind, and advise how to convert them.
 
 Known by their first bytes, and by their extension where a format has no mark of its own.
 """
@@ -50,7 +50,7 @@ def refuse_foreign(path: Path, wanted: str) -> None:
 
 
 def _conversion(path: Path, suffix: str) -> str:
-    """What makes a PLY of Gaussians in a format of somebody else; of most, we do."""
+    """The command that converts Gaussians of another format to PLY; most formats drgs converts itself."""
     name = "scene" if path.name == "meta.json" else path.stem.removesuffix(".compressed")
     target = path.with_name(f"{name}.ply")
     if target == path:
@@ -92,7 +92,7 @@ def _splats(head: bytes, path: Path) -> tuple[str, str] | None:
 
 
 def _other_file(head: bytes, path: Path) -> tuple[str, str] | None:
-    """Anything else that people pass by mistake."""
+    """Other kinds of files that are often passed by mistake."""
     start = head.lstrip(b"\xef\xbb\xbf \t\r\n")[:16].lower()
     brand = head[8:12] if head[4:8] == b"ftyp" else b""
     if head.startswith(b"glTF") or path.suffix.lower() == ".gltf":

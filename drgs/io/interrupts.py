@@ -90,7 +90,7 @@ class _Handlers:
                 time.sleep(0.02)
 
     def error(self, text: str = "") -> KeyboardInterrupt:
-        """What is raised for the signal that came."""
+        """The exception for the signal that came."""
         if self.signum is None or self.signum == signal.SIGINT:
             return KeyboardInterrupt(*([text] if text else []))
         return Terminated(self.signum, text)

@@ -1,4 +1,4 @@
-"""What is done, as JSON lines: what a command that was killed goes on from.
+"""Finished steps as JSON lines, from which a killed command resumes.
 
 One format for the log of a run (`log.jsonl`), the rows of a study and the record of what drgs wrote into a folder
 (`.drgs.jsonl`). A line is one JSON object and is written whole, in one call: a process that is killed, or a power cut,

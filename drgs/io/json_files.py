@@ -1,4 +1,4 @@
-"""JSON, and TOML, that others wrote or edited: parsed with limits, and compared with what it must hold before use."""
+"""JSON, and TOML, that others wrote or edited: parsed with limits, and validated before use."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def _is(value: Any, kind: Any) -> bool:
 
 
 def _name(kind: Any) -> str:
-    """What a value of a kind is called in an error."""
+    """The name of a value's kind in an error."""
     if isinstance(kind, list | dict):
         kind = type(kind)
     names = {

@@ -77,7 +77,7 @@ def release(folder: Path) -> None:
 
 
 def host_of(folder: Path) -> str | None:
-    """The machine whose process writes into a folder; None if nobody does, or nobody knows."""
+    """The machine whose process writes into a folder; None if none does, or it is unknown."""
     host = (_owner(folder / NAME) or {}).get("host")
     return host if isinstance(host, str) else None
 
@@ -96,7 +96,7 @@ def _refuse_if_running(folder: Path, path: Path, owner: dict) -> None:
 
 
 def _owner(path: Path) -> dict | None:
-    """What a lock says; None: there is none, {}: it cannot be read."""
+    """The content of a lock; None: there is none, {}: it cannot be read."""
     try:
         value = parse_json(path.read_bytes()[:_MAX_BYTES], str(path))
     except FileNotFoundError:
@@ -122,7 +122,7 @@ def _this_process() -> dict:
 
 
 def _started(pid: object) -> str | None:
-    """When a process of this machine began, in the system's own terms; None if there is none of this number."""
+    """Start time of a process of this machine, in the system's own unit; None if there is none of this number."""
     if not isinstance(pid, int) or pid <= 0:
         return None
     try:

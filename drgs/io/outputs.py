@@ -1,4 +1,4 @@
-"""What a command may write: never over an input, never over a file that drgs did not make, alone in its folder.
+"""Which files a command may write: never an input, never a file that drgs did not make, in a folder that it locks.
 
 A folder that a command writes into is locked first, before anything is loaded: `lock_folder` finds out that it can be
 written, locks it, and compares what is there with what will be written. `.drgs.jsonl` in it records every file that we
@@ -129,7 +129,7 @@ class LockedFolder:
         Journal(self.path / JOURNAL).append(row)
 
     def record_existing(self, names: Iterable[str], command: str) -> None:
-        """Take what is there for a command's own, where there is no record: a copy without hidden files."""
+        """Record the files of a folder without a record as a command's own: a copy without hidden files."""
         if not (self.path / JOURNAL).exists():
             for name in names:
                 if (self.path / name).is_file():
@@ -352,7 +352,7 @@ def write_json(path: str | os.PathLike, value: Any) -> None:
 
 
 def json_form(value: Any) -> Any:
-    """What stands for a settings dataclass, a path or a NumPy value in JSON; TypeError for anything else."""
+    """The JSON form of a settings dataclass, a path or a NumPy value; TypeError for anything else."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return dataclasses.asdict(value)
     if isinstance(value, os.PathLike):

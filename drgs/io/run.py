@@ -1,4 +1,4 @@
-"""Run folders: what a fit does, where it runs, its log, checkpoint and pictures."""
+"""Run folders: a fit's configuration, environment, log, checkpoint and pictures."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Run:
         return self.path / "renders"
 
     def start(self, config: dict, resume: bool = False) -> None:
-        """Record what will be done, and by what (`env.json`).
+        """Record the configuration, and the environment (`env.json`).
 
         Args:
             config: Everything that determines the run; JSON-serializable.
@@ -65,11 +65,11 @@ class Run:
         write_json(self.path / "env.json", {"schema": SCHEMA, **runtime.info()})
 
     def record(self, config: dict) -> None:
-        """Write config.json, as `start` does; again where a fit finds out on the way what it has to say."""
+        """Write config.json again, when a fit has determined more of it."""
         write_json(self.path / "config.json", {"schema": SCHEMA, **config})
 
     def config(self) -> dict:
-        """What `start` recorded.
+        """The recorded configuration.
 
         Raises:
             FileNotFoundError: If this is no run folder.

@@ -40,9 +40,8 @@ DISTORTIONS = {
     "in the order k1, k2, k3, p1, p2": lambda k1, k2, p1, p2, *rest: (k1, k2, *_later(p1, p2, *rest)),
 }
 _ORACLE_WINDOW = 16  # pixels a side of the squares that the oracle draws one at a time, to bound its memory
-_DENSE_PAIRS = (
-    4_000_000  # (pixel, Gaussian) pairs of a view that are drawn densely where our renderer lacks a convention
-)
+# (pixel, Gaussian) pairs of a view that are drawn densely where our renderer lacks a convention
+_DENSE_PAIRS = 4_000_000
 # relative difference of depths that counts as a tie: some ten times float32's rounding where it computes a depth
 _NEAR_TIE = 2e-6
 _MIN_WEIGHT_CHANGE = 1e-5  # change of a compositing weight; a smaller one moves no gradient by what counts. Chosen
@@ -51,7 +50,7 @@ _COMPENSATION_FLOOR = 0.005**2  # smallest ratio of determinants: gsplat's small
 
 @dataclasses.dataclass(frozen=True)
 class ReferenceModel:
-    """A preset and what is unusual about it.
+    """A preset and the conventions in which a model differs from it.
 
     Attributes:
         settings: Response, order, cut-offs and background.
@@ -424,7 +423,7 @@ def find(
     settled: float = 1e-5,
     suits: Callable[[ReferenceModel], bool] = lambda model: True,
 ) -> SearchResult:
-    """The model whose image is nearest to a given one, and what is unusual about it.
+    """The model whose image is nearest to a given one, and the conventions in which it differs from its preset.
 
     Variations are added one at a time, each time the one that explains most of what is left, as long as that is at
     least 30 %; what a later one makes needless is dropped. Where an image is not the nearest start's at once, pixels
@@ -484,7 +483,7 @@ def _countable(ties: torch.Tensor) -> torch.Tensor:
 
 @dataclasses.dataclass(frozen=True)
 class SearchResult:
-    """What `find` returns.
+    """Result of `find`.
 
     Attributes:
         start: The preset.

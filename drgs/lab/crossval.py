@@ -389,7 +389,7 @@ def crops(g: Gaussians, cameras: list[Camera], settings: RenderSettings) -> tupl
 
 
 def _rendered_by_drgs(g: Gaussians, camera: Camera, settings: RenderSettings) -> tuple[torch.Tensor, torch.Tensor]:
-    """(H, W, 4) color and alpha, and (N,) bool: what is seen."""
+    """(H, W, 4) color and alpha, and (N,) bool, which Gaussians are visible."""
     with torch.no_grad():  # a crop's place has no derivative
         out = render(g, camera, settings, outputs=("visibility",))
     assert out.visibility is not None  # asked for

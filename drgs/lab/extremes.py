@@ -1,4 +1,4 @@
-"""The extremes that the renderer must stand, as named scenes, and the input that it must refuse or warn about.
+"""Extreme inputs that the renderer must render correctly, as named scenes, and input that it must refuse or warn about.
 
 `drgs stress` and the tests run them. A case builds (Gaussians, camera, settings); all leaves are float32 unless the
 case is about float64 means. Camera axes are +x right, +y down, +z forward.

@@ -1,4 +1,4 @@
-"""What the error of an image looks like: simple changes of the right image that make the wrong one.
+"""Classify the error of an image: simple changes of the right image that reproduce the wrong one.
 
 Each pattern is fitted to the image by least squares, where it has numbers, and counts as found if it explains nine
 tenths of the squared error. Of patterns that explain it equally well, the simplest is taken, in the order of
@@ -57,7 +57,7 @@ _SHIFT_CONVERGED = 1e-4  # px: a smaller step ends them
 
 @dataclasses.dataclass(frozen=True)
 class Pattern:
-    """What an error looks like.
+    """A kind of error: a change of the right image that explains it.
 
     Attributes:
         name: A key of `PATTERNS`.
@@ -77,7 +77,7 @@ class Pattern:
 
 @dataclasses.dataclass(frozen=True)
 class ErrorRow:
-    """The place where an image is wrong, and what its error looks like.
+    """Where an image is wrong, and which pattern explains its error.
 
     Attributes:
         pixels: Number of pixels that count and differ by more than 0.001.

@@ -216,7 +216,7 @@ def _asides(images: Pictures, start: RenderSettings, end: RenderSettings) -> lis
 
 @dataclasses.dataclass
 class State:
-    """What one rasterizer makes of a scene, and differences of such.
+    """The image and gradients of one rasterizer, and differences of such.
 
     Attributes:
         image: (P, 3) float64, the pixels of all views.

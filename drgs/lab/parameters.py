@@ -1,4 +1,4 @@
-"""What is differentiated where rasterizers are compared: raw parameters by group, a view's pose, wide colors."""
+"""The inputs by which compared rasterizers are differentiated: raw parameters by group, a view's pose, wide colors."""
 
 from __future__ import annotations
 

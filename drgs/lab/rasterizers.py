@@ -1,4 +1,4 @@
-"""Rasterizers to be compared: ours, gsplat, any torch function with gsplat's arguments, or what one wrote to a file.
+"""Rasterizers to be compared: ours, gsplat, any torch function with gsplat's arguments, or a dump in a file.
 
 Each is given raw parameters (drgs.ellipsoids) and a camera and returns an image that torch can differentiate;
 activations (exp, sigmoid) are applied here, so that derivatives arrive at the raw parameters, and the camera is moved
@@ -302,7 +302,7 @@ _LARGEST = 4 << 30  # bytes of a dump, beyond which it is refused unread: it wou
 
 @dataclasses.dataclass(frozen=True)
 class Dump:
-    """What a rasterizer wrote: see `drgs.lab.rasterizers.load_rasterizer`.
+    """Images and gradients that a rasterizer wrote to a file: see `drgs.lab.rasterizers.load_rasterizer`.
 
     Attributes:
         name: Path of the file.
@@ -335,7 +335,7 @@ def cotangents(cameras: list[Camera], seed: int, channels: int = 3) -> torch.Ten
 
 
 def scene_arrays(g: Gaussians, cameras: list[Camera], background: tuple) -> dict[str, np.ndarray]:
-    """What tells a scene from another: float32 raw parameters, world frame, cameras and background."""
+    """The arrays that identify a scene: float32 raw parameters, world frame, cameras and background."""
     arrays = {name: x.float().numpy() for name, x in raw_of(g).items()}
     # A file holds values, in float32 as rasterizers take them; a pose may be a leaf.
     arrays["viewmat"] = np.stack([float64(c.w2c).detach().float().numpy() for c in cameras])
@@ -462,5 +462,5 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def one_line(error: Exception) -> str:
-    """What an error says first."""
+    """The first line of an error's text."""
     return (str(error).strip().splitlines() or ["without a message"])[0][:200]

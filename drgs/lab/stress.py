@@ -91,7 +91,7 @@ def _caught(name: str, traversal: str, make: Callable[[], StressRow]) -> StressR
 
 @dataclasses.dataclass(frozen=True)
 class Truth:
-    """A case, and what the oracle says about it.
+    """A case, and its images and derivatives by the oracle.
 
     Attributes:
         g: Gaussians of the scene, all leaves.
@@ -111,7 +111,7 @@ class Truth:
 
 
 def truth_of(case: ExtremeCase) -> Truth:
-    """Build a case and ask the oracle."""
+    """Build a case and compute it by the oracle."""
     from drgs import reference
     from drgs.lab.accuracy import FIELDS, Oracle, jacobian, squares
 

@@ -267,7 +267,7 @@ def _compared(sizes: dict[str, float]) -> list[str]:
 
 @dataclasses.dataclass(frozen=True)
 class WorstErrors:
-    """What a budget is compared with, by kind; None where there is no number."""
+    """The errors that a budget is compared with, by kind; None where there is no number."""
 
     image: float | None = None
     gradient: float | None = None
@@ -298,7 +298,7 @@ class FullTime(Interval):
 
 @dataclasses.dataclass(kw_only=True)
 class TradeoffRow:
-    """A variant, and what was measured of it, in the order of tradeoff.json.
+    """A variant of the settings with its times and errors, in the order of tradeoff.json.
 
     Attributes:
         name, kind, share, by: The variant's fields of these names.
@@ -376,7 +376,7 @@ class Measured:
 
     @property
     def truth(self) -> TradeoffRow:
-        """What the others are compared with."""
+        """The setting that the others are compared with."""
         return self.rows[0]
 
     def to_json(self) -> dict[str, Any]:
@@ -419,7 +419,7 @@ _SIGNIFICANCE = 0.05  # two-sided level of the interval of a time ratio (sign te
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Advice:
-    """What is recommended for a use and a budget.
+    """The recommended setting for a use and a budget.
 
     Attributes:
         use: One of `USES`.
@@ -622,7 +622,7 @@ def placed(gaussians: Gaussians) -> Gaussians:
 
 @dataclasses.dataclass(frozen=True)
 class _ViewResult:
-    """What a setting gives for one view.
+    """Image, gradients and information of one view with one setting.
 
     Attributes:
         image: (H, W, 3) colors, on the CPU.
@@ -932,7 +932,7 @@ _PIXEL_GROWTH = 4  # times as many pixels are tried next, on the way to full siz
 
 @dataclasses.dataclass(frozen=True)
 class FullSize:
-    """What was timed with a clock, in the order of tradeoff.json.
+    """Times of full-size views on a clock, in the order of tradeoff.json.
 
     Attributes:
         size: (width, height) of the first view as it was timed; None where there was no time.

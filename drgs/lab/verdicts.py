@@ -1,4 +1,4 @@
-"""What a rasterizer's image and gradients are beside a model's, and what explains the difference: verdicts of groups.
+"""Compare a rasterizer's image and gradients with a model's, and explain the difference: verdicts of groups.
 
 Pixels with near ties, where two correct renderers differ, are left out before a difference counts; then known
 deviations explain what they can, and the rasterizer's own central differences decide the rest: what its gradient has to
@@ -166,7 +166,7 @@ _BUG_TOLERANCE = 0.02  # relative difference of a gradient from the rasterizer's
 
 @dataclasses.dataclass(frozen=True)
 class Deviation:
-    """A difference of gradients that is made on purpose.
+    """A documented difference of gradients that a rasterizer has on purpose.
 
     Attributes:
         name: The deviation in words.
@@ -414,7 +414,7 @@ def _group_row(theirs: torch.Tensor | None, ours: torch.Tensor, tolerance: float
 
 
 def _explain_by_known_choices(case: Case, model: ReferenceModel, compared: Compared) -> None:
-    """Explain what documented choices explain: the fewest of them that settle most groups."""
+    """Explain gradients by documented choices of rasterizers: the fewest of them that settle most groups."""
     groups, theirs = compared.groups, compared.theirs
     open_ones = [name for name, row in groups.items() if row.verdict is None and theirs[name] is not None]
     if not open_ones:
@@ -520,7 +520,7 @@ _JUMP_SHARE = 0.05  # share of the largest slope that no smooth change over half
 
 @dataclasses.dataclass(frozen=True)
 class Differences:
-    """What was measured at some entries.
+    """Central differences at some entries.
 
     Attributes:
         entries: Group -> list of flat indices that converged.

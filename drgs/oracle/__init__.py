@@ -1,4 +1,4 @@
-"""The float64 oracles, `reference` and `volume`, and what they share: activated Gaussians, rays of a camera, colors.
+"""The float64 oracles, `reference` and `volume`, and their common parts: activated Gaussians, rays of a camera, colors.
 
 Torch in float64; autograd gives the gradients of whatever is built on it. The room stands below the engine and imports
 nothing of it, so that what is checked cannot be borrowed.

@@ -76,7 +76,7 @@ _PACKAGES = (
 
 @dataclasses.dataclass(frozen=True)
 class Backend:
-    """What computes: one per process, chosen at first use.
+    """The backend that computes: one per process, chosen at first use.
 
     Attributes:
         variant: Mitsuba variant name, `llvm_ad_rgb` or `cuda_ad_rgb`.
@@ -224,7 +224,7 @@ class Graph:
         self._arrays = arrays
 
     def take(self) -> Any:
-        """What is kept, at the first time; then None."""
+        """The graph, at the first call; then None."""
         arrays, self._arrays = self._arrays, None
         return arrays
 
@@ -398,7 +398,7 @@ def version() -> str:
 
 
 def info() -> dict:
-    """What a bug report or a run's env.json needs; never raises for want of a backend.
+    """Facts for a bug report or a run's env.json; never raises for want of a backend.
 
     Returns:
         JSON-serializable dict with keys drgs, commit, python, platform, cpu, cores, backend, llvm,
@@ -457,7 +457,7 @@ def info() -> dict:
 
 
 def _requested_variant(variant: str | None) -> str | None:
-    """The variant asked for by argument, by Mitsuba's current one or by environment; None: auto."""
+    """The variant requested by argument, by Mitsuba's current one or by environment; None: auto."""
     where = "setup: variant"
     if variant in (None, "auto") and "mitsuba" in sys.modules:
         current = sys.modules["mitsuba"].variant()
@@ -473,7 +473,7 @@ def _requested_variant(variant: str | None) -> str | None:
 
 
 def _requested_threads(threads: int | None) -> int | None:
-    """The number asked for by argument or by environment; None: as many as there are cores."""
+    """The number requested by argument or by environment; None: as many as there are cores."""
     where = "setup: threads"
     text = typing.cast("int | str | None", threads)
     if threads is None:

@@ -47,7 +47,7 @@ _DIRECTORY = re.compile(r"llvm(?:[-@]?|/)(?P<v>\d+(?:\.\d+)*)(?:/|$)")
 
 @dataclasses.dataclass(frozen=True)
 class Library:
-    """One libLLVM on disk. `version` is () when neither name, soname nor directory tells it."""
+    """One libLLVM on disk. `version` is () when neither name, soname nor directory states it."""
 
     path: str
     version: tuple[int, ...]

@@ -1,4 +1,5 @@
-"""What Dr.Jit compiles for on a CPU: the processor as LLVM names it, its features, and the lanes of a packet.
+"""The target that Dr.Jit compiles for on a CPU: the processor as LLVM names it, its features, and the lanes of a
+packet.
 
 Dr.Jit 1.5 takes the machine's own from LLVM and has no Python function that tells it, or chooses another: the library
 that it loads has, in C++ (`jit_llvm_target_cpu`, `jit_llvm_target_features`, `jit_llvm_vector_width`,
@@ -40,7 +41,7 @@ _WRITTEN = re.compile(r"(?P<cpu>[\w.-]+)/(?P<lanes>\d+)(?:/(?P<features>[+-][\w.
 
 @dataclasses.dataclass(frozen=True)
 class Target:
-    """What kernels are compiled for.
+    """The target of kernels.
 
     Attributes:
         cpu: LLVM's name, such as `znver4` or `x86-64-v3`.
@@ -54,7 +55,7 @@ class Target:
 
 
 def compiled_for() -> Target | None:
-    """The target of Dr.Jit's LLVM backend, which must have started; None where its library does not tell."""
+    """The target of Dr.Jit's LLVM backend, which must have started; None where its library does not state it."""
     try:
         core = _core()
         cpu, features, lanes = (getattr(core, name) for name in _READERS)

@@ -1,4 +1,4 @@
-"""How much memory there is, and refusing what needs more before it starts: a process that is killed says nothing."""
+"""Free memory, and refusal of work that needs more before it starts: a process that is killed cannot report."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def _machine() -> int | None:
 
 
 def _control_group() -> int | None:
-    """What the container may still take: the tightest limit of its control group and those above it."""
+    """Bytes that the container may still allocate: the tightest limit of its control group and those above it."""
     left = []
     try:
         lines = _GROUP_OF.read_text().splitlines()
@@ -140,7 +140,7 @@ def _control_group() -> int | None:
 
 
 def _address_space() -> int | None:
-    """What `ulimit -v` leaves."""
+    """Bytes that `ulimit -v` leaves."""
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     if limit == resource.RLIM_INFINITY:
         return None

@@ -33,7 +33,7 @@ _ADVICE = "restore the file, or begin anew"
 
 
 class ViewKey(NamedTuple):
-    """By which what was computed of a view is kept.
+    """Key of a quantity of one view.
 
     Attributes:
         quantity: What was computed, with all options and settings.
@@ -59,7 +59,7 @@ class NotCached(Exception):  # noqa: N818  # no error: the caller does without t
 
 
 class _Entry(NamedTuple):
-    """What was computed of a view, and with a bound the Gaussians that it is of."""
+    """A computed quantity of a view, and with a bound the Gaussians that it was computed of."""
 
     computed: Information
     shapes: Shapes | None
@@ -151,7 +151,7 @@ class Cache:
                 kept.clear()
 
     def find(self, scene: Scene, key: Hashable) -> Information | None:
-        """What is kept under a key for this scene, which is a hit; None if nothing is, or its view has changed too far.
+        """The cached quantity for this scene, a hit; None if there is none, or its view has changed too far.
 
         Args:
             scene: The scene as it is now.
@@ -179,7 +179,7 @@ class Cache:
             return kept.computed if kept.shapes is None else self._padded(kept.computed, len(kept.shapes))
 
     def keep(self, scene: Scene, key: Hashable, computed: Information) -> None:
-        """Store what was computed, which is a miss.
+        """Store a computed quantity, a miss.
 
         Args:
             scene: That it was computed of; without a bound, nothing is stored if another one was looked at since.
@@ -199,7 +199,7 @@ class Cache:
                     self._image_weights[key.camera] = computed[_COLORS][:, 0].sum(-1).float()
 
     def get(self, scene: Scene, key: Hashable, compute: Callable[[], Information]) -> Information:
-        """What is kept under a key for this scene, else what `compute` returns, which is then kept."""
+        """The cached quantity, else the result of `compute`, which is then cached."""
         if (kept := self.find(scene, key)) is not None:
             return kept
         computed = compute()
@@ -265,7 +265,7 @@ class Cache:
             return max(changes, default=math.inf)
 
     def image_weights(self, scene: Scene, camera: Camera) -> torch.Tensor | None:
-        """(N,) how much of a view's image each Gaussian made up, sum of w^2, when that was computed; None: never."""
+        """(N,) sum of w^2 of each Gaussian over a view's pixels when that was computed; None: never computed."""
         with self._lock:
             self._compare(scene)
             weights = self._image_weights.get(camera_key(camera))
@@ -446,12 +446,12 @@ def _reference(scene: Scene) -> Callable[[], Scene | None]:
 
 
 def view_key(quantity: Hashable, camera: Camera, mask: torch.Tensor | None = None) -> ViewKey:
-    """By which what was computed of a view is kept; `quantity` has all else that it depends on."""
+    """Key of a quantity of one view; `quantity` has all other arguments that it depends on."""
     return ViewKey(quantity, camera_key(camera), None if mask is None else _value_key(mask))
 
 
 def camera_key(camera: Camera) -> tuple:
-    """Equal for cameras that see the same: every field but the name by its value, so that a new field is in it, too."""
+    """Equal for cameras of equal fields (all but the name), so that a new field is part of it, too."""
     names = [field.name for field in dataclasses.fields(camera) if field.name != "name"]
     return tuple(_value_key(getattr(camera, name)) for name in names)
 

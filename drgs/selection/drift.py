@@ -1,5 +1,4 @@
-"""How far Gaussians have changed, and what a view sees of it: of a model that is still being fitted, which changes at
-every step.
+"""How far the Gaussians of a model that is still being fitted have changed, and how much of that a view shows.
 
 The information of a view about a Gaussian holds as long as the Gaussian stays what it is. Its change since then is the
 largest of
@@ -33,7 +32,7 @@ __all__ = ["Shapes", "change_of_view"]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Shapes:
-    """What of N Gaussians is compared.
+    """The parameters of N Gaussians that are compared.
 
     Attributes:
         means: (N, 3) float64 world.
@@ -91,7 +90,7 @@ class Shapes:
 def change_of_view(
     before: Shapes, now: Shapes, change: torch.Tensor, camera: Camera, weights: torch.Tensor | None
 ) -> float:
-    """Change of what a view sees, in [0, 1].
+    """Change of the content of a view, in [0, 1].
 
     Args:
         before, now: The Gaussians as they were, and as they are: the first of these are the former.

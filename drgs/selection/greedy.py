@@ -1,4 +1,4 @@
-"""Greedy choice of views by their information: one at a time, each against what is known once those before it are.
+"""Greedy choice of views by information gain: one at a time, given the known views and the picks before.
 
 Plain greedy picks the candidate with the best score, adds its information to H, that of the known views, and scores
 all others again. But scores never rise as H grows: what is known already cannot be learned twice (diminishing

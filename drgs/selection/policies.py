@@ -1,4 +1,4 @@
-"""How a policy is looked up by its name, called, and what it returns checked."""
+"""Look up a policy by its name, call it, and check the selection that it returns."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a policy is given, and what it returns: the views to choose from and how they are scored, the choice."""
+"""Input and output of a policy: the views to choose from and their scoring, and the selection."""
 
 from __future__ import annotations
 

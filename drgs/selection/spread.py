@@ -1,4 +1,4 @@
-"""Policies that look at poses only, or at nothing: they spread views, whatever these show.
+"""Policies by poses alone, or at random: they spread views, whatever these show.
 
 Where cameras differ in time as well, `farthest` and `uniform` look at (camera, time). Cameras that have stood somewhere
 before are new at another time: by their centers alone, all of a capture that begins with every camera at the first time

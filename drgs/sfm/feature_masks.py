@@ -1,4 +1,4 @@
-"""Masks for structure from motion: where features may be found, and what stands in place of all else."""
+"""Masks for structure from motion: where features may be detected, and the pixels that replace the rest."""
 
 from __future__ import annotations
 

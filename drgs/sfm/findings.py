@@ -1,4 +1,4 @@
-"""What a capture shows about how it was taken, and what to do at the next shoot."""
+"""Findings about how a capture was taken, with advice for the next shoot."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ _log = logging.getLogger(__name__)
 
 @dataclasses.dataclass(frozen=True)
 class ImageFolder:
-    """What was put into a folder.
+    """Result of filling a folder with photographs and frames.
 
     Attributes:
         folder: The folder.

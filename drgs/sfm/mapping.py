@@ -1,4 +1,4 @@
-"""Incremental mapping by COLMAP: its progress while it runs, and what became of all photographs.
+"""Incremental mapping by COLMAP: its progress while it runs, and which photographs were registered.
 
 pycolmap calls back once a photograph has a pose, and between two of these calls minutes of bundle adjustment may pass.
 What goes on then is in COLMAP's log, which is followed here in a file.
@@ -87,7 +87,7 @@ class MappingProgress:
                 self._report()
 
     def refresh(self) -> None:
-        """Report again how long the same has been going on."""
+        """Report once more, with the time that the current step has taken."""
         with self._lock:
             self._report()
 
@@ -194,7 +194,7 @@ def _followed(folder: Path, progress: MappingProgress) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class PhotoGroups:
-    """The groups that photographs fell apart into, one of them the model that was kept.
+    """The groups into which photographs separated, one of them the model that was kept.
 
     Attributes:
         kept: Names of the photographs of the model that was kept, sorted.

@@ -109,7 +109,7 @@ def extract(
 
 
 def start_extraction() -> None:
-    """Start the process that `extract` asks, so that the time of its first call is that of features alone."""
+    """Start the process that `extract` uses, so that the time of its first call is that of features alone."""
     _extractor.call("ready", Path())
 
 

@@ -333,7 +333,7 @@ def _from_depth(views: list[View], limit: int, rng: np.random.Generator) -> tupl
 
 
 def _tracked(points: np.ndarray, tracks: Mapping[str, np.ndarray], views: list[View]) -> tuple[np.ndarray, np.ndarray]:
-    """The (N, 3) of the points that tracks say one of V views shows, and which views show them, (V, N) bool."""
+    """(N, 3) points whose tracks contain one of V views, and (V, N) bool, the views of each track."""
     mine = [tracks.get(view.name, np.empty(0, np.int64)) for view in views]
     kept = np.unique(np.concatenate(mine))
     shown = np.zeros((len(views), len(kept)), bool)

@@ -1,4 +1,4 @@
-"""Further photographs into a COLMAP model that `run_sfm` made: the cameras that are there stay where they are.
+"""Register further photographs in a COLMAP model of `run_sfm`: the poses that it has stay fixed.
 
 Features are found in the new photographs alone, matched against those of the database, and COLMAP's incremental mapping
 goes on from the model with its frames and its lenses held. What has been fitted to the model stays valid.
@@ -38,7 +38,7 @@ _SAME_LENS = 0.1  # relative difference of focal lengths, in EXIF and in the mod
 
 @dataclass(frozen=True)
 class Registration:
-    """What became of further photographs.
+    """Result of registering further photographs.
 
     Attributes:
         summary: What became of all photographs of the data set, old and new; `missing` may name old ones, too.

@@ -79,7 +79,7 @@ class PickedFrame:
 
 @dataclasses.dataclass(frozen=True)
 class Picked:
-    """What was taken of a video.
+    """Frames picked from a video.
 
     Attributes:
         frames: The frames, in order; at least one.
@@ -137,7 +137,7 @@ class ExaminedVideo:
         return Picked(tuple(frames), tuple(findings), len(self._samples), self.useful_frames, self._frame_seconds)
 
     def _taken(self, before: int | None, at: int) -> PickedFrame:
-        """The frame at a sample, with what moved since the one before."""
+        """The frame of a sample, with the motion since the frame before."""
         between = [] if before is None else self._samples[before + 1 : at + 1]
         motion = float(np.nansum([sample.motion for sample in between]))
         parallax = float(np.nansum([sample.parallax for sample in between]))
@@ -146,7 +146,7 @@ class ExaminedVideo:
         return PickedFrame(frame, sample.seconds, float(self._sharpness[at]), motion, parallax)
 
     def _findings(self, frames: Sequence[PickedFrame]) -> list[Finding]:
-        """What is wrong with the video, the longest stretches first."""
+        """Faults of the video (turns, blur, speed, blank stretches), the longest first."""
         name, times = self._video.path.name, self._times
         motion = np.array([sample.motion for sample in self._samples])
         findings = list[tuple[float, Finding]]()
@@ -350,7 +350,7 @@ def _spread(useful_frames: np.ndarray, sharpness: np.ndarray, is_open: np.ndarra
 
 
 def _sharp_instead(chosen: Sequence[int], times: np.ndarray, sharpness: np.ndarray, is_open: np.ndarray) -> list[int]:
-    """The same samples, but where one is blurred and another near by is not, that one."""
+    """The same samples, each blurred one replaced by a sharp one near by, if there is one."""
     taken = set[int]()
     for at in chosen:
         if sharpness[at] < _BLURRED_BELOW:

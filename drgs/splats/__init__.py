@@ -35,12 +35,12 @@ __all__ = [
 
 # Scales of 0 have no logarithm, opacities of 0 and 1 no logit: gsplat takes them, and nobody sees these instead.
 _LEAST_SCALE = 1e-20  # scene units
-_LEAST_OPACITY = 1e-12
-_MOST_OPACITY = 1 - 2.0**-26
+_LEAST_OPACITY = 1e-12  # logit -27.6
+_MOST_OPACITY = 1 - 2.0**-26  # logit 18.0
 
 
 class SplatTensors(TypedDict, total=False):
-    """The arguments of `drgs.rasterization` that say what is seen and from where."""
+    """The arguments of `drgs.rasterization` that describe Gaussians and cameras."""
 
     means: torch.Tensor
     quats: torch.Tensor
@@ -75,7 +75,7 @@ class Splats:
         return Splats(**parts, degree=self.degree)
 
     def gaussians(self, with_color: bool = True) -> tuple[Gaussians, float]:
-        """Raw parameters, and what was added to the first three channels to keep them above the clamp."""
+        """Raw parameters, and the number added to the first three channels to keep them above the clamp."""
         shift, features = 0.0, None
         if not with_color:
             sh = self.means.new_zeros(len(self.means), 1, 3)

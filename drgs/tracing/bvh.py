@@ -174,7 +174,7 @@ def proxy_scene(
     origins: np.ndarray,
     tails: bool = False,
 ) -> Proxies | None:
-    """Build the proxies, or None when nothing can be hit.
+    """The Mitsuba scene of proxies around the Gaussians, or None when no Gaussian can be hit.
 
     Args:
         means, quats, radii: (3, N), (4, N) wxyz, (3, N) half axes in world units, NumPy.
@@ -403,7 +403,7 @@ def _coherent(lib: Lib, rays: list[Float]) -> UInt32:
 
 
 def _warn_of_rounding(ellipsoids: np.ndarray, alive: np.ndarray, origins: np.ndarray) -> None:
-    """Tell of Gaussians too thin, in two of their axes, for hits in float32 world space."""
+    """Warn of Gaussians too thin, in two of their axes, for hits in float32 world space."""
     to = ellipsoids[:3] - origins.mean(1, keepdims=True)
     a, b, c = ellipsoids[7:]
     middle = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
@@ -411,6 +411,7 @@ def _warn_of_rounding(ellipsoids: np.ndarray, alive: np.ndarray, origins: np.nda
     if (share := float((ratio > _FAR_RATIO).sum()) / max(len(ratio), 1)) > 0.01:
         warnings.warn(
             f"render: traversal='bvh' must have Gaussians wider than 1/{_FAR_RATIO:g} of their distance in two axes, "
-            f"got {share:.0%} thinner, down to 1/{ratio.max():.1g}; expect errors in their hits or use traversal='tiles'",
+            f"got {share:.0%} thinner, down to 1/{ratio.max():.1g}; expect errors in their hits or use "
+            "traversal='tiles'",
             stacklevel=2,
         )

@@ -43,7 +43,7 @@ OF_VIEW = (
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Output:
-    """What one view shows (torch tensors; None where not in `outputs`); of a list of views with a leading axis.
+    """The images of one view (torch tensors; None where not in `outputs`); of a list of views with a leading axis.
 
     Attributes:
         rgb: (H, W, 3) linear blend of the colors, background included, not clamped.
@@ -217,11 +217,11 @@ class Call:
         return local
 
     def local_directions(self) -> torch.Tensor:
-        """(P, 3) directions in camera axes; where there is none, any that is a number."""
+        """(P, 3) directions in camera axes, any finite numbers for pixels without a ray."""
         return self._local_rays_and_mask()[0]
 
     def _local_rays_and_mask(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """The same, and where there is one, (P, 1)."""
+        """(P, 3) directions in camera axes, and (P, 1) bool, false for pixels without a ray."""
         d = local_directions(self.camera)
         known = torch.isfinite(d).all(1, keepdim=True)
         return torch.where(known, d, torch.tensor([0.0, 0.0, 1.0], dtype=d.dtype)), known
@@ -282,7 +282,7 @@ class Call:
         return images
 
     def prepare(self, inputs: dict) -> tuple[Compositor, Arguments]:
-        """The `Compositor` of the view, and what it composites."""
+        """Project the Gaussians into the view: its `Compositor`, and the arguments of its `forward`."""
         lib, s = self.lib, self.settings
         p = {name: x.array for name, x in self.fields(inputs).items()}
         if s.traversal == "bvh":
@@ -403,7 +403,7 @@ def numbers(where: str, name: str, x) -> torch.Tensor:
 
 
 def checked_pixel_rays(x: torch.Tensor, camera: Camera) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Float64 origins and unit directions (P, 3) of a caller's rays, and where there is one, (P, 1).
+    """Float64 origins and unit directions (P, 3) of a caller's rays, and (P, 1) bool, false for pixels without a ray.
 
     Raises:
         ValueError: If there is not one ray a pixel, or a number is not finite; a direction of 0 is no ray.

@@ -31,7 +31,7 @@ CHUNK = 32  # feature channels of one traversal
 
 
 class Arguments(NamedTuple):
-    """What a `Compositor` composites: the arguments of its `forward`, attached to the graph of a call's inputs."""
+    """The arguments of `Compositor.forward`, attached to the graph of a call's inputs."""
 
     record: list
     sh: Any
@@ -54,7 +54,7 @@ def compositor_of(
     couple: bool = True,
     oriented: bool = False,
 ) -> tuple[Compositor, Arguments]:
-    """The compositor of a view, and what it composites.
+    """The compositor of a view, and the arguments of its `forward`.
 
     Args:
         lib, settings, traversal, want, width, couple, oriented: Arguments of `Compositor`.
@@ -279,7 +279,7 @@ class Compositor:
 
     @property
     def _weights_are_held(self) -> bool:
-        """Whether weights are."""
+        """Whether the weights of the colors' traversal are held for products with features."""
         return any(part.weights is not None for part in self.parts)
 
     def _no_rows(self, count: int) -> torch.Tensor:
@@ -340,7 +340,9 @@ class Compositor:
         slopes: torch.Tensor | None,
         absolute: Float | None,
     ) -> None:
-        """Add what a part with its final states gives to `grads`, `carried`, the `slopes` of features, `absolute`."""
+        """Add the gradient from a part with its final states to `grads`, `carried`, the `slopes` of features,
+        `absolute`.
+        """
         depth = "depth" in self.want and channels.color
         scalars = None
         cotangents = self._cotangents(g, channels, part)
@@ -507,7 +509,7 @@ class Composite(dr.CustomOp):
         absolute: Float | None,
         keep: bool,
     ) -> dict:
-        """The images, as Dr.Jit asks for them."""
+        """The images, under the name that `dr.CustomOp` calls."""
         self.compositor = compositor
         return compositor.forward(record, sh, features, carried, absolute, keep)
 

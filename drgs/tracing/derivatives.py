@@ -67,7 +67,7 @@ def if_any_hit(
 
 
 class Adjoint:
-    """Replay of a primal pass that scatters the gradient of what every hit reads.
+    """Replay of a primal pass that scatters the gradient into the records, SH and features that each hit reads.
 
     Args:
         grads: Buffers like `channels.buffers`, added to.

@@ -1,4 +1,4 @@
-"""What is raised in Python code of ours that Dr.Jit calls while it traces a loop, a branch or an operation."""
+"""Errors raised by Python code that Dr.Jit calls while it traces a loop, a branch or an operation."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ __all__ = ["own_errors"]
 
 @contextlib.contextmanager
 def own_errors() -> Iterator[None]:
-    """Dr.Jit turns an error inside an operation of ours into its own: what was refused, or interrupted, is raised as it
-    was."""
+    """Raise the original error or interrupt, which Dr.Jit replaces by its own where it comes from inside an
+    operation.
+    """
     try:
         yield
     except RuntimeError as error:

@@ -1,4 +1,4 @@
-"""What a walk in exact order knows about each hit, written down, for derivatives in the order of the list.
+"""A table of transmittances by hit, written by a walk in exact order, for derivatives along the list's order.
 
 Rays sort their hits each on their own, so that the lanes of a packet are at different Gaussians: each loads a record of
 its own, and adds to gradients of its own, atomically. But all that a derivative needs of the order are a few numbers a
@@ -23,7 +23,7 @@ __all__ = ["Replayed", "Table", "along_lists", "replayed_hit"]
 
 
 class Replayed(Protocol):
-    """A derivative that depends on the order by what lies in front of a hit and behind it.
+    """A derivative that needs the transmittance in front of a hit and the sums behind it.
 
     Attributes:
         m: Says what a hit is.

@@ -1,4 +1,4 @@
-"""What is rendered: a scene, a camera and settings of the right kind, or one sentence about what was passed instead."""
+"""Checks of the arguments of rendering: a scene, a camera and settings of the right kind, else an error of one line."""
 
 from __future__ import annotations
 

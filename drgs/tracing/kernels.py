@@ -1,4 +1,4 @@
-"""What happens at one hit, and what compositing does with it.
+"""The kernel of a primal pass: the opacity of one hit, and its compositing.
 
 `walk.py` decides which Gaussian a ray meets next; this module evaluates the hit from what is
 stored of the Gaussian and updates the state of the ray. All of it runs inside Dr.Jit loops with AD suspended; the
@@ -56,7 +56,7 @@ class HitModel:
         self.rgb = layout.W_RGB if world else layout.RGB
 
     def slots(self, depth: bool) -> list[int]:
-        """Entries of a record that carry a derivative; `depth` tells whether t* has a cotangent or tangent."""
+        """Entries of a record that carry a derivative; `depth`: whether t* has a cotangent or tangent."""
         return self.response.slots(self.world, depth)
 
     def hit(self, record: list[Float], ray: Ray, active: Mask) -> tuple[Float, Float, Mask]:
@@ -78,7 +78,8 @@ class HitModel:
 
 @dataclasses.dataclass
 class Channels:
-    """What one traversal composites, in flat buffers: colors, from records or SH, and a slice of the features.
+    """The channels that one traversal composites, in flat buffers: colors, from records or SH, and a slice of the
+    features.
 
     Attributes:
         buffers: Name -> Float. `record` has RECORD floats a Gaussian; `sh` 3 K, present when SH are evaluated along

@@ -1,4 +1,4 @@
-"""What a response is a function of: the rays and the Gaussians of one view, in Dr.Jit.
+"""The inputs of a response: the rays and the Gaussians of one view, in Dr.Jit.
 
 Everything about Gaussians is per-Gaussian work, done once a view in float64 and differentiated by Dr.Jit's AD.
 """
@@ -48,7 +48,7 @@ class Ray:
 
 
 class Lens(Protocol):
-    """What bounds on the image ask of a lens (lens_rays.py).
+    """The functions of a lens that bounds on the image need (lens_rays.py).
 
     Attributes:
         guide: What guides are of: pixels of the pinhole camera (plane), the equidistant fisheye, or longitude and
@@ -117,7 +117,7 @@ class Patch(NamedTuple):
     anchor: tuple | Any = None
 
     def spread(self, a: Float, b: Float, c: Float) -> Float:
-        """The most that a dx + b dy + c w differs from what it is in the middle."""
+        """Largest difference of a dx + b dy + c w on the patch from its value in the middle."""
         hx, hy, *hw = self.half
         if not hw:
             return hx * (abs(a) + abs(b)) if hx is hy else dr.fma(hx, abs(a), hy * abs(b))
@@ -299,7 +299,7 @@ def _rotated(view: list, axes: list) -> list:
 
 
 class Projected:
-    """What a view needs to know about each Gaussian.
+    """The record of each Gaussian in a view, with its bounds and order.
 
     Attributes:
         record: List of Dr.Jit floats of width N, laid out as `records` says, attached to the AD graph of the

@@ -1,4 +1,4 @@
-"""What the parts of the engine ask of each other: stream, kernel and sink.
+"""Interfaces between the modules of the engine: stream, kernel and sink.
 
 A part (walk.py) walks its rays along a stream of candidate Gaussians and calls a kernel at each hit. Kernels composite
 (kernels.py) or differentiate what was composited (derivatives.py, jacobian.py); the one of the Jacobian passes its rows
@@ -58,7 +58,7 @@ class Kernel(Protocol):
 
 
 class Sink(Protocol):
-    """What becomes of the Jacobian's rows.
+    """Consumer of the Jacobian's rows.
 
     Attributes:
         needs_color: It reads `Row.color`, even where there is no geometry.

@@ -1,4 +1,4 @@
-"""What hits read of a Gaussian in one view: records, floats side by side in one buffer.
+"""Records: the floats of a Gaussian in one view that hits read, side by side in one buffer.
 
 `projection.py` and the responses fill them, the loops over hits read them. A record is of the screen (cameras of any
 lens, traversal `tiles`) or of the world (any ray, `bvh`).

@@ -1,4 +1,4 @@
-"""Responses: what opacity a Gaussian has for a ray. peak.py, integral.py and ewa.py have the formulas of one each.
+"""Responses: the opacity of a Gaussian for a ray. peak.py, integral.py and ewa.py have the formulas of one each.
 
 A new one is a class that keeps the `Response` protocol and an instance of it in `RESPONSES`, here or from another
 package. What is to be checked has its equations in the float64 oracle (oracle/reference.py), written independently of
@@ -50,7 +50,7 @@ class Response(Protocol):
     # Once a hit, in float32.
 
     def slots(self, world: bool, depth: bool) -> list[int]:
-        """Entries of a record that carry a derivative; `depth` tells whether t* has a cotangent or tangent."""
+        """Entries of a record that carry a derivative; `depth`: whether t* has a cotangent or tangent."""
 
     def along(self, r: list[Float], ray: Ray, world: bool) -> tuple[Float, Float, Float | None]:
         """rho^2, t* (the order key) and u = t* |d'| (None where `opacity` does not need it) of a ray."""

@@ -1,4 +1,4 @@
-"""The hits of pixels in exact order: found along the lists of tiles, and sorted in a row each.
+"""The hits of pixels in exact order, searched along the lists of tiles, and sorted in one row for each pixel.
 
 Rays through a tile meet the Gaussians of its list in orders of their own. The list is walked once, where a packet of
 rays looks at one Gaussian at a time, and every hit is written into the row of its pixel as one number, a word, that
@@ -45,7 +45,7 @@ class MemoryBudget:
 
 
 class SortedHits:
-    """The hits of the pixels of some tiles, found and sorted when they are walked along (`opened`).
+    """The hits of the pixels of some tiles, searched and sorted when a walk begins (`opened`).
 
     Args:
         in_lists: Function that makes a part with these pixels, four a lane, along the lists of the tiles.

@@ -50,8 +50,6 @@ _LANE_PIXELS = {1: [(0, 0)], 2: [(0, 0), (0, 4)], 4: [(0, 0), (4, 0), (0, 4), (4
 _NO_KEY = 2**64 - 1  # key of no entry: sorted behind all others
 # bytes of the orders of all pixels that are held, because derivatives need them again; chosen
 _MAX_ORDER_BYTES = 128 << 20
-# largest sum of the opacities of the tails that are left out of a pixel: half of the image's bound of 1e-5
-# (docs/numerics.md)
 _MAX_TAIL_SUM = 5e-6  # largest sum of opacities of the tails left out of a pixel: half of the bound of images, 1e-5
 _TEST_TILES_FROM = 8  # tiles of a box, on average, from which on each tile is tested against the ellipse
 _TEST_BLOCKS_FROM = 16  # likewise, from which on blocks of tiles are tested first
@@ -244,7 +242,7 @@ class TileTraversal:
 
 
 class _Band(NamedTuple):
-    """Consecutive tiles that are looked at together.
+    """Consecutive tiles that are walked together.
 
     Attributes:
         begin, end: First tile, and that behind the last one.
@@ -369,7 +367,8 @@ def _shorter(
 ) -> Lists:
     """Shorter lists: an extent that bounds the sum of the tails of all Gaussians is longer than a tile needs, which
     lists few of them. Beyond the extent a Gaussian has at most the opacity 1e-5 / N (projection.py); beyond a squared
-    one that is less by c, exp(c / 2) times as much, so that n tails add up to _MAX_TAIL_SUM where c = 2 ln(_MAX_TAIL_SUM N / 1e-5 n).
+    one that is less by c, exp(c / 2) times as much, so that n tails add up to
+    S = _MAX_TAIL_SUM where c = 2 ln(S N / 1e-5 n).
 
     Args:
         tile: (pairs,) of each entry.
@@ -542,7 +541,7 @@ class _Boxes:
 
 
 def _room(size: int) -> int:
-    """Bytes for what bands of tiles hold."""
+    """Bytes that bands of tiles may hold."""
     if runtime.backend().name != "cuda":
         return size
     whole = memory.of_card()

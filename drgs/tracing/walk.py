@@ -33,7 +33,8 @@ from drgs.tracing.weights import PIXELS, Weights
 __all__ = ["BUFFER", "NOWHERE", "ListStream", "Part", "Slots", "Traversal", "pixels_a_lane"]
 
 BUFFER = 20  # hits that a ray is sorted among; a ray for which these are too few is walked again (docs/numerics.md)
-_DEEP_BUFFER = 48  # the same where these were too few: on fits 40 to 80 % of the rays (commit 07ccb400)
+# the same where these were too few; with 16 hits that was so of 40 to 80 % of a fit's rays (commit 07ccb400)
+_DEEP_BUFFER = 48
 _DEEP_FROM = 1000  # such rays, from which on compiling a kernel of their own is worth its time
 NOWHERE = 0xFFFFFFFF  # place in a list of a ray that composited nothing
 _WORD_BITS = 32  # bits of a word beside the key: the lane and the Gaussian
@@ -165,7 +166,7 @@ class Part:
         return (place[-1] - self.slots.first) * PIXELS + self.slots.columns[k]
 
     def reject(self) -> UInt32:
-        """Take the rays that the certificate has found wrong (`run` with `check`) out of this part: their lanes."""
+        """Take the rays whose order the certificate has refuted (`run` with `check`) out of this part: their lanes."""
         failed = self.failed & self.inside[0]
         lanes = dr.compress(failed)
         self.inside = [self.inside[0] & ~failed]

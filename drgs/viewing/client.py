@@ -86,7 +86,7 @@ class Pose:
 
 
 def camera_of(pose: Pose, width: int, height: int, origin: np.ndarray, time: float | None = None) -> Camera:
-    """The camera that shows what the client shows.
+    """The drgs camera of the client's view.
 
     Args:
         pose: Pose of the client's camera.
@@ -103,7 +103,7 @@ def camera_of(pose: Pose, width: int, height: int, origin: np.ndarray, time: flo
 
 
 def pose_of(camera: Camera, origin: np.ndarray) -> Pose:
-    """The client's pose that shows what a camera sees; an optical axis off the middle stays out, and so does a lens.
+    """The client's pose for a camera's view; an off-center optical axis and a lens are left out.
 
     Args:
         camera: Camera in the world.
@@ -129,7 +129,7 @@ _MIN_SIZE = 1e-30  # smallest size of the larger Gaussians, in the world's unit:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ClientGaussians:
-    """What viser's `add_gaussian_splats` takes.
+    """The arrays that viser's `add_gaussian_splats` takes.
 
     The client keeps covariances as half floats, from 6e-5 to 65,504 with all their digits: lengths are therefore
     multiplied so that a Gaussian of nearly the largest has a standard deviation of 64, and all down to 1/8000 of that

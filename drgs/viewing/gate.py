@@ -1,4 +1,4 @@
-"""Which requests the viewer answers: where a request is from is checked before anything is.
+"""Which requests the viewer answers: the origin of a request is checked before anything is computed.
 
 A viewer that listens to this machine alone is still reached by every page that the browser on it has open. Such a
 page may open a WebSocket to 127.0.0.1 (it states its own site as `Origin`), or have its own name resolve to 127.0.0.1
@@ -34,7 +34,7 @@ _LISTS = ("Connection", "Sec-WebSocket-Protocol", "Sec-WebSocket-Extensions")
 
 @dataclasses.dataclass(frozen=True)
 class Gate:
-    """What a request must be like.
+    """Conditions that a request must meet.
 
     Attributes:
         token: Token that the request must know; None asks for none, and takes only requests to a name of this machine.
@@ -62,7 +62,7 @@ class Gate:
         return cls(token, f"drgs_view_{port}")
 
     def address(self, host: str, port: int) -> str:
-        """What is opened in a browser."""
+        """The address to open in a browser."""
         try:
             name = ipaddress.ip_address(host)
             shown = socket.gethostname() if name.is_unspecified else f"[{host}]" if name.version == 6 else host
@@ -132,7 +132,7 @@ def is_loopback(host: str) -> bool:
 
 
 def _malformed(path: str, headers: Any) -> str | None:
-    """What is wrong with a request whoever sends it; None where nothing is."""
+    """Why a request is malformed, whoever sends it; None where it is not."""
     if not headers.get_all("Host"):
         return "the request must name one host"
     for name in _ONCE:

@@ -1,4 +1,4 @@
-"""viser's server behind the gate: the one module that reaches into what viser keeps to itself.
+"""viser's server behind the gate: the one module that uses private names of viser.
 
 viser 1.1 has no public way to check a request before it is answered, to listen on a socket that is bound already, or to
 refuse a tunnel. So, while its server starts, the name `websockets` in `viser.infra._infra` stands for a module whose
@@ -166,7 +166,7 @@ def in_a_line(error: BaseException) -> str:
 
 
 def _without_traceback(record: logging.LogRecord) -> bool:
-    """What a client has sent is worth a line at most, without a traceback, whatever it was; a handshake none."""
+    """Log errors of a client's messages in one line, without a traceback; failed handshakes not at all."""
     if record.exc_info and record.exc_info[1] is not None:
         record.msg = f"view: {record.getMessage()}: {in_a_line(record.exc_info[1])}"
         record.args = ()

@@ -1,4 +1,4 @@
-"""Flights made in the browser: keyframes where its camera is, their way in the scene, a preview, and the file of them.
+"""Camera paths made in the browser: keyframes at its camera, their path in the scene, a preview, and the file of them.
 
 The file goes to the browser as a download: nothing is written where the viewer runs.
 """
@@ -32,7 +32,7 @@ _PREVIEW_FRAME = 1 / 20  # seconds a frame of a preview
 
 
 class KeyframeFolder:
-    """The folder of the panel in which a flight is made.
+    """The folder of the panel in which a camera path is made.
 
     Args:
         client: viser's handle of the browser.
@@ -100,7 +100,7 @@ class KeyframeFolder:
             self._show_line(True)
 
     def forget(self, has_times: bool) -> None:
-        """Another subject is looked at: keyframes stay, unless they have times and it has none, or the reverse."""
+        """The subject has changed: keyframes stay, unless they have times and it has none, or the reverse."""
         if self.keyframes and (self.keyframes[0].time is not None) != has_times:
             self.close()
             self.keyframes = []
@@ -152,7 +152,7 @@ class KeyframeFolder:
             self._line.visible = is_shown
 
     def _show(self) -> None:
-        """Say what there is, and draw the way."""
+        """Update the panel's text, and draw the path."""
         count = len(self.keyframes)
         long = f", {self.flight.seconds:.1f} s" if count > 1 else ""
         self._text.content = panel.status(f"{count} keyframe{'' if count == 1 else 's'}{long}")

@@ -1,4 +1,4 @@
-"""Which pictures there are of what is looked at, and how they are drawn: in steps, a small one first.
+"""The pictures of a subject that the viewer can draw, and how: in steps, a small one first.
 
 What a scene does not have is not offered. A small picture comes first, then one as large as the browser shows, a band
 of rows at a time. Between two steps the worker may turn to something else, so that a browser whose camera has moved
@@ -98,7 +98,7 @@ def rendered_in_bands(
     features: bool = False,
     colors: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> Steps:
-    """What `read` takes of the rendering of a view, (H, W, ...).
+    """Render a view band by band; `read` converts each band's output to rows, joined to (H, W, ...).
 
     Args:
         scene: What is drawn.
@@ -146,7 +146,7 @@ _GAUSSIANS_AT_ONCE = 4096  # Gaussians that are colored at once: bounds the memo
 
 @dataclasses.dataclass(frozen=True)
 class ColorScale:
-    """What the colors of a picture mean.
+    """Meaning of the colors of a picture: their values and unit.
 
     Attributes:
         dark: Value at the dark end.

@@ -1,4 +1,4 @@
-"""What stands in the browser's panel, as HTML: whatever came from a file is escaped here.
+"""HTML of the browser's panel: whatever came from a file is escaped here.
 
 viser puts HTML into its page as it is, and Markdown may hold HTML: nothing else of this room makes either.
 """
@@ -26,7 +26,7 @@ _STEPS = 9  # colors of a scale
 
 
 def header(subject: Subject) -> str:
-    """What is looked at."""
+    """HTML of the subject's name and size."""
     rows = [f"<b>{escape(subject.name)}</b>", f"{subject.count:,} Gaussians"]
     rows += [escape(subject.state)] if subject.state else []
     rows += [f"<i>{escape(note)}</i>" for note in subject.notes]
@@ -34,7 +34,7 @@ def header(subject: Subject) -> str:
 
 
 def status(text: str, scale: ColorScale | None = None) -> str:
-    """What is being done, or what is shown, with the scale of its colors."""
+    """HTML of the current job or picture, with its color scale."""
     rows = [escape(text) or "&nbsp;"]
     if scale is not None:
         shares = np.linspace(0, 1, _STEPS)
@@ -43,7 +43,7 @@ def status(text: str, scale: ColorScale | None = None) -> str:
 
 
 def legend(placed_views: Sequence[PlacedView], title: str) -> str:
-    """What the colors of cameras mean."""
+    """HTML of the meaning of cameras' colors."""
     colors, ends = score_colors(placed_views)
     kinds = {placed.kind: color for placed, color in zip(placed_views, colors, strict=True)}
     rows = [f"{_swatch(kinds['training'])} fitted to"] if "training" in kinds else []
@@ -55,7 +55,7 @@ def legend(placed_views: Sequence[PlacedView], title: str) -> str:
 
 
 def photograph(placed: PlacedView, sight: Sight) -> str:
-    """What is known of a place: its name, what it was used for, its score and the parts of that."""
+    """HTML of a place: its name, what it was used for, its score and the parts of that."""
     camera = sight.camera
     rows = [f"<b>{escape(camera.name)}</b>"]
     used = {"training": "fitted to", "held out": "not fitted to", "candidate": "candidate"}[placed.kind]

@@ -1,4 +1,4 @@
-"""Places where photographs were taken, or could be, and what a selection says of each."""
+"""Places where photographs were taken or proposed, with the scores of a selection."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _PLAIN = (150, 150, 150)  # RGB of places without a score
 
 @dataclasses.dataclass(frozen=True)
 class Score:
-    """What a view was found to be worth.
+    """Score of a view by a selection.
 
     Attributes:
         total: The score.
@@ -91,7 +91,7 @@ class Way:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sight:
-    """What was seen from a place at one time.
+    """The photograph or candidate at a place and a time.
 
     Attributes:
         camera: Camera with the view's name and time, undistorted.
@@ -110,7 +110,7 @@ class Sight:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PlacedView:
-    """A place where a camera stands, with a lens: of synchronous cameras there is one for all times.
+    """A camera pose with a lens: of synchronous cameras there is one for all times.
 
     Attributes:
         kind: Use of its views; `training` if one of them was fitted to.

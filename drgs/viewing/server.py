@@ -90,7 +90,7 @@ class Viewer:
         return self.worker.close(seconds)
 
     def _place(self) -> None:
-        """Tell viser where browsers begin, and what the page looks like."""
+        """Set viser's first camera and the page's appearance."""
         subject, server = self.subject, self._server
         first = subject.first
         bright = sum(subject.background) > 1.5
@@ -189,7 +189,7 @@ class Viewer:
 
     @staticmethod
     def _on_loop_error(_: Any, context: dict[str, Any]) -> None:
-        """A browser has sent what viser, or a session, could not make anything of: a line in the log."""
+        """Log one line where viser, or a session, could not handle a browser's message."""
         error = context.get("exception")
         _log.warning("view: %s", context.get("message") if error is None else in_a_line(error))
 

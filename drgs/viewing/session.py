@@ -1,4 +1,4 @@
-"""One browser: what it shows, where its camera rests, and what it is sent.
+"""One browser: its layer, its camera, and the pictures that it is sent.
 
 While the camera moves the client draws Gaussians by itself. Where it rests for a moment our own picture is drawn, a
 small one first, and lies behind everything else in the scene, whose Gaussians are hidden as long. All methods but
@@ -124,7 +124,7 @@ class Session:
     # ---------------------------------------------------------------------------------------- panel
 
     def _build(self, preset: str) -> None:
-        """Build what stands in the panel."""
+        """Build the panel."""
         gui = self.client.gui
         subject = self.subject
         is_narrow = self.size[0] <= _NARROW_WINDOW
@@ -194,7 +194,7 @@ class Session:
             self._draw_later()
 
     def say(self, text: str, scale: ColorScale | None = None) -> None:
-        """Say in the panel what is being done, or shown. From any thread."""
+        """Show a line of status in the panel. From any thread."""
         if not self._is_closed:
             self._status.content = panel.status(text, scale)
 
@@ -321,7 +321,7 @@ class Session:
         self._show_frusta()
 
     def _show_ways(self, size: float) -> None:
-        """Draw an arrow to each place for a next photograph that was picked, from the photograph that it is told from.
+        """Draw an arrow to each proposed next photograph, from the photograph that its directions refer to.
 
         Args:
             size: Reach of a frustum.
@@ -355,7 +355,7 @@ class Session:
             self._ways.visible = self._are_shown.value
 
     def _clicked(self, placed: PlacedView) -> Callable[[Any], Any]:
-        """What a click on a frustum does."""
+        """Handle a click on a frustum."""
 
         async def clicked(_: Any) -> None:
             self.visit(placed)
@@ -422,7 +422,7 @@ class Session:
 
     @property
     def layer(self) -> Layer:
-        """What is shown."""
+        """The layer that is shown."""
         return self.subject.layer(self._layer.value)
 
     def _send_gaussians(self) -> None:
@@ -452,7 +452,7 @@ class Session:
         self.client.scene.set_background_image(np.ascontiguousarray(plain), format="png")
 
     def _hide(self) -> None:
-        """Take our picture away: it is not what is looked at any more."""
+        """Remove our picture: the camera has moved on."""
         if self._timer:
             self._timer.cancel()
         self._worker.drop((self, "picture"))
@@ -543,7 +543,7 @@ class Session:
     def _with_progress(
         self, steps: Drawings, text: str, expected: float, show: Callable[[np.ndarray], None]
     ) -> Generator[None, None, Drawing]:
-        """Steps of a drawing, saying how much of it is done, and how long the rest will take.
+        """Steps of a drawing, with its progress and the remaining time in the panel.
 
         Args:
             text: Name of what is drawn.
@@ -567,11 +567,11 @@ class Session:
             yield
 
     def _lacks_uncertainty(self) -> bool:
-        """Whether what is to be shown is not known yet."""
+        """Whether the uncertainty that is to be shown is still being computed."""
         uncertainty = self.subject.uncertainty
         return self.layer.name == UNCERTAINTY and uncertainty is not None and not uncertainty.is_complete
 
     def _client_pose(self) -> tuple[Pose, tuple[int, int]] | None:
-        """Pose of the client's camera and pixels of its window; None where it has said nothing that is one."""
+        """Pose of the client's camera and pixels of its window; None where it has reported no valid one."""
         camera = self.client.camera
         return Pose.stated(camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height)

@@ -1,4 +1,4 @@
-"""What a viewer looks at."""
+"""The subject of a viewer: a scene with its cameras, or a run."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class FirstView:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Subject:
-    """What is looked at; another one takes its place where a run has gone on.
+    """A scene with its cameras; a newer one replaces it when a run has continued.
 
     Attributes:
         name: Name of the file or folder, whatever characters it has.
@@ -77,7 +77,7 @@ class Subject:
     notes: tuple[str, ...] = ()
 
     def nearest_time(self, time: float | None) -> float | None:
-        """The time at which it is looked at by who wants a time: one that it has; None where nothing moves.
+        """The time of the scene that is nearest to a wanted time; None where nothing moves.
 
         Args:
             time: Wanted time, of a slider, a photograph, or of what was looked at before, which may have had none or
