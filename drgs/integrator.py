@@ -243,7 +243,7 @@ def render_normals(
         )
     w, x, y, z = torch.nn.functional.normalize(seen.quats.double(), dim=1).unbind(1)
     axis = torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 1)
-    # SH of degree 1 along each ray tell hits where it goes; their color is not looked at.
+    # SH of degree 1 along each ray give hits its direction; their color is not used.
     plain = seen.replace(sh=seen.sh.new_zeros(len(seen), 4, 3), features=axis.to(seen.sh.dtype))
     black = settings.replace(sh_direction="ray", background=(0.0, 0.0, 0.0))
     call = Call(plain, camera, black, frozenset(), pixel_rays=rays, oriented=True)

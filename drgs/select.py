@@ -134,7 +134,9 @@ def select(
         refine=refine,
     )
     if masks is not None and information is not None:
-        raise ValueError("select: masks must be None with information, got both; it knows by itself what views tell")
+        raise ValueError(
+            "select: masks must be None with information, got both; an information function weighs pixels itself"
+        )
     selection = choose(policy, pool)
     selection.seconds = time.perf_counter() - started
     return selection

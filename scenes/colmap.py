@@ -46,7 +46,7 @@ def project(K, c2w, points):
     """(pixels (n, 2), z (n,)) of world points (n, 3)."""
     camera = (points - c2w[:3, 3]) @ c2w[:3, :3]
     z = camera[:, 2]
-    safe = np.where(z > 1e-6, z, 1e-6)  # a point in the camera plane would divide by 0; who asks looks at z
+    safe = np.where(z > 1e-6, z, 1e-6)  # a point in the camera plane would divide by 0; callers check z
     return np.stack([K[0, 0] * camera[:, 0] / safe + K[0, 2], K[1, 1] * camera[:, 1] / safe + K[1, 2]], 1), z
 
 

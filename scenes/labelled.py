@@ -28,7 +28,7 @@ def build(parts, classes, lights=None):
     content = {"type": "scene"}
     materials = {}
     for k, (name, mesh, bsdf, paint, *rest) in enumerate(parts):
-        # Pictures are told apart by their identity: `parts` keeps them all.
+        # Pictures are distinguished by their identity: `parts` keeps them all.
         color = tuple(paint) if np.ndim(paint) == 1 else id(paint)
         key = bsdf["type"], bsdf.get("alpha"), color, bool(rest and rest[0])
         if key not in materials:

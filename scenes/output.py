@@ -22,7 +22,7 @@ def check_numbers(values, where):
 
     Args:
         values: Name -> number: views, seed, sizes in pixels, light paths a pixel.
-        where: Name of who asks, for the error.
+        where: Name of the caller, for the error.
     Raises:
         ValueError: If one is not an integer in its range.
     """
@@ -46,7 +46,7 @@ def publish(out_dir, parameters, fill, where):
         parameters: JSON-serializable dict that determines the content.
         fill: Function that is called with the hidden folder to write the content into. What an interrupted call has
             left is still there: it must keep whatever is finished and write the rest, each file at once (`write_file`).
-        where: Name of who asks, for the error.
+        where: Name of the caller, for the error.
     Returns:
         `out_dir`.
     Raises:

@@ -92,7 +92,7 @@ def test_weights_lambda_and_groups_of_a_field(views, cache):
     assert any("lambda = 0" in note for note in none.notes)
     assert list(run(groups=("means", "mlp")).parts[0]) == ["means", "mlp"]
     assert list(run(groups=("grid",)).parts[0]) == ["grid"]
-    with pytest.raises(ValueError, match="groups must have one that blocks deformation tell about, got sh"):
+    with pytest.raises(ValueError, match="groups must have one that blocks deformation have information about, got sh"):
         run(groups=("sh",), blocks=("deformation",))
 
 

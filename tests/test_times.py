@@ -160,7 +160,7 @@ def test_a_camera_that_stands_still_has_views_at_several_times(caplog):
     """It is warned that they tell no depth; of one time they are refused, as a camera file that is wrong."""
     views = [View(dataclasses.replace(VIEW, time=time), str(time)) for time in (0.0, 0.5, 1.0)]
     check_parallax(views)
-    assert "all 3 training views stand in one place: the photographs tell no depths" in caplog.text
+    assert "all 3 training views stand in one place: the photographs determine no depths" in caplog.text
     for time in (None, 0.5):
         with pytest.raises(ValueError, match=r"^the 3 training views must have poses of their own, all have the same"):
             check_parallax([View(dataclasses.replace(VIEW, time=time), view.name) for view in views])

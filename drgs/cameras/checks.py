@@ -155,7 +155,7 @@ def checked_pose(where: str, w2c: Any, name: str = "w2c") -> np.ndarray:
 def check_handedness(where: str, rotation: np.ndarray, axes: str, column: str) -> None:
     """The axes of camera and world are both right-handed: their rotation (3, 3), or its inverse, is no reflection.
 
-    Which of the two is left-handed no pose tells: with one camera axis turned around, cameras stand where they stood;
+    Which is left-handed, poses do not show: with one camera axis turned around, cameras stand where they stood;
     with one of the world, the scene is its own mirror image. Only photographs, or points, agree with one and not with
     the other.
 

@@ -23,7 +23,7 @@ class Registry(MutableMapping[str, T], Generic[T]):
     """Name -> the function or class of that name, in the order in which rows were added.
 
     A row of this package is written where the table is made, as the value itself or as `module:attribute`, which is
-    imported when it is first asked for: a table that the command line reads for its names loads nothing heavy. Another
+    imported at its first lookup: a table that the command line reads for its names loads nothing heavy. Another
     package adds rows by entry points of the group, which are found when it is installed:
 
         [project.entry-points."drgs.policies"]
@@ -108,7 +108,7 @@ class Registry(MutableMapping[str, T], Generic[T]):
 @functools.cache
 def _entry_points(group: str) -> dict[str, EntryPoint]:
     """Rows of installed packages by name; of two of a name the first that is found."""
-    import importlib.metadata  # a quarter of what `import drgs.settings` takes, which asks no table
+    import importlib.metadata  # a quarter of what `import drgs.settings` takes, which looks up no table
 
     found: dict[str, EntryPoint] = {}
     for point in importlib.metadata.entry_points(group=group):

@@ -72,7 +72,7 @@ def load_gaussians(path: str | os.PathLike, *, as_stored: bool = False) -> Gauss
         path: A .ply (3DGS's or SuperSplat's compressed one), .spz, .splat, .ksplat, .sog or .glb; a folder of a SOG
             scene or its meta.json; a model folder of INRIA's, whose latest iteration is taken.
         as_stored: Keep the axes of the file, where the format (SPZ) has others than PLY: some writers leave out the
-            turn that its specification asks for.
+            turn that its specification requires.
     Returns:
         float32 `Gaussians`. Where a byte stands for an opacity of 0 or 1, or a scale is 0, its logit or logarithm is
         finite (drgs/codecs/values.py).

@@ -83,7 +83,7 @@ def unzstd(path: Path, frame: bytes, size: int) -> bytes:
     if size == 0:
         return b""
     try:
-        # Of the stream, and not of one call: that would allocate what the frame claims, or what is asked for.
+        # Of the stream, and not of one call: that would allocate what the frame claims, or the requested size.
         with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(io.BytesIO(frame)) as stream:
             found = bytearray()
             while len(found) <= size and (part := stream.read(min(size + 1 - len(found), _PIECE))):

@@ -29,7 +29,7 @@ class Codec:
         by_suffix: Whether a file of this suffix that no codec recognizes is of the format: it has no mark, or its
             reader says best what is wrong.
         load_as_stored: Reads a file in the axes that it states, where there are writers that leave out the turn which
-            the specification asks for.
+            the specification requires.
         encode: Makes the bytes of a file, of float32 values on the CPU, without an origin and without features; None
             where the format is only read.
         made_by: Program that makes such a file of a PLY, with the places `{ply}` and `{path}`; for the message where it

@@ -59,7 +59,7 @@ def encode_splat(g: Gaussians) -> bytes:
     Values round to the nearest byte (antimatter15's own writer cuts digits off).
 
     Raises:
-        ValueError: If there are none, which no reader tells from a file that is cut, or a scale is no float32.
+        ValueError: If there are none (readers take that for a file that is cut), or a scale is no float32.
     """
     if not len(g):
         raise ValueError("save_gaussians: .splat must hold at least one Gaussian, got none; write a PLY")

@@ -37,7 +37,7 @@ __all__ = [
 ]
 
 _DEPTH = 3  # folders below the one that is named, down to which a data set is looked for
-_MOST_FOLDERS = 1000  # of each depth that are looked at
+_MOST_FOLDERS = 1000  # folders of each depth that are listed; chosen
 _SHOWN = 3  # data sets that a message names
 _log = logging.getLogger(__name__)
 
@@ -109,7 +109,7 @@ def load(
     Where the training views have two times or more, the data set is one of a scene that moves (`Dataset.is_dynamic`).
     Views of synchronous cameras, which the second to the fourth of these formats have, are named by camera and frame
     (`cam03/0007`), and their times are 0 at the first frame that is used, 1 at the last, and between them by the
-    frame's number. A frame of a video is decoded when its image is asked for. The first camera is held out at all
+    frame's number. A frame of a video is decoded when its image is read. The first camera is held out at all
     times, unless `test_meta.json` says which are. A `held_out.json` beside a data set that states no split of its own
     names the views that are held out (`drgs capture --add` writes it).
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["Focus", "level_frame", "middle_camera", "path", "scene_extent", "upright"]
 
 # Angles and shares are chosen by hand, so that orbits, forward-facing captures, walks and drives of the data sets in
-# tests/test_orbits.py are told apart; no study varied them.
+# tests/test_orbits.py are classified rightly; no study varied them.
 _REWEIGHTINGS = 30  # rounds of reweighting, at most; the median of lines settles in about ten
 _MIN_CONVERGENCE = 0.02  # smallest mean squared sine between the axes and their mean: 8 degrees
 _PARALLEL_AXES = 0.8  # length of the mean axis of cameras that look the same way: within about 37 degrees
@@ -64,7 +64,7 @@ class Focus:
         Args:
             cameras: Any number.
             center: The point, if it is given.
-            distance_of: How far away what a camera looks at is; where axes are parallel only that tells.
+            distance_of: Distance from a camera to the surface in front of it; used where axes are parallel.
         Returns:
             None where there are fewer than two cameras or no such point.
         """

@@ -148,7 +148,7 @@ class SplitRule:
         Args:
             listed: All views, those included whose image is missing.
             there: How many have their image; of fewer than 2 none is held out.
-            every, offset, cameras: What is asked for.
+            every, offset, cameras: The requested split.
         Raises:
             ValueError: If a number is out of range, the offset lies beyond the last view, or cameras are held out that
                 there are not, or all that there are.

@@ -28,7 +28,7 @@ HDR = {16: "PQ", 18: "HLG"}
 _HLG_WHITE = 0.75  # of the signal
 _PQ_WHITE = 203.0  # cd/m2
 _PQ_PEAK = 10_000.0  # cd/m2
-_LARGEST = 1 << 26  # bytes of a header that are looked at; that of an hour of video has some MiB
+_LARGEST = 1 << 26  # bytes of a header that are read; that of an hour of video has some MiB
 _MATROSKA = 1 << 20  # bytes in which Matroska and WebM describe their tracks
 _NEAR = 16  # frames ahead that are decoded rather than sought
 _SAME = 0.01  # milliseconds between time stamps of one frame
@@ -110,7 +110,7 @@ class HdrReader:
             found = None
         if found is None:
             return None
-        # FFmpeg 8 would convert tones, too, of a frame that says which it has; before, PyAV does not tell.
+        # FFmpeg 8 would convert tones, too, of a frame that says which it has; before, PyAV does not report it.
         with contextlib.suppress(AttributeError):
             found.color_trc = found.color_primaries = 1
         if is_gray:

@@ -24,7 +24,7 @@ __all__ = ["encoded_jpeg", "pixels", "size"]
 
 _SIDE = 1 << 15  # pixels, libheif's own limit; a compressed byte stands for any number of them
 _BYTES = 12  # a pixel: planes as decoded, interleaved, turned, and the copy that is answered
-# the tag; what begins EXIF in a JPEG, and its most bytes
+# EXIF: the tag of the orientation, the header in a JPEG, and the bytes that a JPEG segment holds at most
 _ORIENTATION = 0x0112
 _EXIF = b"Exif\0\0"
 _MAX_EXIF_BYTES = 65_533
@@ -82,7 +82,7 @@ def _shown(path: Path) -> Image.Image:
             raise _damaged(path, error) from None
     if shown.mode not in ("L", "RGB", "RGBA"):
         shown = shown.convert("RGBA" if shown.has_transparency_data else "RGB")
-    transfer = (shown.info.get("nclx_profile") or {}).get("transfer_characteristics")  # Pillow tells none of AVIF
+    transfer = (shown.info.get("nclx_profile") or {}).get("transfer_characteristics")  # Pillow reports none of AVIF
     if transfer in HDR:
         converted = Image.fromarray(in_srgb(257 * np.asarray(shown.convert("RGB"), np.uint16), transfer))
         converted.info = shown.info

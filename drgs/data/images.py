@@ -255,7 +255,7 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 # Frame headers are C0..CF, except the tables C4 (Huffman), C8 (reserved) and CC (arithmetic).
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_SCAN = (0xDA,)  # start of scan (SOS): pixels follow
-_DIRECTORY = 4096  # entries of a TIFF that are looked at
+_DIRECTORY = 4096  # entries of a TIFF directory that are read; chosen
 
 
 def stated_size(path: Path) -> tuple[int, int] | None:

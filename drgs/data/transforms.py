@@ -208,7 +208,7 @@ def _splits(file: Path, data: dict) -> list[str]:
 
 
 class _FirstImage:
-    """Size of the first training image, read when it is first asked for."""
+    """Size of the first training image, read at first use."""
 
     def __init__(self, dataset: Dataset, *held_out: Any) -> None:
         """`held_out`: arguments of `Dataset.split`."""

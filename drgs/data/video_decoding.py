@@ -32,9 +32,8 @@ _MAX_FRAMES = 10**7  # four days at 30 a second; a time stamp of each is held
 _MISSING = (0.02, 8)  # share or number of frames that a header may claim too many, where it states a duration alone
 _NEAR = 16  # frames ahead that are decoded rather than sought
 _SAME = 0.01  # milliseconds between time stamps of one frame
-# videos that are held open, and of which is known what is in them
-_MAX_OPEN = 4
-_MAX_KNOWN = 1024
+_MAX_OPEN = 4  # videos that are held open; chosen
+_MAX_KNOWN = 1024  # videos whose size, frame count and time stamps are remembered; chosen
 _REPORT_EVERY = 50  # frames between two reports
 _COPY = "it is truncated or damaged, copy it again"
 

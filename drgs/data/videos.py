@@ -21,7 +21,7 @@ _decoder = Child("drgs.data.video_decoding", "a video that can be decoded", "con
 
 @dataclasses.dataclass(frozen=True)
 class VideoFrame:
-    """One frame of a video, decoded when it is asked for.
+    """One frame of a video, decoded at first use.
 
     Attributes:
         path: The video.

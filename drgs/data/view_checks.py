@@ -100,7 +100,7 @@ def check_parallax(views: list[View]) -> None:
         )
     if np.abs(poses[:, :3, 3] - poses[0, :3, 3]).max() <= tiny:
         _log.warning(
-            "all %d training views stand in one place: the photographs tell no depths, other places will look wrong",
+            "all %d training views stand in one place: the photographs determine no depths, other places will look wrong",
             len(views),
         )
         return
@@ -305,7 +305,7 @@ def default_background(dataset: Dataset, lazy: bool = False) -> tuple[tuple[floa
     all others on black.
 
     Args:
-        dataset: Its training views are looked at, PNGs alone.
+        dataset: Its training views that are PNGs are compared.
         lazy: Open none but the first training view, and of that the header alone.
     Returns:
         RGB in [0, 1], and one line.

@@ -74,7 +74,7 @@ class FeatureColors:
     def picture(self, features: torch.Tensor, decoder: Decoder | None = None) -> np.ndarray:
         """(H, W, 3) uint8 of (H, W, C) features (with a decoder: of (H, W, D) features before it); black where 0."""
         rows = []
-        with torch.no_grad():  # a picture is looked at only; the decoder's graph would keep every row
+        with torch.no_grad():  # a picture needs no gradient; the decoder's graph would keep every row
             for row in features.detach():  # as NumPy wants it below
                 decoded = (row if decoder is None else decoder(row.to(decoder.matrix))).cpu().float()
                 length = decoded.norm(dim=1, keepdim=True)

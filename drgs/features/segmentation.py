@@ -149,7 +149,7 @@ def cosines(features: torch.Tensor, vectors: torch.Tensor, decoder: Decoder | No
     Args:
         features: (..., C) features; with a decoder the (..., D) features before it.
         vectors: (K, C) vectors, of any length but 0.
-        decoder: Decoder of D features to C, asked for a few pixels at a time.
+        decoder: Decoder of D features to C, applied to a few pixels at a time.
     Returns:
         (..., K) float32 on the CPU; 0 where a feature is 0.
     Raises:

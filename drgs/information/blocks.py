@@ -115,7 +115,7 @@ class SceneBlocks:
         Raises:
             ValueError: If the scene does not have a block that is named.
         """
-        with torch.no_grad():  # only which fields the Gaussians have is looked at
+        with torch.no_grad():  # only the names of the Gaussians' fields are read
             seen = scene.at(cameras[0].time)
         names = scoring.blocks_of(seen, where, scene)
         prepared: dict[str, Any] = {}

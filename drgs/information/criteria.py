@@ -75,7 +75,7 @@ def criterion_named(name: str, where: str = "criterion") -> ViewCriterion:
     """The criterion of a name, or of the function that `package.module:function` names.
 
     Args:
-        name: A name in `CRITERIA`, or of somebody's own function. Never one that a file holds: importing runs the
+        name: A name in `CRITERIA`, or `package.module:function`. Never one that a file holds: importing runs the
             module.
         where: What an error begins with.
     Raises:

@@ -90,7 +90,7 @@ def information_gain(
     """How much a candidate view adds to the training views, parameters taken as independent.
 
     `eig` = sum Hc / (H + l), `logdet` = sum log(1 + Hc / (H + l)), `trace_cov` = sum 1 / (H + l) - 1 / (H + Hc + l),
-    `v_opt` = sum P (1 / (H + l) - 1 / (H + Hc + l)), P the information of all views that will be looked at: the drop of
+    `v_opt` = sum P (1 / (H + l) - 1 / (H + Hc + l)), P the information of all views that will be rendered: the drop of
     the predicted variance of their pixels [4].
     Features count once: all D channels have the same information, which divides out of the mean over them.
 
@@ -133,7 +133,7 @@ def scorer(
     if (pool is not None) != rule.needs_pool:
         raise ValueError(
             f"information_gain: pool must be {'given' if rule.needs_pool else 'None'} with criterion {criterion}, got "
-            f"{'none' if pool is None else 'one'}; it is the information of all views that will be looked at"
+            f"{'none' if pool is None else 'one'}; it is the information of all views that will be rendered"
         )
     if rule.term is None:
         if weights:
@@ -442,7 +442,7 @@ def dense(
     R = torch.linalg.qr(rows / length, mode="r")[1]
     if len(R) and not bool((R.diagonal().abs() > _SINGULAR).all()):
         raise ValueError(
-            "dense: H + lambda must be positive definite, got parameters that training rows cannot tell apart; "
+            "dense: H + lambda must be positive definite, got parameters that training rows cannot separate; "
             "use lambda > 0"
         )
     whitened = torch.linalg.solve_triangular(R, Jc / length, upper=True, left=False)

@@ -75,7 +75,7 @@ def _lfs(head: bytes, path: Path) -> tuple[str, str] | None:
 
 
 def _splats(head: bytes, path: Path) -> tuple[str, str] | None:
-    """Gaussians in a format of somebody else."""
+    """Gaussians in another project's format."""
     suffix = path.suffix.lower()
     kind = None
     if head.startswith(b"NGSP") or (head.startswith(b"\x1f\x8b") and _unpacked(head).startswith(b"NGSP")):

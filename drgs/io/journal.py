@@ -46,7 +46,7 @@ class Journal:
 
         Args:
             row: What it says, JSON.
-            unless: Asked with all rows while no other process can append; True: the line is not needed.
+            unless: Called with all rows while no other process can append; True: the line is not needed.
         Raises:
             OSError: If there is no room for all of it, which leaves the file as it was, or no permission.
             ValueError: If `unless` is given and the file is damaged.

@@ -68,7 +68,7 @@ def acquire(folder: Path, command: str) -> str | None:
 
 
 def release(folder: Path) -> None:
-    """Remove this process's lock; somebody else's is left alone."""
+    """Remove this process's lock; another process's is left alone."""
     path = folder / NAME
     with contextlib.suppress(OSError):
         owner = _owner(path)

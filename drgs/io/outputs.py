@@ -3,7 +3,7 @@
 A folder that a command writes into is locked first, before anything is loaded: `lock_folder` finds out that it can be
 written, locks it, and compares what is there with what will be written. `.drgs.jsonl` in it records every file that we
 put there with its SHA-256 hash, before the file appears: what is there under its name with another hash is somebody
-else's, or was edited, and stays. The same is asked again when a file is put in its place.
+else's, or was edited, and stays. The same is checked again when a file is put in its place.
 """
 
 from __future__ import annotations

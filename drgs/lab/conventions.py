@@ -159,7 +159,7 @@ class ReferenceModel:
         return total
 
     def near_ties(self, raw: dict, camera: Camera) -> torch.Tensor:
-        """(H, W) bool: pixels that hang on what float32 cannot tell, by the float64 oracle.
+        """(H, W) bool: pixels whose order float32 cannot resolve, by the float64 oracle.
 
         Two Gaussians whose depths are as good as equal, or a hit or a ray on the very edge of a cut-off, as
         `drgs.reference` marks them `ambiguous`: two correct renderers differ there, the gradient more than the image.
@@ -260,7 +260,7 @@ class ReferenceModel:
             # The root has no derivative at 0; gsplat has no floor, and 1e-6 of an opacity is not drawn by anyone.
             floor = 1e-12 if self.compensation == "full" else _COMPENSATION_FLOOR
             alpha = raw["logit_opacities"].sigmoid() * _compensation(raw, camera, self.settings, floor)
-            # Logits of 0 and 1 are infinite; 1e-12 of an opacity is drawn by nobody.
+            # Logits of 0 and 1 are infinite; an opacity of 1e-12 is never drawn.
             raw["logit_opacities"] = torch.logit(alpha.clamp(1e-12, 1 - 1e-12))
         if COLORS in raw:
             return raw

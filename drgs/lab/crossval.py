@@ -325,7 +325,7 @@ def _scope(r: dict) -> list[str]:
     if r["near_ties"]:
         what = "counted all the same, too little would be left" if r["near_ties_counted"] else "left out"
         lines.append(
-            f"{r['near_ties']:,} of {r['pixels']:,} pixels hang on near ties that float32 cannot tell apart: {what}"
+            f"{r['near_ties']:,} of {r['pixels']:,} pixels hang on near ties that float32 cannot resolve: {what}"
         )
     lines += [f"not compared: the gradient of {name}: {why}" for name, why in r["not_offered"].items()]
     return lines
@@ -357,7 +357,7 @@ def crops(g: Gaussians, cameras: list[Camera], settings: RenderSettings) -> tupl
     Args:
         g: Gaussians of the scene.
         cameras: Pinhole cameras of one image size.
-        settings: Settings of the images that are looked at.
+        settings: Settings of the images that are compared.
     Returns:
         The Gaussians; a camera a view that shows anything; and where each crop lies.
     Raises:
@@ -392,7 +392,7 @@ def _rendered_by_drgs(g: Gaussians, camera: Camera, settings: RenderSettings) ->
     """(H, W, 4) color and alpha, and (N,) bool, which Gaussians are visible."""
     with torch.no_grad():  # a crop's place has no derivative
         out = render(g, camera, settings, outputs=("visibility",))
-    assert out.visibility is not None  # asked for
+    assert out.visibility is not None  # among the outputs
     return torch.cat([out.rgb, out.alpha[..., None]], -1).cpu(), out.visibility.cpu() > 0
 
 

@@ -94,7 +94,7 @@ class Rasterizer:
             # It may make an array of the pose, or refuse one that wants a gradient: the others are taken alone.
             fixed = {name: x for name, x in raw.items() if name not in MOTIONS}
             return {**self.gradient(fixed, camera, background, cotangent), **dict.fromkeys(moving)}
-        # Gradients are numbers from here on; a function may have asked for a graph of them.
+        # Gradients are numbers from here on; a function may have built a graph of them.
         return {
             name: None if x is None else x.detach().double().cpu() for name, x in zip(leaves, derivatives, strict=True)
         }
@@ -163,7 +163,7 @@ def ours(settings: RenderSettings, name: str, preset: str | None = None) -> Rast
 
 
 def function(call: Callable, name: str, along_rays: bool = False) -> Rasterizer:
-    """A function with gsplat's argument names, in float64 if it takes that, on a card if there is one and it asks.
+    """A function with gsplat's argument names, in float64 if it takes that, on a GPU if there is one and it needs it.
 
     Args:
         call: The function.

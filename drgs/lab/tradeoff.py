@@ -735,7 +735,7 @@ class _Measurement:
 
         def both():
             image = setup.image(setup.moving, camera, self.settings, share)
-            # The image is looked at only: its graph is that of `gradient`.
+            # The image needs no graph here: `gradient` builds its own.
             return image.detach().cpu(), setup.gradient(image, setup.cotangents[view])
 
         (image, gradients), took["forward_backward"] = clocked(both)
@@ -889,13 +889,13 @@ def _squares(x: torch.Tensor) -> float:
 def scaled_diagonal(
     gaussians: Gaussians, camera: Camera, settings: RenderSettings, share: float = 1.0, method: Method = "exact"
 ) -> Tensors:
-    """The Fisher diagonal by group, scaled to all pixels whatever the share of them that is looked at.
+    """The Fisher diagonal by group, scaled to all pixels whatever the share of them that is computed.
 
     Args:
         gaussians: Gaussians of the scene.
         camera: View at full size.
         settings: Render settings.
-        share: Share of the view's width and height that is looked at.
+        share: Share of the view's width and height that is computed.
         method: Method of `drgs.fisher.diagonal`.
     """
     small = by_share(camera, share)

@@ -466,7 +466,7 @@ def _decide(case: Case, model: ReferenceModel | None, compared: Compared, names:
 
 def _entries(theirs: torch.Tensor, ours: torch.Tensor, count: int) -> list[int]:
     """Flat indices at which the two differ most, and at which the gradient is largest: half of each."""
-    a = torch.nan_to_num(theirs).reshape(-1)  # NaN sorts before every number: nothing else would be looked at
+    a = torch.nan_to_num(theirs).reshape(-1)  # NaN sorts before every number: nothing else would be chosen
     b = ours.reshape(-1)
     order = [torch.argsort(x.abs(), descending=True).tolist() for x in (a - b, b)]
     return list(dict.fromkeys(order[0][: count // 2] + order[1][:count]))[:count]

@@ -344,7 +344,7 @@ def view_rays(g: Any, cam: Any, rays: Sequence | None, window: Sequence[int] | N
         window: (x, y, width, height) in pixels: only these pixels of the camera's image.
     """
     offset = float64(getattr(g, "origin", (0, 0, 0)))
-    rotation: torch.Tensor | Any = None  # Any: no camera, no pose, and then nobody reads it
+    rotation: torch.Tensor | Any = None  # Any: no camera, no pose, and then it is not read
     center: torch.Tensor | Any = None
     rolling = cam is not None and getattr(cam, "shutter", "global") != "global"
     if rolling:

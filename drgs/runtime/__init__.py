@@ -82,7 +82,7 @@ class Backend:
         variant: Mitsuba variant name, `llvm_ad_rgb` or `cuda_ad_rgb`.
         name: `llvm` or `cuda`.
         types: `drjit.llvm.ad` or `drjit.cuda.ad`, the namespace of differentiable array types.
-        llvm_path: The libLLVM that is loaded, None on CUDA or where the system does not tell.
+        llvm_path: The libLLVM that is loaded, None on CUDA or where the system does not report it.
         llvm_version: (major, minor, patch) as Dr.Jit reports it, None on CUDA.
         threads: Dr.Jit's thread count when the backend was chosen.
     """
@@ -97,7 +97,7 @@ class Backend:
 
 _active: Backend | None = None
 _computing = threading.RLock()
-_abandoned: list[Any] = []  # graphs that nobody wants any more, and that were left while another thread computed
+_abandoned: list[Any] = []  # graphs that are no longer used, but were left while another thread computed
 _owner: int | None = None  # the process that has computed: its worker threads exist nowhere else
 _thread: int | None = None  # the thread that has computed last
 

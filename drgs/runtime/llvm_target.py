@@ -1,7 +1,7 @@
 """The target that Dr.Jit compiles for on a CPU: the processor as LLVM names it, its features, and the lanes of a
 packet.
 
-Dr.Jit 1.5 takes the machine's own from LLVM and has no Python function that tells it, or chooses another: the library
+Dr.Jit 1.5 takes the machine's own from LLVM and has no Python function that returns it, or chooses another: the library
 that it loads has, in C++ (`jit_llvm_target_cpu`, `jit_llvm_target_features`, `jit_llvm_vector_width`,
 `jit_llvm_set_target`). This is the one module that calls them, by their mangled names; in a version that has others,
 `compiled_for` gives None and `compile_for` refuses. tests/test_runtime.py fails as soon as Dr.Jit has a name for it.

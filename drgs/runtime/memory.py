@@ -51,7 +51,7 @@ def require(where: str, needed: int, what: str, advice: str, cuda: bool = False)
         needed: Bytes, a lower bound.
         what: That takes them.
         advice: How it takes less.
-        cuda: Ask for memory of the device, in place of the machine's.
+        cuda: Check the device's memory, in place of the machine's.
     """
     if needed < _UNCHECKED_BYTES:
         return
@@ -107,7 +107,7 @@ def _machine() -> int | None:
                 return int(line.split()[1]) << 10
     except (OSError, ValueError):
         pass
-    try:  # macOS does not say what is free; nobody has more than there is
+    try:  # macOS does not report free memory; the total is an upper bound
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, AttributeError):
         return None

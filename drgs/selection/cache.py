@@ -182,7 +182,7 @@ class Cache:
         """Store a computed quantity, a miss.
 
         Args:
-            scene: That it was computed of; without a bound, nothing is stored if another one was looked at since.
+            scene: That it was computed of; without a bound, nothing is stored if another one was compared since.
             key: All else that it depends on; with a bound, a `ViewKey`.
             computed: What was computed.
         """
@@ -207,7 +207,7 @@ class Cache:
         return computed
 
     def _store(self, key: Hashable, kept: _Entry) -> None:
-        """Keep something in place of what is there, and let go of what there is no room for."""
+        """Store an entry, and drop the oldest ones that no longer fit."""
         self._forget(key)  # computed twice, by two calls at a time
         if (size := size_of(kept.computed)) > self.max_bytes:
             self.evictions += 1

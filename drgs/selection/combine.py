@@ -161,7 +161,7 @@ def joint_of(blocks: SceneBlocks) -> tuple[Joint, Combination]:
     parts = [(name if apart else "", quantity) for some in together for name, quantity in blocks.quantities(some)]
     if not parts:
         raise ValueError(
-            f"select: groups must have one that blocks {', '.join(blocks.names)} tell about, got "
+            f"select: groups must have one that blocks {', '.join(blocks.names)} have information about, got "
             f"{', '.join(scoring.groups or ()) or 'none'}; add the other block, or another group"
         )
     traced = [name for name, quantity in blocks.quantities(blocks.names) if not quantity.needs_known_views]

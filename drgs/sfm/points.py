@@ -312,7 +312,7 @@ def _from_depth(views: list[View], limit: int, rng: np.random.Generator) -> tupl
         if not (depth > 0).any():
             continue
         # A sensor sees no depth at edges, on dark and on far surfaces: 40 % of the pixels of an office. Without a
-        # point there, nothing ever grows there; the nearest known depth is a fair guess.
+        # point there, nothing ever grows there; the nearest known depth is a fair start.
         depth = _filled(depth)
         valid = np.ones(depth.shape, bool) if mask is None else mask > MASK_KEEP
         pixels = np.flatnonzero(valid)

@@ -276,7 +276,7 @@ class VisualHull:
     def support(self, places: np.ndarray) -> np.ndarray:
         """(P,) how many photographs show each of places (P, 3), where none of these shows the background; else -1."""
         number = np.zeros(len(places), np.int64)
-        left = np.arange(len(places))  # what one photograph shows as empty need not be looked at in the next
+        left = np.arange(len(places))  # a point that one silhouette excludes need not be tested by the next
         for index in range(len(self.cameras)):
             shown, columns, rows = self._pixels(index, places[left])
             number[left[shown]] += 1
@@ -349,7 +349,7 @@ class VisualHull:
 
 
 def _size(camera: Camera) -> tuple[int, int]:
-    """Width and height at which its photograph is looked at."""
+    """Width and height of its silhouette, px."""
     width = min(_SILHOUETTE_WIDTH, camera.width)
     return width, max(1, round(camera.height * width / camera.width))
 

@@ -39,7 +39,7 @@ CAMERA_MODELS = (
     "OPENCV_FISHEYE",
 )
 MATCHING = ("auto", "exhaustive", "sequential", "retrieval")
-# Matches that a pose needs where an object alone is looked at, which has few: half of COLMAP's own numbers.
+# Matches that a pose needs where masks leave an object alone, which has few: half of COLMAP's own numbers.
 _MASKED_INLIERS_FIRST = 50
 _MASKED_INLIERS = 15
 
@@ -333,7 +333,7 @@ def _lenses(image_dir: Path, readable: Path, names: list[str], report: Progress)
         image_dir: The photos, maybe with a frames.json.
         readable: The same, as COLMAP reads them.
         names: Their names.
-        report: Told that it has begun.
+        report: Called when it begins.
     """
     from drgs.data.colmap_bindings import pycolmap
 

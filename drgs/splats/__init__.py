@@ -1,7 +1,7 @@
 """Scenes and cameras as gsplat's users hold them, tensors of activated values, as `Gaussians` and `Camera`s.
 
 Raw parameters are logarithms and logits: values at the ends of their range (a scale of 0, an opacity of 0 or 1) are
-moved inside by less than float32 can tell from them, and keep their derivative.
+moved inside by less than float32 resolves, and keep their derivative.
 
 Channels: rendering is linear in the colors, so up to three of them travel as the color of SH degree 0, shifted above
 the clamp at 0 (what the shift adds to an image is taken off again), and the others as features.
@@ -33,7 +33,7 @@ __all__ = [
     "scene_of",
 ]
 
-# Scales of 0 have no logarithm, opacities of 0 and 1 no logit: gsplat takes them, and nobody sees these instead.
+# Scales of 0 have no logarithm, opacities of 0 and 1 no logit: gsplat takes them, and these look the same.
 _LEAST_SCALE = 1e-20  # scene units
 _LEAST_OPACITY = 1e-12  # logit -27.6
 _MOST_OPACITY = 1 - 2.0**-26  # logit 18.0

@@ -46,7 +46,7 @@ def factors(
         got = tuple(covars.shape) if is_tensor else type(covars).__name__
         raise ArgumentError(f"{where}: covars must be a tensor of shape {shape}, got {got}; pass matrices")
     x = covars.to(torch.float64)
-    fixed = x.detach()  # the axes that a change is looked at in have no derivative
+    fixed = x.detach()  # the axes in which a change is expressed have no derivative
     size = fixed.abs().amax((-1, -2)).clamp_min(1e-300)
     _refuse(where, ~torch.isfinite(fixed).all(-1).all(-1), fixed, "finite")
     skewed = (fixed - fixed.mT).abs().amax((-1, -2)) > 1e-5 * size

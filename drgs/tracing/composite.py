@@ -152,7 +152,7 @@ class Compositor:
             features: Flat (N D) or None.
             carried: Columns (rays,): SH basis values, then o and d of world rays or shifts of others.
             absolute: Flat (N 2) zeros whose gradient is to be the sum of each pixel's absolute gradient by projected
-                means; None: nobody asks.
+                means; None: not needed.
             keep: The adjoint may follow.
             columns: So many tangents may follow.
             joint: Feature channels that the first traversal composites with the colors, none or all, so that each of

@@ -74,7 +74,7 @@ class Screen(NamedTuple):
         lens: The lens, if there is one.
         side: (N,) the side of the cube, 0, 1 or 2 for x, y and z, that the anchor is on; None of what is no wide lens.
         offsets: Two (N,) columns of zeros in pixels, added to projected means: derivatives by these are by them; None
-            where nobody asks.
+            where it is not needed.
     """
 
     pinhole: list[Float]
@@ -201,7 +201,7 @@ class Activated:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
         # In float32 the square of a scale overflows at a log-scale of 45, which is a legal parameter. Any scale below
-        # 1e-30 is this one, without a derivative: nobody sees it, and float32 holds its inverse.
+        # 1e-30 is this one, without a derivative: it is invisible, and float32 holds its inverse.
         self.scale = [dr.exp(dr.maximum(Float64(column("log_scales", k, 3)), _THINNEST)) for k in range(3)]
         self.logit = Float64(column("logit_opacities", 0, 1))
         # exp of a non-positive number on both sides: no overflow at any logit. Not of -|logit|, whose derivative at a
@@ -325,7 +325,7 @@ class Projected:
         self.record = record
         self.key = key
         self.alive = alive
-        # Any: None where a view has no such thing, and then nobody reads it.
+        # Any: None where a view has no such thing, and then it is not read.
         self.bounds: list[Float] | Any = bounds
         self.ellipsoids: list[Float] | Any = ellipsoids
         self.frame: tuple | Any = frame

@@ -108,7 +108,7 @@ def _screen(lib: Lib, c: list[Float], pinhole: list[Float], width: int, height: 
     iz = dr.select(front, 1 / dr.select(front, c[2], 1), 0)
     px = dr.select(front, fx * (c[0] * iz) + skew * (c[1] * iz) + cx, cx)
     py = dr.select(front, fy * (c[1] * iz) + cy, cy)
-    # Into the image: around an anchor far outside, the record would lose digits at the pixels that are looked at.
+    # Into the image: around an anchor far outside, the record would lose digits at the pixels of the image.
     (low_x, low_y), (high_x, high_y) = ((0, 0), (width - 1, height - 1)) if lens is None else (lens.low, lens.high)
     ax = dr.clip(dr.floor(px), low_x, high_x) + 0.5
     ay = dr.clip(dr.floor(py), low_y, high_y) + 0.5

@@ -6,7 +6,7 @@ server        a session for every browser
 session       one browser: what it shows, where its camera rests, what it is sent
 keyframes     the folder of keyframes in its panel
 panel         what stands in the panel, as escaped HTML
-subject       what is looked at
+subject       the scene or run that is shown
 layers        which pictures of it there are, and how they are drawn in steps
 worker        the one thread that computes
 client        the browser's cameras and Gaussians, and ours

@@ -5,7 +5,7 @@ page may open a WebSocket to 127.0.0.1 (it states its own site as `Origin`), or 
 (the request then states that name as `Host`). Both are refused. One that listens to a network asks for a token, once
 in the address, from then on in a cookie that scripts do not see.
 
-Here is what is decided, from a path and headers alone; `drgs.viewing.gated_viser` asks it.
+It decides from a path and headers alone; `drgs.viewing.gated_viser` calls it.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Gate:
     """Conditions that a request must meet.
 
     Attributes:
-        token: Token that the request must know; None asks for none, and takes only requests to a name of this machine.
+        token: Token that the request must know; None: none is required, and only requests to a name of this machine are answered.
         cookie: Name of the cookie that keeps the token, with the port in it: cookies are of all ports of a host.
     """
 
@@ -51,7 +51,7 @@ class Gate:
         Args:
             host: Name or address that the viewer listens at.
             port: Port that it listens at.
-            token: Token to ask for; None: none on this machine, else one that nobody can guess.
+            token: Token that is required; None: none on this machine, else a random one.
         Raises:
             ValueError: If the token is short, or has characters that an address has another meaning for.
         """
@@ -104,7 +104,7 @@ class Gate:
 
     @staticmethod
     def around(headers: Any) -> list[tuple[str, str]]:
-        """Headers of every answer: a page that talks to nobody else, in no frame of another one."""
+        """Headers of every answer: the page may contact no other server, and be in no frame of another page."""
         host = headers.get_all("Host")[0]
         policy = f"connect-src 'self' ws://{host} wss://{host} data: blob:; frame-ancestors 'none'; base-uri 'none'"
         return [

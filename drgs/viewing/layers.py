@@ -62,7 +62,7 @@ class DrawingProgress(NamedTuple):
 
 
 Steps = Generator[DrawingProgress, None, np.ndarray]
-"""Yields its progress between its steps, and returns what it has made."""
+"""Yields its progress between its steps, and returns the picture."""
 
 # A first picture is there at once, and a step ends soon enough for a newer request; chosen.
 _FIRST_PIXELS = 16_000  # pixels of the first picture
@@ -110,7 +110,7 @@ def rendered_in_bands(
     """
     parts = []
     shown: list[np.ndarray] = []
-    with torch.no_grad():  # a picture is looked at only; a graph would keep every band's intermediates
+    with torch.no_grad():  # a picture needs no gradient; a graph would keep every band's intermediates
         shown_scene = scene.at(camera.time) if features else colors_only(scene.at(camera.time), None)
     below = 0
     for part in bands(camera):
@@ -233,7 +233,7 @@ def _rgb(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
 
 def _depth(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
     def read(out: Output) -> np.ndarray:
-        assert out.depth is not None  # asked for
+        assert out.depth is not None  # among the outputs
         return np.stack([out.depth.cpu().numpy(), out.alpha.cpu().numpy()], axis=-1)
 
     values = yield from rendered_in_bands(scene, camera, settings, read)

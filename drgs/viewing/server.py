@@ -21,8 +21,8 @@ __all__ = ["Viewer"]
 
 _log = logging.getLogger(__name__)
 
-_NEAR = 1e-3  # times the distance to what is looked at: where the client's pictures begin
-# Times that distance: where they end. A skybox is up to 200 extents of the cameras away, of which what is looked at may
+_NEAR = 1e-3  # times the distance to the orbit center: where the client's pictures begin
+# Times that distance: where they end. A skybox is up to 200 extents of the cameras away, of which the orbit distance may
 # be a small part. What is near is resolved by the nearer number alone.
 _FAR = 1e5
 # Keys of jobs that can wait.
@@ -34,7 +34,7 @@ class Viewer:
     """A viewer that listens from the time it is made.
 
     Args:
-        subject: What is looked at first.
+        subject: The subject that is shown first.
         host: Name or address to listen at.
         port: Port to listen at; 0 is any that is free.
         token: Token that a browser must know; None: none on this machine, else one that is made up.

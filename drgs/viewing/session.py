@@ -60,7 +60,7 @@ class Session:
 
     Args:
         client: viser's handle of the browser.
-        subject: What is looked at.
+        subject: The scene or run that is shown.
         worker: The thread that computes.
         preset: Preset that our pictures are drawn by at first.
         pixels: Largest number of pixels of a picture.
@@ -85,7 +85,7 @@ class Session:
         self._need_uncertainty = need_uncertainty
         self._latest_complete = latest_complete
         self._loop = asyncio.get_running_loop()
-        self._lock = threading.Lock()  # of what follows: the worker's thread asks whether its picture is still wanted
+        self._lock = threading.Lock()  # of what follows: the worker's thread reads whether its picture is still wanted
         self._wanted = 0  # number of the picture that is wanted; another one's is left
         self._is_closed = False
         self.drawn = 0  # pictures that were drawn to the end
@@ -490,7 +490,7 @@ class Session:
         with self._lock:
             self._wanted += 1
             wanted = self._wanted
-        # What is drawn is settled here: when the job begins, another subject may be looked at, at another time.
+        # What is drawn is settled here: when the job begins, another subject may be shown, at another time.
         pose = dataclasses.replace(self.pose, position=self.pose.position + self.subject.origin)
         whole = camera_of(pose, *self.size, np.zeros(3), subject.nearest_time(self.time))
         steps = self._picture(wanted, subject, whole, subject.layer(self.layer.name), self._preset.value)

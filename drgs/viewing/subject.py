@@ -46,7 +46,7 @@ class Subject:
 
     Attributes:
         name: Name of the file or folder, whatever characters it has.
-        state: How far a fit is, e.g. `step 1200`; empty where nobody knows.
+        state: How far a fit is, e.g. `step 1200`; empty where it is unknown.
         count: Number of Gaussians.
         scene: What is drawn.
         origin: (3,) origin of the Gaussians: world coordinates of the client's 0.
@@ -80,7 +80,7 @@ class Subject:
         """The time of the scene that is nearest to a wanted time; None where nothing moves.
 
         Args:
-            time: Wanted time, of a slider, a photograph, or of what was looked at before, which may have had none or
+            time: Wanted time, of a slider, a photograph, or of the subject before, which may have had none or
                 others.
         """
         if not self.times:
