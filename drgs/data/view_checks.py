@@ -100,7 +100,8 @@ def check_parallax(views: list[View]) -> None:
         )
     if np.abs(poses[:, :3, 3] - poses[0, :3, 3]).max() <= tiny:
         _log.warning(
-            "all %d training views stand in one place: the photographs determine no depths, other places will look wrong",
+            "all %d training views stand in one place: the photographs determine no depths, other places will look "
+            "wrong",
             len(views),
         )
         return

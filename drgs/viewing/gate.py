@@ -37,7 +37,7 @@ class Gate:
     """Conditions that a request must meet.
 
     Attributes:
-        token: Token that the request must know; None: none is required, and only requests to a name of this machine are answered.
+        token: Token that the request must know; None: none is required, and requests must be to a name of this machine.
         cookie: Name of the cookie that keeps the token, with the port in it: cookies are of all ports of a host.
     """
 

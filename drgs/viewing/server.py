@@ -22,8 +22,8 @@ __all__ = ["Viewer"]
 _log = logging.getLogger(__name__)
 
 _NEAR = 1e-3  # times the distance to the orbit center: where the client's pictures begin
-# Times that distance: where they end. A skybox is up to 200 extents of the cameras away, of which the orbit distance may
-# be a small part. What is near is resolved by the nearer number alone.
+# Times that distance: where they end. A skybox is up to 200 extents of the cameras away, of which the orbit distance
+# may be a small part. What is near is resolved by the nearer number alone.
 _FAR = 1e5
 # Keys of jobs that can wait.
 _UNCERTAINTY_JOB = "uncertainty"
