@@ -33,13 +33,13 @@ from drgs.tracing.harmonics import higher_harmonics
 from drgs.tracing.pose import rigid_pose
 from drgs.tracing.shutter import middle_pose
 from drgs.tracing.unscented import (
+    COVARIANCE_WEIGHTS,
     DILATION,
     EXTENT,
     LEAST_COMPENSATION,
     LEAST_OPACITY,
     MARGIN,
-    OF_COVARIANCE,
-    OF_MEAN,
+    MEAN_WEIGHTS,
     SPREAD,
 )
 
@@ -804,7 +804,7 @@ def _projected_by_points(splats: Splats, camera: Camera, depths: torch.Tensor, n
         within = ((pixels >= -MARGIN * size) & (pixels < (1 + MARGIN) * size)).all(-1) & torch.from_numpy(seen).reshape(
             -1, 7
         )
-        of_mean, of_covariance = (torch.tensor(x, dtype=torch.float64) for x in (OF_MEAN, OF_COVARIANCE))
+        of_mean, of_covariance = (torch.tensor(x, dtype=torch.float64) for x in (MEAN_WEIGHTS, COVARIANCE_WEIGHTS))
         means2d = torch.einsum("k,nki->ni", of_mean, pixels)
         off = pixels - means2d[:, None]
         xx, xy, yy = (

@@ -27,8 +27,8 @@ __all__ = [
     "LEAST_COMPENSATION",
     "LEAST_OPACITY",
     "MARGIN",
-    "OF_COVARIANCE",
-    "OF_MEAN",
+    "COVARIANCE_WEIGHTS",
+    "MEAN_WEIGHTS",
     "SPREAD",
     "unscented_boxes",
 ]
@@ -36,13 +36,13 @@ __all__ = [
 _ALPHA, _BETA = 0.1, 2.0  # parameters of the transform, gsplat's defaults; kappa is 0
 SPREAD = _ALPHA * math.sqrt(3.0)
 """Distance of the six points from the mean, in standard deviations."""
-_OTHERS = 1 / (2 * SPREAD**2)  # weight of each of the six points
-OF_MEAN = (1 - 6 * _OTHERS, *[_OTHERS] * 6)
+_WEIGHT_OF_POINT = 1 / (2 * SPREAD**2)  # weight of each of the six points
+MEAN_WEIGHTS = (1 - 6 * _WEIGHT_OF_POINT, *[_WEIGHT_OF_POINT] * 6)
 """Weights of the mean's and the six points' places in the mean on the image."""
-OF_COVARIANCE = (OF_MEAN[0] + 1 - _ALPHA**2 + _BETA, *OF_MEAN[1:])
+COVARIANCE_WEIGHTS = (MEAN_WEIGHTS[0] + 1 - _ALPHA**2 + _BETA, *MEAN_WEIGHTS[1:])
 """The same in the covariance."""
 MARGIN = 0.1
-"""Of the image, around it: a Gaussian without a point within is not drawn."""
+"""Share of the width and height, added on each side: a Gaussian without a point inside is not drawn."""
 DILATION = 0.3
 """px^2, added to the covariance: gsplat's default."""
 LEAST_COMPENSATION = 0.005
@@ -71,10 +71,10 @@ def unscented_boxes(lib: Lib, g: Activated, camera: Camera, origin: torch.Tensor
         margin_x, margin_y = MARGIN * camera.width, MARGIN * camera.height
         inside = (x >= -margin_x) & (x < camera.width + margin_x)
         there |= front & inside & (y >= -margin_y) & (y < camera.height + margin_y)
-    mean = [sum(w * p[k] for w, p in zip(OF_MEAN, points, strict=True)) for k in range(2)]
+    mean = [sum(w * p[k] for w, p in zip(MEAN_WEIGHTS, points, strict=True)) for k in range(2)]
     off = [(p[0] - mean[0], p[1] - mean[1]) for p in points]
     xx, xy, yy = (
-        sum(w * o[i] * o[j] for w, o in zip(OF_COVARIANCE, off, strict=True)) for i, j in ((0, 0), (0, 1), (1, 1))
+        sum(w * o[i] * o[j] for w, o in zip(COVARIANCE_WEIGHTS, off, strict=True)) for i, j in ((0, 0), (0, 1), (1, 1))
     )
     sharp = xx * yy - xy * xy
     xx += DILATION
