@@ -97,6 +97,7 @@ _MODULES = {
     "sfm": "sfm",
     "sharing": "pages.sharing",
     "shutters": "cameras.shutters",
+    "sizes": "cameras.sizes",
     "splats": "splats",
     "studies": "studies",
     "testing": "testing",
@@ -173,6 +174,7 @@ if TYPE_CHECKING:
     from drgs import viewing as viewing
     from drgs.cameras import Camera
     from drgs.cameras import shutters as shutters
+    from drgs.cameras import sizes as sizes
     from drgs.codecs import load_gaussians, save_gaussians
     from drgs.data import Dataset, View
     from drgs.data import load as load_data
