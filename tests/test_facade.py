@@ -59,16 +59,6 @@ def test_a_module_is_imported_by_its_public_name(name):
         importlib.import_module(f"drgs.data.{name}")
 
 
-def test_points_are_functions_of_data_too():
-    """`drgs.data.initial_points`, as in 0.2.0, is that of structure from motion; other names are refused."""
-    from drgs.data import initial_points
-    from drgs.sfm import points
-
-    assert initial_points is points.initial_points
-    assert all(getattr(drgs.data, name) is getattr(points, name) for name in points.__all__)
-    assert not hasattr(drgs.data, "initial_pionts")
-
-
 def test_what_users_import_is_public():
     """The journey from photographs to the next view, and the types that its functions take, are in `__all__`."""
     wanted = (

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import logging
 import os
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from drgs.checks.registry import Registry
 from drgs.data.camera_layout import scene_extent
@@ -41,15 +40,6 @@ _MOST_FOLDERS = 1000  # folders of each depth that are listed; chosen
 _SHOWN = 3  # data sets that a message names
 _log = logging.getLogger(__name__)
 
-_POINTS = (
-    "added_points",
-    "initial_points",
-    "matched_points",
-    "shared_points",
-    "triangulated_count",
-    "triangulated_points",
-)
-
 LOADERS: Registry[Format] = Registry(
     "data set format",
     "drgs.loaders",
@@ -68,15 +58,6 @@ LOADERS: Registry[Format] = Registry(
 """Formats of data sets, in the order in which they are tried; those of other packages and
 scripts come after these, so that no folder changes its meaning when something is installed.
 """
-
-
-if not TYPE_CHECKING:  # a type checker reads them in drgs.sfm.points, and finds names here that are misspelt
-
-    def __getattr__(name: str) -> Any:
-        """Points of photographs were functions of this module up to 0.2.0: `drgs.sfm.points` has them."""
-        if name in _POINTS:
-            return getattr(importlib.import_module("drgs.sfm.points"), name)
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def load(
