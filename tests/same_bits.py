@@ -169,6 +169,7 @@ def write_photographs(folder: Path, times: int = 1) -> None:
     """
     import cv2
     import numpy as np
+    import torch
 
     from drgs.cameras import orbit
 
@@ -177,7 +178,7 @@ def write_photographs(folder: Path, times: int = 1) -> None:
     folder.mkdir()
     (folder / "images").mkdir()
     if times == 1:
-        (folder / "semantic_features").mkdir()
+        (folder / "rgb_feature_langseg").mkdir()
     frames = []
     for k, camera in enumerate(orbit((0, 0, 0), 3.0, VIEWS, width=WIDTH, height=HEIGHT)):
         time = (k % times) / max(times - 1, 1)
@@ -192,7 +193,7 @@ def write_photographs(folder: Path, times: int = 1) -> None:
         cv2.imwrite(str(folder / f"images/{k}.png"), (image[..., ::-1] * 255).round().astype(np.uint8))
         if times == 1:
             maps = np.eye(CHANNELS, dtype=np.float32)[labels[::2, ::2]].transpose(2, 0, 1)
-            np.save(folder / f"semantic_features/{k}.npy", maps)
+            torch.save(torch.from_numpy(maps), folder / f"rgb_feature_langseg/{k}_fmap_CxHxW.pt")
         c2w = np.linalg.inv(camera.w2c) @ np.diag([1.0, -1, -1, 1])  # transforms.json has OpenGL's axes
         frame = {"file_path": f"images/{k}.png", "transform_matrix": c2w.round(12).tolist()}
         frames.append({**frame, "time": time} if times > 1 else frame)
