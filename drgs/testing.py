@@ -17,7 +17,7 @@ import torch
 from drgs.cameras import Camera, look_at
 from drgs.ellipsoids import Gaussians
 from drgs.lab.crossval import VERDICTS, Result, crossval
-from drgs.lab.rasterizers import function, load_rasterizer
+from drgs.lab.rasterizers import function, is_along_rays, load_rasterizer
 
 __all__ = ["assert_matches", "random_scene"]
 
@@ -39,7 +39,8 @@ def assert_matches(
         rasterizer: A function with gsplat's argument names, or a name as `drgs crossval --rasterizer` takes it.
         scene: Gaussians to compare on; default random scenes of `seeds`.
         cameras: Views of the scene; both are given, or none.
-        preset: Preset that it claims to compute, or `auto`.
+        preset: Preset that it claims to compute, or `auto`. Of one along rays (`3dgut`, `exact`, `fast`) the function
+            is called with `with_ut` and `with_eval3d` where it has them, as `drgs crossval` calls it.
         background: RGB of the background; black hides what happens to its gradient.
         allow: Verdicts (drgs.lab.crossval.VERDICTS) besides `agreement` that pass.
         seeds: Seeds of the random scenes.
@@ -58,9 +59,10 @@ def assert_matches(
     results = []
     for g, views in scenes:
         if isinstance(rasterizer, str):
-            tested = load_rasterizer(rasterizer, g, views, {"background": background})
+            rays = is_along_rays(preset, rasterizer)
+            tested = load_rasterizer(rasterizer, g, views, {"background": background}, rays)
         else:
-            tested = function(rasterizer, getattr(rasterizer, "__name__", "rasterizer"))
+            tested = function(rasterizer, getattr(rasterizer, "__name__", "rasterizer"), is_along_rays(preset))
         result = crossval(tested, g, views, preset, {"background": background}, **options)
         results.append(result)
         if result.verdict not in ("agreement", *allow):

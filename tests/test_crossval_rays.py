@@ -17,6 +17,7 @@ import torch_rays
 from test_data import save, write_image
 from torch_rays import DEFECTS, LENSES
 
+import drgs
 from drgs import cli
 from drgs.cameras import Camera, c2w_to_opengl
 from drgs.cameras.shutters import SHUTTERS
@@ -254,6 +255,13 @@ def test_assert_matches_along_rays():
     assert_matches(torch_rays.rasterizer(RIGHT), g, [camera], "3dgut", background=BACKGROUND, allow=allow)
     with pytest.raises(AssertionError, match="log_scales: gradient bug"):
         assert_matches(torch_rays.broken("scale_chain", RIGHT), g, [camera], "3dgut", background=BACKGROUND)
+
+
+def test_assert_matches_calls_as_the_command_does():
+    """A preset along rays is compared with Gaussians along rays, although no camera has a lens."""
+    g, camera = _made(0)
+    (result,) = assert_matches(drgs.rasterization, g, [camera], "3dgut", background=BACKGROUND, channels=0)
+    assert not result.findings
 
 
 def test_what_knows_no_lens_is_refused():

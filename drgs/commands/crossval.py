@@ -16,7 +16,6 @@ from drgs.io.outputs import atomic_write, check_file, lock_folder, write_json
 from drgs.lab import ladder, rasterizers
 from drgs.lab.crossval import Result, crossval
 from drgs.lab.report import html
-from drgs.settings import PRESETS, RenderSettings
 
 if TYPE_CHECKING:
     from drgs.commands.options import Crossval
@@ -36,7 +35,7 @@ def run(args: Crossval) -> int:
         check_file(args.export, "crossval", inputs, rasterizers.is_export)
     given = SceneInput.of(args)
     g, fields = given.colors, given.fields
-    along_rays = _along_rays(args)
+    along_rays = rasterizers.is_along_rays(args.preset, args.rasterizer)
     # A model of the image plane has no lens, and what is written for another machine is pinholes.
     cameras, source = views_to_sample(args, given, lenses=along_rays and args.export is None)
     cameras = [at_most(camera, args.max_pixels) for camera in cameras]
@@ -66,15 +65,6 @@ def run(args: Crossval) -> int:
         _print(result, args)
     bad = result.verdict == "gradient bug" or (args.strict and result.verdict != "agreement")
     return int(bad)
-
-
-def _along_rays(args: Crossval) -> bool:
-    """Whether the preset that is compared with is said to evaluate Gaussians along rays; a dump is of pinholes."""
-    own = args.rasterizer.removeprefix("drgs:") if args.rasterizer.startswith("drgs:") else "auto"
-    name = own if own in PRESETS and args.preset == "auto" else args.preset
-    if name == "auto" or args.rasterizer.endswith(rasterizers.SUFFIXES):
-        return False
-    return not RenderSettings.preset(name).planar
 
 
 def _print(result: Result, args: Crossval) -> None:

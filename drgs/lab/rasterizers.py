@@ -36,6 +36,7 @@ __all__ = [
     "SUFFIXES",
     "Dump",
     "Rasterizer",
+    "is_along_rays",
     "cotangents",
     "export",
     "function",
@@ -149,6 +150,20 @@ def load_rasterizer(
         return function(_three_channels_along_rays(rasterization), text, along_rays)
     imported = imported_function("--rasterizer", text, "drgs:PRESET, gsplat, a file .npz or .safetensors, or ")
     return function(imported, text, along_rays)
+
+
+def is_along_rays(preset: str, name: str = "") -> bool:
+    """Whether a rasterizer is compared with Gaussians along rays: of presets that have no image plane.
+
+    Args:
+        preset: The preset that it claims to be; `auto` is that of `drgs:PRESET`, else the image plane.
+        name: Name of the rasterizer, as `load_rasterizer` takes it; a dump is of pinholes.
+    """
+    own = name.removeprefix("drgs:") if name.startswith("drgs:") else "auto"
+    claimed = own if own in PRESETS and preset == "auto" else preset
+    if claimed == "auto" or name.endswith(SUFFIXES):
+        return False
+    return not RenderSettings.preset(claimed).planar
 
 
 def ours(settings: RenderSettings, name: str, preset: str | None = None) -> Rasterizer:
