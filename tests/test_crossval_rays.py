@@ -285,7 +285,7 @@ def test_what_knows_no_lens_is_refused():
 
 @pytest.mark.parametrize("lens", ["opencv", "fisheye"])
 def test_command_through_a_lens(tmp_path, lens):
-    """With a preset along rays cameras keep their lens, without one they are pinholes as ever."""
+    """With a preset along rays cameras keep their lens, without one they are pinholes, and the lens is tested apart."""
     g, camera = _made(0, lens)
     save_ply(g, tmp_path / "scene.ply")
     write_capture(tmp_path / "capture", camera)
@@ -293,7 +293,7 @@ def test_command_through_a_lens(tmp_path, lens):
 
     def rasterization(means, camera_model="pinhole", radial_coeffs=None, with_eval3d=False, **arguments):
         """Asked for one Gaussian first."""
-        seen.append((camera_model, None if radial_coeffs is None else radial_coeffs.shape[1], with_eval3d))
+        seen.append((camera_model, None if radial_coeffs is None else radial_coeffs.shape[-1], with_eval3d))
         options = {"camera_model": camera_model, "radial_coeffs": radial_coeffs}
         return torch_rays.rasterizer(RIGHT)(means=means, **options, **arguments)
 
@@ -305,11 +305,12 @@ def test_command_through_a_lens(tmp_path, lens):
     try:
         out = tmp_path / "rays"
         assert cli.main([*command, "--preset", "3dgut", "--set", "culling=extent", "--strict", "-o", str(out)]) == 0
-        assert set(seen[1:]) == {("fisheye", 4, True) if lens == "fisheye" else ("pinhole", 6, True)}
+        through = ("fisheye", 4, True) if lens == "fisheye" else ("pinhole", 6, True)
+        assert set(seen[1:]) == {through}
         assert json.loads((out / "crossval.json").read_text())["verdict"] == "agreement"
         seen.clear()
         assert cli.main([*command, "-o", str(tmp_path / "auto")]) == 0
-        assert set(seen) == {("pinhole", None, False)}
+        assert set(seen) == {("pinhole", None, False), through}  # the path of the lens is tested apart
     finally:
         del sys.modules["taken_down"]
 

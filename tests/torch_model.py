@@ -37,6 +37,7 @@ class Model:
     direction: Callable = lambda means, center: normalize(means - center, dim=-1)
     coefficients: Callable = _same
     color: Callable = _same
+    numbers: Callable = _same
     key: Callable = lambda view: view[:, 2]
     clamp: Callable = lambda alpha, alpha_max: alpha.clamp(max=alpha_max)
     behind: Callable = lambda transmittance, background: transmittance[:, None] * background
@@ -121,7 +122,7 @@ class Model:
             order = torch.argsort(self.key(view), stable=True)
             order = order[keep[order]]
             first, last = torch.floor((at - radius) / TILE), torch.ceil((at + radius) / TILE)
-        splats = {"index": index, "depth": z, "at": at, "opacity": opacity, "first": first, "last": last}
+        splats = {"index": self.numbers(index), "depth": z, "at": at, "opacity": opacity, "first": first, "last": last}
         splats = {name: value[order] for name, value in splats.items()}
         # Divided only where kept: a determinant of 0 would give NaN in the gradient.
         a, b, c, det = (value[order] for value in (a, b, c, det))

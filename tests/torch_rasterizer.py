@@ -29,11 +29,15 @@ __all__ = [
     "CORRECT",
     "DEFECTS",
     "GROUPS",
+    "PATH_DEFECTS",
     "Defect",
     "Model",
+    "PathDefect",
+    "PathModel",
     "broken",
     "draw",
     "gradients",
+    "paths",
     "random_scene",
     "rasterization",
     "rasterizer",
@@ -318,6 +322,147 @@ DEFECTS = {
     for name, (kind, groups, words, what, fields) in _TABLE.items()
 }
 globals().update({f"defect_{name}": _function(defect) for name, defect in DEFECTS.items()})
+
+
+@dataclasses.dataclass(frozen=True)
+class PathModel:
+    """A rasterizer with depth modes, several cameras and packed arrays. A defect replaces a stage of one path."""
+
+    color: Model = CORRECT
+    depth: Model = CORRECT
+    own: Callable = lambda depth: depth
+    divisor: Callable = lambda alpha: alpha
+    packed: Callable = lambda means: means
+    of_camera: Callable = lambda index, count, x: x
+
+    def rasterize(
+        self,
+        means,
+        quats,
+        scales,
+        opacities,
+        colors,
+        viewmats,
+        Ks,
+        width,
+        height,
+        *,
+        near_plane=0.01,
+        eps2d=0.3,
+        sh_degree=None,
+        backgrounds=None,
+        render_mode="RGB",
+        packed=False,
+    ):
+        """Images of RGB, RGB+D and RGB+ED, with gsplat's arguments."""
+        if render_mode not in ("RGB", "RGB+D", "RGB+ED"):
+            raise ValueError(f"rasterize: render_mode {render_mode} is not there")
+        options = {"near_plane": near_plane, "eps2d": eps2d}
+        images, alphas = [], []
+        for i, (w2c, K) in enumerate(zip(viewmats, Ks, strict=True)):
+            inputs = [self.of_camera(i, len(Ks), x) for x in (means, quats, scales, opacities, colors)]
+            if packed:
+                inputs[0] = self.packed(inputs[0])
+            one = w2c[None], K[None], width, height
+            behind = None if backgrounds is None else backgrounds[i : i + 1]
+            image, alpha, _ = self.color.rasterize(*inputs, *one, sh_degree=sh_degree, backgrounds=behind, **options)
+            if render_mode != "RGB":
+                z = self.own((inputs[0] @ w2c[:3, :3].T + w2c[:3, 3])[:, 2:])
+                depth, weight, _ = self.depth.rasterize(*inputs[:4], z, *one, **options)
+                if render_mode == "RGB+ED":
+                    depth = depth / self.divisor(weight).clamp(min=1e-10)
+                image = torch.cat([image, depth], -1)
+            images.append(image)
+            alphas.append(alpha)
+        return torch.cat(images), torch.cat(alphas), {}
+
+
+@dataclasses.dataclass(frozen=True)
+class PathDefect:
+    """A fault of one path of a rasterizer whose images and gradients of one view are right.
+
+    Attributes:
+        what: One line on the fault.
+        path: Paths that it shows on.
+        verdict: Verdict of the whole.
+        call: The rasterizer that has it.
+    """
+
+    what: str
+    path: tuple[str, ...]
+    verdict: str
+    call: Callable
+
+
+def _path_function(name, **fields):
+    model = PathModel(**fields)
+
+    def rasterize(
+        means,
+        quats,
+        scales,
+        opacities,
+        colors,
+        viewmats,
+        Ks,
+        width,
+        height,
+        *,
+        near_plane=0.01,
+        eps2d=0.3,
+        sh_degree=None,
+        backgrounds=None,
+        render_mode="RGB",
+        packed=False,
+    ):
+        options = {"near_plane": near_plane, "eps2d": eps2d, "sh_degree": sh_degree, "backgrounds": backgrounds}
+        options |= {"render_mode": render_mode, "packed": packed}
+        return model.rasterize(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **options)
+
+    rasterize.__name__ = rasterize.__qualname__ = name
+    return rasterize
+
+
+paths = _path_function("paths")
+_BOTH_DEPTHS = ("depth RGB+D", "depth RGB+ED")
+_PATH_TABLE = {
+    "depth_halved": (
+        "the gradient of a depth by the depths of Gaussians is halved",
+        _BOTH_DEPTHS,
+        {"own": lambda depth: _Backward.apply(depth, lambda g: 0.5 * g)},
+    ),
+    "depth_cross_terms": (
+        "the gradient of an expected depth lacks the terms of the alpha that it is divided by",
+        _BOTH_DEPTHS[1:],
+        {"divisor": torch.Tensor.detach},
+    ),
+    "depth_clamp_passes": (
+        "a clamped alpha passes its gradient through in the depth alone",
+        _BOTH_DEPTHS,
+        {"depth": dataclasses.replace(CORRECT, **DEFECTS["clamp_passes_gradient"].fields)},
+    ),
+    "index_shifted": (
+        "colors are those of the n-th Gaussian of all, where the n-th that is not culled is meant",
+        ("culled Gaussians in front", "near plane"),
+        {"color": dataclasses.replace(CORRECT, numbers=lambda index: torch.arange(len(index)))},
+    ),
+    "one_camera_of_two": (
+        "of several cameras in a call only the last one has a gradient",
+        ("several cameras in a call",),
+        {"of_camera": lambda i, count, x: x if i == count - 1 else x.detach()},
+    ),
+    "packed_detached": ("packed means are detached", ("packed",), {"packed": torch.Tensor.detach}),
+}
+PATH_DEFECTS = {
+    name: PathDefect(
+        what,
+        where,
+        "model difference" if name == "index_shifted" else "gradient bug",
+        _path_function(f"paths_{name}", **fields),
+    )
+    for name, (what, where, fields) in _PATH_TABLE.items()
+}
+globals().update({f"paths_{name}": defect.call for name, defect in PATH_DEFECTS.items()})
 
 
 def broken(defect: str) -> Callable:

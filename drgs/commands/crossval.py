@@ -24,7 +24,7 @@ __all__ = ["run"]
 
 
 def run(args: Crossval) -> int:
-    """`drgs crossval SCENE`: 1 if a gradient is wrong, or, with --strict, if anything is not as the preset has it."""
+    """`drgs crossval SCENE`: 1 if a gradient or a path is wrong, with --strict if anything differs."""
     OrbitShape.of(args)  # refuses what cannot be, before anything is read
     inputs = [args.scene, args.cameras or "", args.rasterizer]
     if args.export is None:
@@ -37,8 +37,9 @@ def run(args: Crossval) -> int:
     g, fields = given.colors, given.fields
     along_rays = rasterizers.is_along_rays(args.preset, args.rasterizer)
     # A model of the image plane has no lens, and what is written for another machine is pinholes.
-    cameras, source = views_to_sample(args, given, lenses=along_rays and args.export is None)
-    cameras = [at_most(camera, args.max_pixels) for camera in cameras]
+    seen, source = views_to_sample(args, given, lenses=True)
+    keep_lenses = along_rays and args.export is None
+    cameras = [at_most(camera if keep_lenses else camera.undistorted(), args.max_pixels) for camera in seen]
     if args.export is not None:
         rasterizers.export(args.export, g, cameras, given.background, args.seed)
         if not args.quiet:
@@ -50,7 +51,17 @@ def run(args: Crossval) -> int:
         def advance(stage: str) -> None:
             bar.update(0, label=f"crossval, {stage}")
 
-        result = crossval(rasterizer, g, cameras, args.preset, fields, seed=args.seed, advance=advance)
+        lenses = [at_most(camera, args.max_pixels) for camera in seen if camera.is_distorted]
+        result = crossval(
+            rasterizer,
+            g,
+            cameras,
+            args.preset,
+            fields,
+            seed=args.seed,
+            lenses=lenses if args.preset == "auto" else None,
+            advance=advance,
+        )
         report = {"schema": SCHEMA, "command": "crossval", "scene": str(args.scene), "source": source} | result.report
         table = ""
         if args.ladder:
@@ -63,7 +74,8 @@ def run(args: Crossval) -> int:
     write_json(args.output / "crossval.json", report)
     if not args.quiet:
         _print(result, args)
-    bad = result.verdict == "gradient bug" or (args.strict and result.verdict != "agreement")
+    wrong = result.verdict == "gradient bug" or any(row.status == "wrong" for row in result.paths)
+    bad = wrong or (args.strict and result.verdict != "agreement")
     return int(bad)
 
 
@@ -84,4 +96,8 @@ def _print(result: Result, args: Crossval) -> None:
     rms = max(view.rms for view in result.views)
     share = max(view.share for view in result.views)
     print(f"image at these conventions: RMS {rms:.1e}, {share:.2%} of the pixels off by more than 0.001")
-    print(f"{report['verdict']}: {args.output / 'report.html'}, crossval.json")
+    rows = [(row.path, row.status, "; ".join(x for x in (row.why, row.how) if x)) for row in result.paths]
+    columns = ("path", "status", "why, and what would test it")
+    tables.show("paths of the rasterizer", columns, rows, texts=columns[1:])
+    left = result.not_tested()
+    print(f"{report['verdict']}{f' ({left})' if left else ''}: {args.output / 'report.html'}, crossval.json")

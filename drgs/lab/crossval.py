@@ -11,7 +11,9 @@ to be made on purpose may explain it; else the rasterizer's own central differen
     model difference   it agrees with them, and the model is another one
     undecided          too few differences converged, or a dump has none
 
-The verdict of the whole is the worst of them; `other convention` if only conventions differ from what was claimed. What
+Then the other paths to an image are tested, depth and packed arrays among them (paths.py).
+
+The verdict of the whole is the worst of all; `other convention` if only conventions differ from what was claimed. What
 a rasterizer has no gradient of is not offered, and said so.
 """
 
@@ -32,13 +34,13 @@ from drgs.lab import conventions
 from drgs.lab.conventions import ReferenceModel
 from drgs.lab.image_errors import error_line
 from drgs.lab.parameters import COLORS, MOTIONS, PARAMETERS, raw_of, with_colors, with_pose
+from drgs.lab.paths import PathRow, path_rows, status_of
 from drgs.lab.rasterizers import Dump, Rasterizer, cotangents, one_line
-from drgs.lab.verdicts import Case, Compared, GroupRow, ViewRow, compared, judge, with_errors
+from drgs.lab.verdicts import VERDICTS, Case, Compared, GroupRow, ViewRow, compared, judge, with_errors
 from drgs.settings import RenderSettings
 
 __all__ = ["VERDICTS", "Crop", "Result", "crops", "crossval"]
 
-VERDICTS = ("gradient bug", "undecided", "model difference", "other convention", "known deviation", "agreement")
 _STARTS = ("gsplat", "inria", "3dgut", "fast", "exact", "mitsuba")  # the first of equally near ones is taken
 # (pixel, Gaussian) pairs up to which the oracle takes a scene whole; larger ones are cropped. Chosen: bounds seconds
 _ORACLE_PAIRS = 4_000_000
@@ -75,6 +77,7 @@ class Result:
         model: The model at the rasterizer's conventions.
         gaussians: Gaussians that were compared (a part of a large scene where the oracle is the reference).
         cameras: Views that were compared, as they were cropped.
+        paths: A row a path of the rasterizer: tested or not, and what was found.
     """
 
     report: dict
@@ -85,11 +88,17 @@ class Result:
     model: ReferenceModel
     gaussians: Gaussians
     cameras: list[Camera]
+    paths: list[PathRow]
 
     @property
     def verdict(self) -> str:
-        """The worst of the groups' verdicts."""
+        """The worst of the verdicts on groups and paths."""
         return self.report["verdict"]
+
+    def not_tested(self) -> str:
+        """One line on the paths that were not tested; empty if there is none."""
+        names = [row.path for row in self.paths if row.status == "not tested"]
+        return f"not tested: {', '.join(names)}" if names else ""
 
     def lines(self) -> list[str]:
         """The findings, one a line."""
@@ -106,7 +115,8 @@ class Result:
         for name, group in self.groups.items():
             verdict = f"{group.verdict}: {group.why}" if group.why else group.verdict
             lines.append(f"{name}: {verdict}; relative difference {group.relative:.2g}, cosine {group.cosine:.6f}")
-        return lines
+        lines += [row.line() for row in self.paths if row.status == "wrong"]
+        return [*lines, self.not_tested()] if self.not_tested() else lines
 
 
 def crossval(
@@ -120,6 +130,8 @@ def crossval(
     entries: int = 10,
     seed: int = 0,
     channels: int = 6,
+    paths: bool = True,
+    lenses: list[Camera] | None = None,
     advance: Callable[[str], None] | None = None,
 ) -> Result:
     """Compare a rasterizer with the model that it claims to compute.
@@ -134,6 +146,9 @@ def crossval(
         entries: Number of parameters a group whose central differences are taken, where they are needed.
         seed: Seed of the cotangents.
         channels: Width of the plain colors whose gradient is compared, too; 0 for none.
+        paths: Whether the other paths of a function are tested, too: depth, several cameras, packed arrays and so on.
+        lenses: Cameras with a lens where `cameras` are pinholes: the first that has one is compared with preset
+            `3dgut`, if the function's signature names `radial_coeffs`.
         advance: Function that is called with each stage's name.
     Raises:
         ValueError: If cameras differ in size, have a lens that the preset does not draw, or the rasterizer's function
@@ -205,13 +220,33 @@ def crossval(
         comparison.groups |= wide
         not_offered |= {COLORS: reason} if reason else {}
     report = _report(case, comparison, search, claimed, given, places, not_offered, seed)
+    rows: list[PathRow] = []
+    if paths:
+        wide = {name: row for name, row in comparison.groups.items() if name == COLORS or name.endswith("channels")}
+        reason = not_offered.get(COLORS, "")
+        lens = _lens_row(rasterizer, g, lenses or [], fields or {}, seed)
+        # Of single views; what other paths are is not known yet.
+        rows = path_rows(
+            case,
+            model,
+            comparison,
+            report["verdict"],
+            wide,
+            reason,
+            seed,
+            functools.partial(ties_of, model),
+            lens,
+        )
+        verdicts = [row.verdict for row in rows if row.verdict]
+        report["verdict"] = min((report["verdict"], *verdicts), key=VERDICTS.index)
+    report["paths"] = [dataclasses.asdict(row) for row in rows]
     say("pictures")
     exact = ReferenceModel(RenderSettings.preset("exact", background=background))
     images = []
     for picture, (same, _), camera in zip(pictures, drawn, cameras, strict=True):
         true, _ = _rendered(exact, raw, camera, False)
         images.append({"rasterizer": picture.numpy(), "model": same.numpy(), "exact": true.numpy()})
-    return Result(report, images, comparison.groups, comparison.views, search.findings, model, g, cameras)
+    return Result(report, images, comparison.groups, comparison.views, search.findings, model, g, cameras, rows)
 
 
 def _starting_models(
@@ -234,6 +269,29 @@ def _starting_models(
             "or a rolling shutter; use undistorted cameras, or a preset along rays (3dgut, exact, fast)"
         )
     return along_rays
+
+
+def _lens_row(
+    rasterizer: Rasterizer | Dump, g: Gaussians, cameras: list[Camera], fields: dict, seed: int
+) -> PathRow | None:
+    """What is said of a function on the first camera that has a lens, along rays; None if there is none."""
+    seen = [camera for camera in cameras if camera.is_distorted]
+    if not seen or not isinstance(rasterizer, Rasterizer):
+        return None
+    how = f"drgs crossval SCENE --cameras DATA --preset 3dgut --rasterizer {rasterizer.name}"
+    if "radial_coeffs" not in rasterizer.named:
+        why = "its signature does not name radial_coeffs, cameras were undistorted"
+        return PathRow("lens", "not tested", why, how)
+    try:
+        legal = _legal("3dgut", fields)
+        found = crossval(rasterizer, g, seen[:1], "3dgut", legal, seed=seed, channels=0, paths=False)
+    except ValueError as error:
+        return PathRow("lens", "not tested", f"refused: {one_line(error)}", how)
+    if found.verdict == "undecided":
+        return PathRow("lens", "not tested", "undecided", how)
+    what = [f"{x.name} is {x.found}" for x in found.findings]
+    what += [f"{name}: {x.verdict}: {x.why}" for name, x in found.groups.items() if x.verdict != "agreement"]
+    return PathRow("lens", status_of(found.verdict), "; ".join(["with preset 3dgut", *what]), "", found.verdict)
 
 
 def _images(

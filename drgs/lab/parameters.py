@@ -14,6 +14,7 @@ from drgs.oracle import float64
 from drgs.splats import color_of
 
 __all__ = [
+    "BACKGROUNDS",
     "COLORS",
     "POSE",
     "MOTIONS",
@@ -33,6 +34,7 @@ POSE = "viewmats"  # (6,) of one view, 0: see `posed`
 POSE_END = "viewmats_rs"  # (6,) of the pose at the end of a rolling shutter, likewise
 MOTIONS = (POSE, POSE_END)
 COLORS = "colors"  # (N, D) in place of `sh`
+BACKGROUNDS = "backgrounds"  # (C, D) of the views of a call, where the gradient by them is compared
 
 
 def raw_of(g: Gaussians) -> dict[str, torch.Tensor]:

@@ -28,7 +28,18 @@ from drgs.ellipsoids import Gaussians, sh_degree_of
 from drgs.integrator import render
 from drgs.io.foreign import refuse_foreign
 from drgs.io.outputs import atomic_write
-from drgs.lab.parameters import COLORS, MOTIONS, PARAMETERS, POSE, gaussians_of, image_of, posed, raw_of, with_pose
+from drgs.lab.parameters import (
+    BACKGROUNDS,
+    COLORS,
+    MOTIONS,
+    PARAMETERS,
+    POSE,
+    gaussians_of,
+    image_of,
+    posed,
+    raw_of,
+    with_pose,
+)
 from drgs.oracle import float64
 from drgs.settings import PRESETS, RenderSettings
 
@@ -60,6 +71,10 @@ class Rasterizer:
         dtype: Precision of the parameters that it is given.
         device: Device that it wants them on.
         preset: Preset that it is, if it is ours.
+        several: (raw parameters, one a batch; cameras; their backgrounds; further arguments of the function; channels
+            of its image) -> images (B C, H, W, channels), alphas (B C, H, W) of one call; None of what has no arguments
+            of gsplat's.
+        named: Arguments that its signature names.
     """
 
     name: str
@@ -67,6 +82,10 @@ class Rasterizer:
     dtype: torch.dtype = torch.float64
     device: str = "cpu"
     preset: str | None = None
+    several: Callable[[list[dict], list[Camera], list[tuple], dict, int], tuple[torch.Tensor, torch.Tensor]] | None = (
+        None
+    )
+    named: frozenset[str] = frozenset()
 
     def image(self, raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
         """Image and alpha without derivatives, float64 on the CPU."""
@@ -188,44 +207,72 @@ def function(call: Callable, name: str, along_rays: bool = False) -> Rasterizer:
     accepted = inspect.signature(call).parameters
     open_ended = any(p.kind is p.VAR_KEYWORD for p in accepted.values())
 
-    def draw(raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
-        """The function's image and alpha, or one line that says how it failed."""
+    def arguments(raw: dict, cameras: list[Camera], backgrounds: list[tuple]) -> dict:
+        """Arguments of one batch that it takes."""
         means = raw["means"]
-        camera = posed(raw, camera)
+        cameras = [posed(raw, camera) for camera in cameras]
         like = {"dtype": means.dtype, "device": means.device}
-        arguments = {
+        always = {
             "means": means,
             "quats": raw["quats"],
             "scales": raw["log_scales"].exp(),
             "opacities": raw["logit_opacities"].sigmoid(),
             "colors": raw[COLORS] if COLORS in raw else raw["sh"],
-            "viewmats": float64(camera.w2c).to(**like)[None],
-            "Ks": float64(camera.K).to(**like)[None],
-            "width": camera.width,
-            "height": camera.height,
+            "viewmats": torch.stack([float64(camera.w2c).to(**like) for camera in cameras]),
+            "Ks": torch.stack([float64(camera.K).to(**like) for camera in cameras]),
+            "width": cameras[0].width,
+            "height": cameras[0].height,
         }
-        options = {"backgrounds": torch.tensor([background], **like), "packed": False}
+        options = {"backgrounds": torch.tensor(backgrounds, **like), "packed": False}
+        if BACKGROUNDS in raw:
+            options["backgrounds"] = raw[BACKGROUNDS]
         if COLORS not in raw:
             options["sh_degree"] = sh_degree_of(raw["sh"].shape[1])
-        lens = _lens_arguments(camera, like, accepted)
+        lenses = [_lens_arguments(camera, like, accepted) for camera in cameras]
+        lens = {
+            k: torch.cat([of_camera[k] for of_camera in lenses]) if isinstance(x, torch.Tensor) else x
+            for k, x in lenses[0].items()
+        }
         if lens or along_rays:
             options |= {"with_ut": True, "with_eval3d": True}
         if missing := [] if open_ended else [k for k in lens if k not in accepted]:
             raise ValueError(
-                f"--rasterizer {name}: must take {missing[0]} for a camera of model {camera.model!r}, does not; "
+                f"--rasterizer {name}: must take {missing[0]} for a camera of model {cameras[0].model!r}, does not; "
                 "compare it on undistorted cameras"
             )
-        given = {k: v for k, v in options.items() if open_ended or k in accepted} | lens
+        return always | {k: v for k, v in options.items() if open_ended or k in accepted} | lens
+
+    def several(
+        raws: list[dict], cameras: list[Camera], backgrounds: list[tuple], changed: dict, channels: int
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """The function's images and alphas, or one line that says how it failed."""
+        batches = [arguments(raw, cameras, backgrounds) for raw in raws]
+        given = batches[0]
+        if len(batches) > 1:
+            given = {
+                k: torch.stack([batch[k] for batch in batches]) if isinstance(x, torch.Tensor) else x
+                for k, x in given.items()
+            }
         try:
-            returned = call(**arguments, **given)
+            returned = call(**(given | changed))
         except Exception as error:
             raise ValueError(f"--rasterizer {name}: raised {type(error).__name__}: {one_line(error)}") from error
-        image, alpha = _checked(name, returned, camera, len(background))
+        image, alpha = _checked(name, returned, cameras[0], len(raws), len(cameras), channels)
         if "backgrounds" not in given:
-            image = image + (1 - alpha[..., None]) * torch.tensor(background, **like)
+            behind = torch.tensor(backgrounds, dtype=image.dtype, device=image.device)[:, None, None]
+            behind = behind.repeat(len(raws), 1, 1, 1)
+            width = behind.shape[-1]  # behind a depth there is nothing
+            seen = image[..., :width] + (1 - alpha[..., None]) * behind
+            image = torch.cat([seen, image[..., width:]], -1)
         return image, alpha
 
-    return Rasterizer(name, draw, *_precision_and_device(draw))
+    def draw(raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
+        """Image and alpha of one view."""
+        images, alphas = several([raw], [camera], [background], {}, len(background))
+        return images[0], alphas[0]
+
+    dtype, device = _precision_and_device(draw)
+    return Rasterizer(name, draw, dtype, device, None, several, frozenset(accepted))
 
 
 def _three_channels_along_rays(rasterization: Callable) -> Callable:
@@ -291,8 +338,10 @@ def _precision_and_device(draw: Callable) -> tuple[torch.dtype, str]:
     return torch.float32, "cpu"
 
 
-def _checked(name: str, returned: object, camera: Camera, channels: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """(H, W, channels) and (H, W) of what a function returned."""
+def _checked(
+    name: str, returned: object, camera: Camera, batches: int, count: int, channels: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """(B C, H, W, channels) and (B C, H, W) of what a function returned."""
     if not isinstance(returned, tuple | list) or len(returned) < 2:
         got = type(returned).__name__
         raise ValueError(f"--rasterizer {name}: must return (image, alpha, info), got {got}")
@@ -301,10 +350,10 @@ def _checked(name: str, returned: object, camera: Camera, channels: int) -> tupl
     for what, x, last in (("image", image, channels), ("alpha", alpha, 1)):
         if not isinstance(x, torch.Tensor):
             raise ValueError(f"--rasterizer {name}: its {what} must be a torch tensor, got {type(x).__name__}")
-        if tuple(x.shape) not in ((1, *size, last), (*size, last)):
-            wanted = f"(1, {size[0]}, {size[1]}, {last})"
+        wanted = (count, *size, last) if batches == 1 else (batches, count, *size, last)
+        if tuple(x.shape) != wanted and (batches * count > 1 or tuple(x.shape) != (*size, last)):
             raise ValueError(f"--rasterizer {name}: its {what} must have shape {wanted}, got {tuple(x.shape)}")
-    return image.reshape(*size, channels), alpha.reshape(size)
+    return image.reshape(-1, *size, channels), alpha.reshape(-1, *size)
 
 
 # -------------------------------------------------------------------------------------------- scenes and dumps as files

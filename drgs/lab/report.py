@@ -18,7 +18,7 @@ _MEANING = {
     "other convention": "At the conventions found below it agrees; they are not those of the preset.",
     "model difference": "Its image is not the model's: where, and what its error looks like, is below.",
     "undecided": "Gradients differ, and nothing says who is right.",
-    "gradient bug": "Its gradients are not the derivatives of its own image.",
+    "gradient bug": "Gradients of its image, or of one of its paths, are not the derivatives of that image.",
 }
 _PAGE = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
@@ -81,6 +81,13 @@ not and are left out, with {{ g.differences.pixels_left_out }} pixels at cut-off
 {% for i in g.differences.entries %}<tr><td>{{ i }}</td><td>{{ "%.5g" | format(g.differences.gradient[loop.index0]) }}
 </td><td>{{ "%.5g" | format(g.differences.central[loop.index0]) }}</td>
 <td>{{ num(g.differences.uncertainty[loop.index0]) }}</td></tr>{% endfor %}</table>{% endfor %}
+{% if r.paths %}<h2>Paths</h2>
+<p>Ways to an image that have code of their own. Each is compared with the model, or with plain calls of the rasterizer
+that amount to the same.</p>
+<table><tr><th>path</th><th>status</th><th>why</th><th>what would test it</th></tr>
+{% for p in r.paths %}<tr><td>{{ p.path }}</td><td class="text {{ status[p.status] }}">{{ p.status }}</td>
+<td class="text">{{ p.why }}</td><td class="text">{{ p.how }}</td></tr>
+{% endfor %}</table>{% endif %}
 {% if ladder %}<h2>From this model to the exact one</h2>
 <p>One approximation is switched at a time, in the order of the rows / in its reverse as far as there is such a model.
 RMS and largest difference of each step of the image; its share of the whole difference, of the image and of each
@@ -123,6 +130,7 @@ def html(report: dict, images: list[dict], ladder: str = "") -> str:
         ladder=Markup(_table(ladder)),
         meaning=_MEANING,
         num=lambda x: f"{x:.1e}",
+        status={"agrees": "good", "wrong": "bad", "not tested": "odd"},
         color=lambda verdict: {"agreement": "good", "gradient bug": "bad"}.get(verdict, "odd"),
     )
 

@@ -25,6 +25,7 @@ from drgs.lab.rasterizers import Dump, Rasterizer
 from drgs.oracle import float64
 
 __all__ = [
+    "VERDICTS",
     "AlphaRow",
     "Case",
     "Compared",
@@ -36,9 +37,12 @@ __all__ = [
     "WorstPixel",
     "central",
     "compared",
+    "gradient_row",
     "judge",
     "with_errors",
 ]
+
+VERDICTS = ("gradient bug", "undecided", "model difference", "other convention", "known deviation", "agreement")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -276,7 +280,7 @@ def compared(
         # Who has a gradient of one pose of a shutter and none of the other has lost it.
         poses = any(theirs.get(name) is not None for name in MOTIONS)
         offered = [name for name, x in theirs.items() if name not in MOTIONS or poses]
-        groups = {name: _group_row(theirs[name], ours[name], case.tolerance) for name in offered}
+        groups = {name: gradient_row(theirs[name], ours[name], case.tolerance) for name in offered}
         comparison = Compared(views, agrees, u, theirs, groups, ties, counted)
         if ties.any() or (agrees and all(row.verdict for row in groups.values())):
             return comparison
@@ -378,7 +382,7 @@ def _mean(values: torch.Tensor, counts: torch.Tensor) -> float:
     return float((values * counts).sum()) / max(int(counts.sum()), 1)
 
 
-def _group_row(theirs: torch.Tensor | None, ours: torch.Tensor, tolerance: float) -> GroupRow:
+def gradient_row(theirs: torch.Tensor | None, ours: torch.Tensor, tolerance: float) -> GroupRow:
     """How far two gradients are apart; `verdict` is None where that is still to be explained."""
     verdict, why = None, ""
     if theirs is None:
@@ -429,7 +433,7 @@ def _explain_by_known_choices(case: Case, model: ReferenceModel, compared: Compa
         for chosen in itertools.combinations(choices, size):
             changed = model.replace(**{k: v for c in chosen for k, v in c.change.items()})
             ours = case.ours(changed, compared.u)
-            settled = [n for n in open_ones if _group_row(theirs[n], ours[n], case.tolerance).verdict == "agreement"]
+            settled = [n for n in open_ones if gradient_row(theirs[n], ours[n], case.tolerance).verdict == "agreement"]
             if len(settled) > len(best[0]):
                 best = settled, chosen
     for name in best[0]:
