@@ -1,11 +1,14 @@
 """What `drgs crossval` says of correct and broken rasterizers and of outside code: rows, and docs/crossval.md of them.
 
-    python benchmarks/crossval.py [--only alarms|poses|broken|rays|eval3d|outside] [--seeds 50] [--runs runs] [--page]
+    python benchmarks/crossval.py [--only alarms|poses|broken|paths|rays|eval3d|outside] [--seeds 50] [--page]
 
 Correct ones, for false alarms (`alarms`): our presets against the oracle, and gsplat's own torch code (examples/) where
 it is installed. Each seed has its cotangents and its view of a real scene, and the crop of it that the command takes.
 Rows are kept in crossval.json, crossval_poses.json and crossval_broken.json: a run that was stopped goes on. `poses`:
 the same for gradients of poses and of colors of six channels, four seeds each.
+
+Other paths than a view's colors (`paths`): a right rasterizer with depth modes, several cameras and packed arrays,
+copies of it that are broken on one path, and one along rays whose lens loses the geometry. Rows in crossval_paths.json.
 
 Along rays (`rays`, `eval3d`): the right rasterizer of tests/torch_rays.py and copies that are broken on purpose, and
 gsplat 1.6's own torch code (examples/gsplat_eval3d.py), through a pinhole, OpenCV's lens and a fisheye. Rows are kept
@@ -48,7 +51,7 @@ from drgs.commands.orbits import OrbitShape, scene_orbit  # noqa: E402
 from drgs.data import load as load_data  # noqa: E402
 from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.files import load_ply  # noqa: E402
-from drgs.lab.crossval import VERDICTS, crops, crossval  # noqa: E402
+from drgs.lab.crossval import VERDICTS, Result, crops, crossval  # noqa: E402
 from drgs.lab.parameters import PARAMETERS, POSE_END, raw_of, with_pose  # noqa: E402
 from drgs.lab.rasterizers import cotangents, function, load_rasterizer  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
@@ -79,10 +82,12 @@ DOCUMENTED = ("view_direction_detached", "clamp_passes_gradient")  # are choices
 BROKEN = Path(__file__).with_name("crossval_broken.json")
 ROWS = Path(__file__).with_suffix(".json")
 POSES = Path(__file__).with_name("crossval_poses.json")
+PATHS = Path(__file__).with_name("crossval_paths.json")
 RAYS = Path(__file__).with_name("crossval_rays.json")
 EVAL3D = Path(__file__).with_name("crossval_eval3d.json")
 OWN_EVAL3D = "examples.gsplat_eval3d:rasterization"
 RAY_SEEDS = 2
+PATH_SEEDS = 1
 RAY_FIELDS = {"background": BACKGROUND, "culling": "extent"}  # dense code has no boxes of the unscented transform
 RAY_SPLATS = 100  # of a real scene those that weigh most: the rasterizer in torch is dense
 POSE_SEEDS = 4
@@ -235,6 +240,39 @@ def _same(a, b, g: Gaussians, camera: Camera) -> bool:
         return False
     slopes = [x.gradient(raw, camera, BACKGROUND, u) for x in (a, b)]
     return all(y is not None and torch.equal(x, y) for x, y in zip(*(s.values() for s in slopes), strict=True))
+
+
+def paths() -> None:
+    """Every defect of a path, and the right rasterizer, on a random scene; a lost geometry, through a lens."""
+    rows = studies.read_rows(PATHS, {})
+    for seed in range(PATH_SEEDS):
+        scene = random_scene(seed, count=30, width=32, height=24)
+        for name in ("right", *torch_rasterizer.PATH_DEFECTS):
+            key = f"{name} random {seed}"
+            if key not in rows:
+                defect = torch_rasterizer.PATH_DEFECTS.get(name)
+                made = function(torch_rasterizer.paths if defect is None else defect.call, name)
+                expected = ("agreement", ()) if defect is None else (defect.verdict, defect.path)
+                rows[key] = _path_row(crossval(made, *scene, "gsplat", {"background": BACKGROUND}), *expected)
+                studies.write_rows(PATHS, rows)
+                print(key, rows[key], flush=True)
+    for lens in ("opencv",):
+        key = f"lens_detached {lens}"
+        if key not in rows:
+            g, camera = ray_scenes()[f"{lens} 0"]
+            made = function(torch_rays.lens_detached(right_rays()), "lens_detached")
+            found = crossval(made, g, [camera.undistorted()], "3dgut", RAY_FIELDS, lenses=[camera])
+            rows[key] = _path_row(found, "gradient bug", ("lens",))
+            studies.write_rows(PATHS, rows)
+            print(key, rows[key], flush=True)
+
+
+def _path_row(found: Result, verdict: str, wrong: tuple[str, ...]) -> dict:
+    """What is said of the paths of a rasterizer, and whether it is that."""
+    named = [row.path for row in found.paths if row.status == "wrong"]
+    single = all(row.verdict == "agreement" for row in found.groups.values())  # the colors of one view are right
+    good = found.verdict == verdict and set(named) == set(wrong) and single
+    return {"verdict": found.verdict, "right": good, "named": named, "not_tested": found.not_tested()}
 
 
 def ray_scenes() -> dict[str, tuple]:
@@ -403,7 +441,7 @@ def agreed(rows: dict) -> str:
 
 def table() -> str:
     """What the page is about, one line a study."""
-    correct, posed, wrong, along = (studies.read_rows(path, {}) for path in (ROWS, POSES, BROKEN, RAYS))
+    correct, posed, wrong, along, other = (studies.read_rows(path, {}) for path in (ROWS, POSES, BROKEN, RAYS, PATHS))
     largest = max(max(row["relative"]) for row in correct.values())
     moved = [max(row[key] for row in posed.values()) for key in ("pose", "colors")]
     wrongly = ", ".join(
@@ -421,6 +459,11 @@ def table() -> str:
             f"{len(torch_rays.DEFECTS)} broken copies of one along rays, and that",
             "two random ones through three lenses, and `wolf`",
             judged(along),
+        ],
+        [
+            f"{len(torch_rasterizer.PATH_DEFECTS) + 1} copies that are broken on one [path](#paths), and a right one",
+            "a random one",
+            judged(other),
         ],
     ]
     return markdown_table(["rasterizers", "scenes", "right verdicts"], lines)
@@ -448,6 +491,16 @@ def broken_lines(path: Path, right: str, defects: dict) -> Iterator[list[str]]:
         wrong = [scene for scene, row in found.items() if not row["right"]]
         what = "nothing" if name == right else defects[name].what
         yield [name, what, *(row["verdict"] for row in found.values()), "; ".join(named), " ".join(wrong)]
+
+
+def path_lines() -> Iterator[list[str]]:
+    """Every defect of a path: what is wrong, and the paths that are named."""
+    what = {name: x.what for name, x in torch_rasterizer.PATH_DEFECTS.items()} | {"right": "nothing"}
+    what["lens_detached"] = "means, quats and scales are detached where there is a lens"
+    yield ["rasterizer", "what is wrong", "scene", "verdict", "wrong paths", "right"]
+    for key, row in studies.read_rows(PATHS, {}).items():
+        name, _, scene = key.partition(" ")
+        yield [name, what[name], scene, row["verdict"], "; ".join(row["named"]), "yes" if row["right"] else "no"]
 
 
 def eval3d_lines() -> Iterator[list[str]]:
@@ -492,6 +545,7 @@ def page() -> None:
     """The table, the picture and the data files, of the rows that there are."""
     studies.write_csv(CSV / "crossval-correct.csv", correct_lines())
     studies.write_csv(CSV / "crossval-broken.csv", broken_lines(BROKEN, "correct", torch_rasterizer.DEFECTS))
+    studies.write_csv(CSV / "crossval-paths.csv", path_lines())
     studies.write_csv(CSV / "crossval-rays.csv", broken_lines(RAYS, "right", torch_rays.DEFECTS))
     studies.write_csv(CSV / "crossval-eval3d.csv", eval3d_lines())
     draw()
@@ -500,7 +554,7 @@ def page() -> None:
 
 def main():
     parser = argparse.ArgumentParser()
-    parser.add_argument("--only", choices=["alarms", "poses", "broken", "rays", "eval3d", "outside"])
+    parser.add_argument("--only", choices=["alarms", "poses", "broken", "paths", "rays", "eval3d", "outside"])
     parser.add_argument("--seeds", type=int, default=50, help="of every correct rasterizer on every real scene")
     parser.add_argument("--runs", type=Path, default=ROOT / "runs", help="where fits are kept")
     parser.add_argument(
@@ -511,6 +565,7 @@ def main():
         "alarms": lambda: alarms(args.runs, args.seeds),
         "poses": lambda: poses(args.runs),
         "broken": lambda: broken(args.runs),
+        "paths": paths,
         "rays": rays,
         "eval3d": eval3d,
         "outside": outside,

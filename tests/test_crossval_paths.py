@@ -121,24 +121,15 @@ def test_distances_to_hits():
         assert rows["hit distance Ed"].status == rows["depth RGB+D"].status == "agrees"
 
 
-def _detached_lens(means, quats, scales, radial_coeffs=None, tangential_coeffs=None, with_eval3d=False, **arguments):
-    """Right without a lens; with one, the geometry has no gradient."""
-    if radial_coeffs is None and not with_eval3d:
-        return torch_rasterizer.rasterization(means, quats, scales, **arguments)
-    options = {"radial_coeffs": radial_coeffs, "tangential_coeffs": tangential_coeffs}
-    inputs = means.detach(), quats.detach(), scales.detach()
-    return torch_rays.rasterizer(RIGHT)(*inputs, **options, **arguments)
-
-
 def test_a_lens_that_loses_the_geometry(tmp_path):
     """With --preset auto cameras are pinholes, and yet the lens that they had is tested."""
     g, camera = ray_scene(0, "opencv")
-    result = crossval(function(_detached_lens, "detached"), g, [camera], "3dgut", FIELDS, channels=0)
+    result = crossval(function(torch_rays.lens_detached(RIGHT), "detached"), g, [camera], "3dgut", FIELDS, channels=0)
     assert result.verdict == "gradient bug"
     save_ply(g, tmp_path / "scene.ply")
     write_capture(tmp_path / "capture", camera)
     module = types.ModuleType("lost_lens")
-    module.rasterization = _detached_lens
+    module.rasterization = torch_rays.lens_detached(RIGHT)
     sys.modules["lost_lens"] = module
     command = ["crossval", str(tmp_path / "scene.ply"), "--cameras", str(tmp_path / "capture"), "--quiet"]
     command += ["--no-ladder", "--rasterizer", "lost_lens:rasterization", "--set", "background=0.3,0.6,0.2"]

@@ -36,6 +36,7 @@ __all__ = [
     "broken",
     "end_of",
     "interpolated",
+    "lens_detached",
     "ray_scene",
     "rasterization",
     "rasterizer",
@@ -584,3 +585,16 @@ def _product(a, b):
     u, v = a[1:].expand(len(b), 3), b[:, 1:]
     real = a[0] * b[:, :1] - (u * v).sum(1, keepdim=True)
     return torch.cat([real, a[0] * v + b[:, :1] * u + torch.linalg.cross(u, v)], 1)
+
+
+def lens_detached(model: RayModel) -> Callable:
+    """A rasterizer along rays that is right without a lens; with one, the geometry has no gradient."""
+
+    def rasterize(means, quats, scales, radial_coeffs=None, tangential_coeffs=None, **arguments):
+        options = {"radial_coeffs": radial_coeffs, "tangential_coeffs": tangential_coeffs}
+        inputs = (means, quats, scales)
+        if radial_coeffs is not None:
+            inputs = tuple(x.detach() for x in inputs)
+        return rasterizer(model)(*inputs, **options, **arguments)
+
+    return rasterize
