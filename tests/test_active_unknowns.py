@@ -457,25 +457,25 @@ def test_candidates_count_by_what_drgs_select_says(uneven, tmp_path, monkeypatch
     """Scores of a pick are those of `drgs.select` of the same scene with exposure and pose eliminated, in known
     photographs, where they are fitted, and in candidates; without that they are others.
     """
-    import drgs.select as module
+    from drgs.selection import policies
 
-    asked = []
+    pools, choose = [], policies.choose
 
-    def spy(scene, candidates, train, k, policy, **options):
-        asked.append((scene.detach(), candidates, train, options))
-        return select(scene, candidates, train, k, policy, **options)
+    def spy(policy, pool):
+        pools.append(dataclasses.replace(pool, scene=pool.scene.detach()))
+        return choose(policy, pool)
 
-    monkeypatch.setattr(module, "select", spy)
+    monkeypatch.setattr(policies, "choose", spy)
     active = plan(policy="fisher", criterion="eig", blocks=("geometry",), add=3)
     run = tmp_path / "run"
     fit(lazily(uneven), run, config(exposure="points", poses="refined", selection=active, max_steps=20), progress=False)
     monkeypatch.undo()
     pick = json.loads((run / "selection.json").read_text())["picks"][2]
-    scene, candidates, train, options = asked[2]
+    scene, candidates, train = pools[2].scene, pools[2].candidates, pools[2].train
     stated = {view.name: view.camera for view in lazily(uneven).views}
     assert any(np.abs(camera.w2c - stated[camera.name].w2c).max() > 1e-6 for camera in train)
-    scoring = dataclasses.replace(options["scoring"], nuisances=Nuisances(eliminate=("exposure", "pose")))
-    assert options["scoring"].nuisances == scoring.nuisances
+    scoring = dataclasses.replace(pools[2].scoring, nuisances=Nuisances(eliminate=("exposure", "pose")))
+    assert pools[2].scoring.nuisances == scoring.nuisances
     again = select(scene, candidates, train, 1, "fisher", scoring=scoring)
     assert [other["score"] for other in pick["candidates"]] == pytest.approx(again.scores, rel=1e-6)
     plain = select(scene, candidates, train, 1, "fisher", scoring=dataclasses.replace(scoring, nuisances=Nuisances()))
@@ -486,19 +486,19 @@ def test_information_in_a_fit_is_that_of_the_oracle(uneven, tmp_path, monkeypatc
     """What a candidate and a known photograph with a refined camera tell at a pick, without their exposure and pose,
     against the float64 oracle's Jacobian and a projection: diagonals of all groups within 1e-4 of the largest entry.
     """
-    import drgs.select as module
+    from drgs.selection import policies
 
-    asked = []
+    pools, choose = [], policies.choose
 
-    def spy(scene, candidates, train, k, policy, **options):
-        asked.append((scene.detach(), candidates[0], train[0], options["scoring"]))
-        return select(scene, candidates, train, k, policy, **options)
+    def spy(policy, pool):
+        pools.append(dataclasses.replace(pool, scene=pool.scene.detach()))
+        return choose(policy, pool)
 
-    monkeypatch.setattr(module, "select", spy)
+    monkeypatch.setattr(policies, "choose", spy)
     active = plan(policy="fisher", info_pixels=144)
     settings = config(exposure="points", poses="refined", selection=active, max_gaussians=12)
     fit(lazily(uneven), tmp_path / "run", settings, progress=False)
-    scene, *views, scoring = asked[1]
+    scene, views, scoring = pools[1].scene, (pools[1].candidates[0], pools[1].train[0]), pools[1].scoring
     g = scene.replace(**{name: x.double().requires_grad_() for name, x in scene.parameters().items()})
     for camera in views:
         posed = torch.tensor(camera.w2c, dtype=torch.float64, requires_grad=True)

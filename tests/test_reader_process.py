@@ -62,19 +62,19 @@ def stopped(pid: int) -> bool:
 def test_answers(child, tmp_path, caplog):
     """Values, arrays, errors, warnings and what is told on the way; one process for all."""
     told = []
-    assert child.ask("count", Path("a"), 3, progress=told.append) == 3
+    assert child.call("count", Path("a"), 3, progress=told.append) == 3
     pid = child.pid
     assert told == [0, 1, 2]
     assert caplog.messages == ["a: counted"]
-    array = child.ask("zeros", Path("a"), [300, 400, 3])
+    array = child.call("zeros", Path("a"), [300, 400, 3])
     assert (array.shape, array.dtype, array.flags.writeable) == ((300, 400, 3), np.uint8, True)
     np.testing.assert_array_equal(array.ravel(), np.arange(360_000).astype(np.uint8))
-    assert child.ask("zeros", Path("a"), [0, 3]).shape == (0, 3)
+    assert child.call("zeros", Path("a"), [0, 3]).shape == (0, 3)
     for kind in (ValueError, FileNotFoundError):
         with pytest.raises(kind, match=r"^a/b: no$"):
-            child.ask("fail", Path("a/b"), kind.__name__)
+            child.call("fail", Path("a/b"), kind.__name__)
     with pytest.raises(ValueError, match=r"^a/b: must be readable, got KeyError: 'a/b: no'; copy it again$"):
-        child.ask("fail", Path("a/b"), "KeyError")
+        child.call("fail", Path("a/b"), "KeyError")
     assert child.pid == pid
 
 
@@ -84,17 +84,17 @@ def test_relative_paths_are_where_this_process_is(child, tmp_path, monkeypatch):
         (tmp_path / name).mkdir()
         (tmp_path / name / "a").write_text(name)
         monkeypatch.chdir(tmp_path / name)
-        assert child.ask("read", Path("a")) == name
+        assert child.call("read", Path("a")) == name
 
 
 def test_a_crash_is_one_line_and_the_next_file_is_read(child, capfd):
     """A real SIGABRT within the question."""
     with pytest.raises(ValueError, match="^") as error:
-        child.ask("abort", Path("a/b"))
+        child.call("abort", Path("a/b"))
     wanted = "a/b: must be a file that can be read, the process that reads it ended with SIGABRT; copy it again"
     assert str(error.value) == wanted
     assert child.pid is None
-    assert child.ask("count", Path("a"), 2) == 2
+    assert child.call("count", Path("a"), 2) == 2
     assert "Traceback" not in capfd.readouterr().err
 
 
@@ -105,22 +105,22 @@ def test_an_interrupt_leaves_no_answer_for_the_next_question(child):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        child.ask("count", Path("a"), 3, progress=interrupt)
-    assert child.ask("zeros", Path("a"), [2]).tolist() == [0, 1]
+        child.call("count", Path("a"), 3, progress=interrupt)
+    assert child.call("zeros", Path("a"), [2]).tolist() == [0, 1]
 
 
 def test_ctrl_c_and_sigterm_do_not_reach_it(child):
     """A fit that is told to end saves first, and may read files until then."""
-    child.ask("count", Path("a"), 1)
+    child.call("count", Path("a"), 1)
     for name in (signal.SIGINT, signal.SIGTERM):
         os.kill(child.pid, name)
     assert os.getpgid(child.pid) != os.getpgid(0)
-    assert child.ask("count", Path("a"), 2) == 2
+    assert child.call("count", Path("a"), 2) == 2
 
 
 def test_it_ends_with_this_process(child):
     """Nothing is left behind, whatever ended it: the socket is closed."""
-    child.ask("count", Path("a"), 1)
+    child.call("count", Path("a"), 1)
     process = child._process
     child._file.close()
     child._socket.close()
@@ -129,15 +129,15 @@ def test_it_ends_with_this_process(child):
 
 def test_a_fork_gets_a_process_of_its_own(child):
     """Two processes on one socket would read each other's answers."""
-    child.ask("count", Path("a"), 1)
+    child.call("count", Path("a"), 1)
     pid = child.pid
     forked = os.fork()
     if forked == 0:
-        answer = child.pid is None and child.ask("count", Path("a"), 5) == 5 and child.pid != pid
+        answer = child.pid is None and child.call("count", Path("a"), 5) == 5 and child.pid != pid
         child.end()
         os._exit(0 if answer else 1)
     assert os.waitstatus_to_exitcode(os.waitpid(forked, 0)[1]) == 0
-    assert (child.ask("count", Path("a"), 2), child.pid) == (2, pid)
+    assert (child.call("count", Path("a"), 2), child.pid) == (2, pid)
 
 
 def test_threads_take_turns(child):
@@ -146,7 +146,7 @@ def test_threads_take_turns(child):
 
     def ask(n):
         for _ in range(20):
-            if child.ask("zeros", Path("a"), [n]).shape != (n,):
+            if child.call("zeros", Path("a"), [n]).shape != (n,):
                 wrong.append(n)
 
     threads = [threading.Thread(target=ask, args=(n,)) for n in range(1, 5)]
