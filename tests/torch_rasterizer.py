@@ -394,36 +394,7 @@ class PathDefect:
     call: Callable
 
 
-def _path_function(name, **fields):
-    model = PathModel(**fields)
-
-    def rasterize(
-        means,
-        quats,
-        scales,
-        opacities,
-        colors,
-        viewmats,
-        Ks,
-        width,
-        height,
-        *,
-        near_plane=0.01,
-        eps2d=0.3,
-        sh_degree=None,
-        backgrounds=None,
-        render_mode="RGB",
-        packed=False,
-    ):
-        options = {"near_plane": near_plane, "eps2d": eps2d, "sh_degree": sh_degree, "backgrounds": backgrounds}
-        options |= {"render_mode": render_mode, "packed": packed}
-        return model.rasterize(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **options)
-
-    rasterize.__name__ = rasterize.__qualname__ = name
-    return rasterize
-
-
-paths = _path_function("paths")
+paths = PathModel().rasterize
 _BOTH_DEPTHS = ("depth RGB+D", "depth RGB+ED")
 _PATH_TABLE = {
     "depth_halved": (
@@ -458,7 +429,7 @@ PATH_DEFECTS = {
         what,
         where,
         "model difference" if name == "index_shifted" else "gradient bug",
-        _path_function(f"paths_{name}", **fields),
+        PathModel(**fields).rasterize,
     )
     for name, (what, where, fields) in _PATH_TABLE.items()
 }

@@ -222,21 +222,8 @@ def crossval(
     report = _report(case, comparison, search, claimed, given, places, not_offered, seed)
     rows: list[PathRow] = []
     if paths:
-        wide = {name: row for name, row in comparison.groups.items() if name == COLORS or name.endswith("channels")}
-        reason = not_offered.get(COLORS, "")
         lens = _lens_row(rasterizer, g, lenses or [], fields or {}, seed)
-        # Of single views; what other paths are is not known yet.
-        rows = path_rows(
-            case,
-            model,
-            comparison,
-            report["verdict"],
-            wide,
-            reason,
-            seed,
-            functools.partial(ties_of, model),
-            lens,
-        )
+        rows = _path_rows(case, comparison, report, model, not_offered, seed, functools.partial(ties_of, model), lens)
         verdicts = [row.verdict for row in rows if row.verdict]
         report["verdict"] = min((report["verdict"], *verdicts), key=VERDICTS.index)
     report["paths"] = [dataclasses.asdict(row) for row in rows]
@@ -292,6 +279,22 @@ def _lens_row(
     what = [f"{x.name} is {x.found}" for x in found.findings]
     what += [f"{name}: {x.verdict}: {x.why}" for name, x in found.groups.items() if x.verdict != "agreement"]
     return PathRow("lens", status_of(found.verdict), "; ".join(["with preset 3dgut", *what]), "", found.verdict)
+
+
+def _path_rows(
+    case: Case,
+    comparison: Compared,
+    report: dict,
+    model: ReferenceModel,
+    not_offered: dict[str, str],
+    seed: int,
+    near_ties: Callable[[int], torch.Tensor],
+    lens: PathRow | None,
+) -> list[PathRow]:
+    """`path_rows` of what was compared in single views; `report` as it is before paths are known."""
+    wide = {name: row for name, row in comparison.groups.items() if name == COLORS or name.endswith("channels")}
+    reason = not_offered.get(COLORS, "")
+    return path_rows(case, model, comparison, report["verdict"], wide, reason, seed, near_ties, lens)
 
 
 def _images(
