@@ -16,7 +16,7 @@ from test_active import SIZE, config, lazily, plan, write_still
 from drgs import cli, fisher
 from drgs.cameras import Camera, look_at, orbit
 from drgs.commands.fisher import map_weights
-from drgs.commands.nerfstudio_frame import _moved, in_frame_of_data
+from drgs.commands.frames import _moved, in_frame_of_data
 from drgs.data import load
 from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.display.pictures import map_picture
@@ -197,7 +197,7 @@ def test_a_splat_of_nerfstudio_is_brought_to_the_cameras(place, tmp_path, capsys
     stated = {"transform": np.c_[TURN, SHIFT].tolist(), "scale": SCALE}
     (splat.parent / "dataparser_transforms.json").write_text(json.dumps(stated))
     assert cli.main([*line, str(tmp_path / "one")]) == 0
-    assert f"splat.ply: is in nerfstudio's frame, brought to that of {place / 'data'} by" in caplog.text
+    assert f"splat.ply: is in another frame, brought to that of {place / 'data'} by {splat.parent}" in caplog.text
     (splat.parent / "dataparser_transforms.json").unlink()
     assert cli.main([*line, str(tmp_path / "two")]) == 0
     assert re.search(r"[5-9] of 9 known views show nothing of the scene: do the cameras belong to it", caplog.text)

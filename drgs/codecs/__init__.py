@@ -9,6 +9,7 @@
 | .ksplat (mkkellogg), levels 0 to 2 | yes | no |
 | SOG (PlayCanvas), versions 1 and 2, as an archive or a folder | yes | version 2, an archive |
 | GLB with KHR_gaussian_splatting | yes | yes |
+| checkpoints of gsplat's simple_trainer and nerfstudio's splatfacto (.pt, .ckpt) | yes | no |
 
 docs/files.md says what each of them loses.
 """
@@ -23,7 +24,7 @@ from typing import TYPE_CHECKING
 from drgs.checks.arguments import ArgumentError, check_path
 from drgs.checks.registry import Registry
 from drgs.codecs.codec import Codec
-from drgs.codecs.folders import file_of_folder, is_checkpoint, refuse_checkpoint
+from drgs.codecs.folders import file_of_folder
 from drgs.codecs.ply import load_ply, save_ply
 from drgs.io.foreign import refuse_foreign
 from drgs.io.outputs import atomic_write
@@ -48,6 +49,7 @@ CODECS: Registry[Codec] = Registry(
         "ksplat": "drgs.codecs.ksplat:KSPLAT",
         "sog": "drgs.codecs.sog:SOG",
         "glb": "drgs.codecs.gltf:GLB",
+        "checkpoint": "drgs.codecs.checkpoints:CHECKPOINT",
     },
     Codec,
 )
@@ -69,8 +71,9 @@ def load_gaussians(path: str | os.PathLike, *, as_stored: bool = False) -> Gauss
     other axes than PLY files: they are turned, SH included (drgs/codecs/spz.py, drgs/codecs/gltf.py).
 
     Args:
-        path: A .ply (3DGS's or SuperSplat's compressed one), .spz, .splat, .ksplat, .sog or .glb; a folder of a SOG
-            scene or its meta.json; a model folder of INRIA's, whose latest iteration is taken.
+        path: A .ply (3DGS's or SuperSplat's compressed one), .spz, .splat, .ksplat, .sog, .glb, or a checkpoint of
+            gsplat's simple_trainer or of splatfacto; a folder of a SOG scene or its meta.json; a model folder of
+            INRIA's, the results of simple_trainer or a run of splatfacto, whose last step is taken.
         as_stored: Keep the axes of the file, where the format (SPZ) has others than PLY: some writers leave out the
             turn that its specification requires.
     Returns:
@@ -97,8 +100,6 @@ def load_gaussians(path: str | os.PathLike, *, as_stored: bool = False) -> Gauss
     codec = _codec_of(path, head)
     if codec is not None:
         return codec.load_as_stored(path) if as_stored and codec.load_as_stored else codec.load(path)
-    if is_checkpoint(path, head):
-        refuse_checkpoint(path)
     refuse_foreign(path, "a file of Gaussians")
     raise ValueError(f"{path}: must be a file of Gaussians, is of no format that is known; what is read: {readable()}")
 
@@ -108,7 +109,7 @@ def readable() -> str:
     suffixes = dict.fromkeys(codec.suffix for codec in CODECS.values())
     # Without .compressed.ply, which ends with .ply, too.
     *others, last = [x for x in suffixes if not any(x != other and x.endswith(other) for other in suffixes)]
-    return f"{', '.join(others)} and {last}, a SOG folder or a model folder of INRIA's"
+    return f"{', '.join(others)} and {last}, a SOG folder or the folder of a trainer (INRIA's, gsplat's, splatfacto)"
 
 
 def save_gaussians(

@@ -3,7 +3,8 @@
 INRIA's 3DGS   point_cloud/iteration_*/point_cloud.ply, of the highest iteration; cameras.json, where it is there.
                cfg_args, a line of Python, is neither run nor read.
 SOG            meta.json beside its images
-Nerfstudio     config.yml and checkpoints: pickles, which are not read; `ns-export` writes a PLY of them
+gsplat         ckpts/ckpt_*_rank0.pt of simple_trainer's results, of the last step
+Nerfstudio     nerfstudio_models/step-*.ckpt beside config.yml, which is not read
 """
 
 from __future__ import annotations
@@ -12,9 +13,12 @@ import re
 import zipfile
 from pathlib import Path
 
-__all__ = ["cameras_of_model", "file_of_folder", "is_checkpoint", "names_in_archive", "refuse_checkpoint"]
+__all__ = ["cameras_of_model", "file_of_folder", "is_checkpoint", "names_in_archive", "nerfstudio_run"]
 
 _ITERATION = re.compile(r"iteration_(\d{1,18})")
+_GSPLAT_STEP = re.compile(r"ckpt_(\d{1,18})(?:_rank0)?\.pt")
+_NERFSTUDIO_STEP = re.compile(r"step-(\d{1,18})\.ckpt")
+_MODELS = "nerfstudio_models"
 
 
 def file_of_folder(folder: Path) -> Path | None:
@@ -22,7 +26,7 @@ def file_of_folder(folder: Path) -> Path | None:
 
     Raises:
         FileNotFoundError: If a model folder of INRIA's holds no point_cloud.ply.
-        ValueError: If it is a run of Nerfstudio, or a streamed SOG scene.
+        ValueError: If it is a streamed SOG scene.
     """
     if (folder / "meta.json").is_file():
         return folder / "meta.json"
@@ -33,17 +37,34 @@ def file_of_folder(folder: Path) -> Path | None:
         )
     clouds = folder / "point_cloud"
     if clouds.is_dir():
-        found = [(int(match[1]), x) for x in clouds.iterdir() if (match := _ITERATION.fullmatch(x.name))]
-        for _, iteration in sorted(found, reverse=True):
+        for iteration in _by_step(clouds, _ITERATION):
             if (iteration / "point_cloud.ply").is_file():
                 return iteration / "point_cloud.ply"
         raise FileNotFoundError(
             f"{clouds}: must hold iteration_*/point_cloud.ply, holds none; train the model, or name a PLY"
         )
-    models = "nerfstudio_models"
-    if folder.name == models or (folder / models).is_dir() or any(folder.glob("step-*.ckpt")):
-        refuse_checkpoint(folder)
+    for place, step in (
+        (folder, _GSPLAT_STEP),
+        (folder / "ckpts", _GSPLAT_STEP),
+        (folder, _NERFSTUDIO_STEP),
+        (folder / _MODELS, _NERFSTUDIO_STEP),
+    ):
+        if place.is_dir() and (found := _by_step(place, step)):
+            return found[0]
     return None
+
+
+def _by_step(folder: Path, pattern: re.Pattern[str]) -> list[Path]:
+    """What is named by a step in a folder, the last step first."""
+    found = [(int(match[1]), x) for x in folder.iterdir() if (match := pattern.fullmatch(x.name))]
+    return [x for _, x in sorted(found, reverse=True)]
+
+
+def nerfstudio_run(path: Path) -> Path | None:
+    """The run folder of Nerfstudio that a checkpoint is of; None if it is of none."""
+    if path.parent.name == _MODELS:
+        return path.parent.parent
+    return path.parent if _NERFSTUDIO_STEP.fullmatch(path.name) else None
 
 
 def names_in_archive(path: Path) -> set[str]:
@@ -64,17 +85,7 @@ def is_checkpoint(path: Path, head: bytes) -> bool:
     """
     if head.startswith(b"PK\x03\x04") and "data.pkl" in names_in_archive(path):
         return True
-    return path.suffix.lower() == ".ckpt" and not head.startswith(b"version https://git-lfs")
-
-
-def refuse_checkpoint(path: Path) -> None:
-    """Raise ValueError: a run of Nerfstudio, or a checkpoint of it, says nothing without being run."""
-    folder = path if path.is_dir() else path.parent
-    run = folder.parent if folder.name == "nerfstudio_models" or path.suffix == ".ckpt" else folder
-    raise ValueError(
-        f"{path}: must be a file of Gaussians, is a checkpoint of Nerfstudio, a pickle that is not read; run "
-        f"`ns-export gaussian-splat --load-config {run / 'config.yml'} --output-dir {run / 'export'}` and name its PLY"
-    )
+    return path.suffix.lower() in (".ckpt", ".pt", ".pth") and not head.startswith(b"version https://git-lfs")
 
 
 def cameras_of_model(folder: Path) -> Path | None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from drgs.codecs import load_gaussians, readable
 from drgs.codecs.folders import cameras_of_model, file_of_folder
-from drgs.commands.nerfstudio_frame import in_frame_of_data
+from drgs.commands.frames import in_frame_of_data
 from drgs.data.camera_lists import is_camera_list
 from drgs.fitting.records import FitRecord, fit_record, is_run, load_run
 from drgs.io.foreign import refuse_foreign
@@ -66,7 +66,7 @@ class SceneInput:
         """
         replaced = args.replaced()
         given = cls.at(args.scene)
-        if given.run is None and args.scene.is_file() and (data := _data_of(args)) is not None:
+        if given.run is None and (data := _data_of(args)) is not None:
             given = dataclasses.replace(given, gaussians=in_frame_of_data(given.gaussians, args.scene, data))
         fitted = {} if given.record is None else {"background": given.record.config.settings.background}
         return dataclasses.replace(given, fields=fitted | replaced)

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Literal
 from drgs import data
 from drgs.cameras.sizes import at_most, resized_alike
 from drgs.codecs.folders import cameras_of_model
-from drgs.commands.nerfstudio_frame import DATAPARSER_TRANSFORMS
+from drgs.commands.frames import DATAPARSER_TRANSFORMS
 from drgs.commands.options import SIDE
 from drgs.commands.orbits import OrbitShape, capture_orbit, dome, scene_orbit
 from drgs.commands.values import UP
