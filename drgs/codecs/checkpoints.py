@@ -58,7 +58,8 @@ def load_checkpoint(path: Path) -> Gaussians:
     counts = {part["sh"].shape[1] for part in parts}
     if len(counts) > 1:
         raise ValueError(f"{path}: all ranks must have SH of one degree, got {sorted(counts)} coefficients; name one")
-    made = Gaussians(**{name: torch.cat([part[name] for part in parts]) for name in parts[0]})
+    fields: dict[str, Any] = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+    made = Gaussians(**fields)
     made.validate(str(path))
     return made
 
