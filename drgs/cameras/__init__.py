@@ -200,6 +200,16 @@ class Camera:
             return self
         return dataclasses.replace(self, model="pinhole", distortion=())
 
+    def relative_to(self, origin: np.ndarray) -> Camera:
+        """The same camera in a world whose 0 is `origin` (3,), as means of Gaussians are; itself if that is 0."""
+        if not np.any(origin):
+            return self
+        poses: dict[str, Any] = {}
+        for name in ("w2c", *(["w2c_end"] if self.is_rolling else [])):
+            rotation, translation = self._rigid(name)
+            poses[name] = _homogeneous(rotation, translation + rotation @ np.asarray(origin, np.float64))
+        return dataclasses.replace(self, **poses)
+
     def pixel_directions(self) -> np.ndarray:
         """(H,W,3) float64 unit world directions through the pixel centers, lens and shutter included.
 

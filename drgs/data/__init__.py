@@ -9,8 +9,9 @@ import shlex
 from pathlib import Path
 from typing import Any
 
+from drgs.cameras.origins import origin_text
 from drgs.checks.registry import Registry
-from drgs.data.camera_layout import scene_extent
+from drgs.data.camera_layout import scene_extent, scene_origin
 from drgs.data.colmap import find_model
 from drgs.data.dataset import Dataset, apply_held_out
 from drgs.data.formats import Format
@@ -146,9 +147,22 @@ def load(
     dataset.split()  # refuses numbers that cannot be
     check_times(dataset)
     mark_partial_masks(dataset.views, lazy)
+    _place(dataset)
     if semantics:
         attach(dataset, lazy)
     return dataset
+
+
+def _place(dataset: Dataset) -> None:
+    """Set the origin of a data set by its cameras; the log says where it is."""
+    if dataset.views:
+        dataset.origin = scene_origin(str(dataset.path), [view.camera for view in dataset.views], dataset.points)
+    if dataset.origin.any():
+        _log.info(
+            "%s: stands far from 0: Gaussians are kept relative to an origin at %s, cameras stay in the world",
+            dataset.path,
+            origin_text(dataset.origin),
+        )
 
 
 def _read(name: str, path: Path, options: dict[str, Any]) -> Dataset:

@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.cameras import look_at
+from drgs.cameras.origins import origin_near, rounding
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from drgs.cameras import Camera
 
-__all__ = ["Focus", "level_frame", "middle_camera", "path", "scene_extent", "upright"]
+__all__ = ["Focus", "level_frame", "middle_camera", "path", "scene_extent", "scene_origin", "upright"]
 
 # Angles and shares are chosen by hand, so that orbits, forward-facing captures, walks and drives of the data sets in
 # tests/test_orbits.py are classified rightly; no study varied them.
@@ -36,6 +37,7 @@ _MIN_SMOOTHING = 0.75  # standard deviation of the smoothing in steps between ph
 _MAX_PITCH = 80.0  # degrees above or below the horizon, beyond which an axis does not say what is ahead
 _SMOOTHINGS_PER_PATH = 40  # at least 1 / 40 of the whole path, of which a video has many photographs
 _EXTENT_MARGIN = 1.1  # 3DGS's own factor of the radius of the cameras
+_MOST_ROUNDING = 1e-3  # pixels that float64 may round a place in the scene by
 
 
 @dataclasses.dataclass(frozen=True)
@@ -177,12 +179,36 @@ def scene_extent(cameras: list[Camera], points: np.ndarray | None = None) -> flo
     centers = np.stack([camera.center for camera in cameras])
     middle = centers.mean(axis=0)
     spread = float(np.linalg.norm(centers - middle, axis=1).max())
-    # Below it, cameras that stand in one place differ by rounding alone.
-    if spread > 1e-9 * max(1.0, float(np.abs(middle).max())):
+    if spread > rounding(centers):  # else they stand in one place
         return _EXTENT_MARGIN * spread
     if points is not None and len(points):
         return _EXTENT_MARGIN * float(np.median(np.linalg.norm(points - middle, axis=1)))
     return 1.0
+
+
+def scene_origin(where: str, cameras: list[Camera], points: np.ndarray | None = None) -> np.ndarray:
+    """(3,) float64 origin that Gaussians seen by cameras are kept relative to: 0 unless they stand far from there.
+
+    Far is more than 10 times `scene_extent` (`drgs.cameras.origins.origin_near`).
+
+    Args:
+        where: Where the cameras come from, for messages.
+        cameras: Cameras, at least one.
+        points: (P,3) world points, as of `scene_extent`.
+    Raises:
+        ValueError: If float64 rounds places in the scene by more than 1e-3 of a pixel.
+    """
+    extent = scene_extent(cameras, points)
+    for camera in cameras:
+        far = float(np.linalg.norm(camera.center))
+        off = float(np.spacing(far)) * float(max(camera.K[0, 0], camera.K[1, 1])) / extent
+        if off > _MOST_ROUNDING:
+            raise ValueError(
+                f"{where}: cameras must stand where float64 holds {_MOST_ROUNDING:g} of a pixel, got {camera.name!r} "
+                f"{far:.3g} from 0, where it rounds by {off:.2g} pixels of a scene {extent:.3g} wide; subtract an "
+                "offset from all positions"
+            )
+    return origin_near(np.stack([camera.center for camera in cameras]).mean(axis=0), extent)
 
 
 def middle_camera(cameras: list[Camera]) -> Camera:

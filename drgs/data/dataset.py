@@ -8,14 +8,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from drgs.data.views import View
 from drgs.io.journal import SCHEMA
 from drgs.io.json_files import check_json, read_json
 from drgs.io.outputs import write_json
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from drgs.data.semantics import Semantics
 
 __all__ = ["Dataset", "HELD_OUT", "SplitRule", "apply_held_out", "write_held_out"]
@@ -46,6 +46,8 @@ class Dataset:
             these points; None where it states none.
         tracks: Points (N, 3), 20,000 of the data set's own at most, and view name -> int64 indices of those that this
             view was found to show; None where the data set does not say.
+        origin: (3,) float64 world: what Gaussians that are fitted to the data set are relative to. 0 unless the cameras
+            stand far from there; cameras and points themselves stay in the world (`drgs.data.load` sets it).
     """
 
     path: Path
@@ -62,6 +64,7 @@ class Dataset:
     frames: tuple[int, ...] = ()
     reprojection: float | None = None
     tracks: tuple[np.ndarray, Mapping[str, np.ndarray]] | None = None
+    origin: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
 
     @property
     def times(self) -> tuple[float, ...]:

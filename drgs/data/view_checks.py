@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.cameras.origins import rounding
 from drgs.data.images import png_has_alpha, read_image, unit_range
 from drgs.data.resampling import resize_area
 from drgs.io.foreign import is_file
@@ -88,8 +89,7 @@ def check_parallax(views: list[View]) -> None:
     """
     poses = np.stack([view.camera.c2w for view in views])
     spread = np.abs(poses - poses[0]).max(axis=(1, 2))
-    # Equal poses that a file states in several ways differ by rounding.
-    tiny = 1e-9 * max(1.0, float(np.abs(poses).max()))
+    tiny = rounding(poses)  # equal poses that a file states in several ways
     if len(views) < 2:
         return
     times = [[view.camera.time or 0.0] for view in views]  # from one place at two times, things may have moved
@@ -121,7 +121,7 @@ def check_cameras(views: list[View]) -> None:
     times = {view.camera.time for view in views} - {None}
     centers = np.stack([view.camera.center for view in views])
     # Cameras on stands may have been calibrated anew for every time.
-    near = max(1e-3 * float(np.ptp(centers, axis=0).max()), 1e-6 * max(1.0, float(np.abs(centers).max())))
+    near = max(1e-3 * float(np.ptp(centers, axis=0).max()), 1e-6, rounding(centers))
     distinct: list[np.ndarray] = []
     for center in centers:
         if len(distinct) < _FEW_PLACES and all(np.abs(center - other).max() > near for other in distinct):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.cameras.origins import rounding
 from drgs.data.dataset import Dataset
 from drgs.data.masks import MASK_KEEP
 from drgs.data.views import View
@@ -260,8 +261,7 @@ def _at_first(views: list[View]) -> list[View]:
         return views
     first = [view for view in views if view.camera.time == times[0]]
     centers = np.array([view.camera.center for view in first])
-    # Poses that a file states in several ways differ by rounding: 1e-9 of the distance from the origin is one place.
-    return first if np.ptp(centers, axis=0).max() > 1e-9 * max(1.0, float(np.abs(centers).max())) else views
+    return first if np.ptp(centers, axis=0).max() > rounding(centers) else views  # else they are of one place
 
 
 def added_points(
