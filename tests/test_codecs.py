@@ -296,11 +296,12 @@ def test_spz_goes_back_to_its_bits(tmp_path, rng, tied):
 
 def test_spz_says_what_it_cannot_hold(tmp_path, rng, caplog):
     """Scales and SH out of range go to its ends; far scenes get fewer bits behind the point; features are left out."""
-    g = drgs.Gaussians(*(torch.full(shape, 3.0) for shape in ((2, 3), (2, 4), (2, 3), (2,), (2, 4, 3))))
-    g = g.replace(means=g.means * 1e5, log_scales=g.log_scales * 4, features=torch.zeros(2, 7))
+    g = drgs.Gaussians(*(torch.full(shape, 3.0) for shape in ((3, 3), (3, 4), (3, 3), (3,), (3, 4, 3))))
+    g = g.replace(means=g.means * 1e5, log_scales=torch.tensor([[12.0], [3.0], [3.0]]).repeat(1, 3))
+    g = g.replace(features=torch.zeros(3, 7))
     with caplog.at_level(logging.WARNING):
         save_gaussians(g, tmp_path / "a.spz")
-    for text in ("6 log scales were out", "18 SH coefficients were out", "left out the 7 semantic features"):
+    for text in ("3 log scales were out", "27 SH coefficients were out", "left out the 7 semantic features"):
         assert text in caplog.text
     back = load_gaussians(tmp_path / "a.spz")
     assert (back.means - g.means).abs().max() <= 2.0**-5  # 4 bits behind the point are left of 24
@@ -311,18 +312,26 @@ def test_spz_says_what_it_cannot_hold(tmp_path, rng, caplog):
         *(torch.ones(shape) for shape in ((1, 3), (1, 4), (1, 3), (1,), (1, 1, 3))), origin=np.full(3, 7.0)
     )
     save_gaussians(far, tmp_path / "c.glb")
-    assert load_gaussians(tmp_path / "c.glb").means.tolist() == [[8.0, 8.0, 8.0]]
+    back = load_gaussians(tmp_path / "c.glb")
+    assert back.means.tolist() == [[1.0, 1.0, 1.0]] and back.origin.tolist() == [7.0, 7.0, 7.0]
 
 
 def test_activations_beyond_what_a_format_holds(tmp_path):
-    """Logits of +-1000 and tiny scales come back finite; a scale that no float32 holds is refused for .glb."""
+    """Logits of +-1000 and tiny scales come back finite; a scale that no float32 holds is refused for .glb, and in .spz
+    scales of which half are out of its range.
+    """
     g = drgs.Gaussians(*(torch.ones(shape) for shape in ((3, 3), (3, 4), (3, 3), (3,), (3, 1, 3))))
     g = g.replace(logit_opacities=torch.tensor([-1000.0, 0, 1000]), log_scales=torch.full((3, 3), -200.0))
     for suffix in ("spz", "glb"):
-        save_gaussians(g, tmp_path / f"a.{suffix}")
+        held = g if suffix == "glb" else g.replace(log_scales=torch.tensor([[-200.0, -200.0, -4.0]]).repeat(3, 1))
+        save_gaussians(held, tmp_path / f"a.{suffix}")
         back = load_gaussians(tmp_path / f"a.{suffix}")
         np.testing.assert_allclose(back.opacities.numpy(), [0, 0.5, 1], atol=0.5 / 255)
         assert torch.isfinite(back.log_scales).all()
+    with pytest.raises(
+        ValueError, match=r"SPZ must have standard deviations of 4\.5e-05 to 3\.8e\+02 units, got 1\.4e-87"
+    ):
+        save_gaussians(g, tmp_path / "b.spz")
     with pytest.raises(ValueError, match="a log scale above 88 is none"):
         save_gaussians(g.replace(log_scales=torch.full((3, 3), 1000.0)), tmp_path / "b.glb")
     assert not (tmp_path / "b.glb").exists()

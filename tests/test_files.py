@@ -168,12 +168,14 @@ def test_harmonics_of_degree_4_are_cut(tmp_path, caplog):
     assert "left out the SH coefficients of degree 4" in caplog.text
 
 
-def test_origin_is_added_on_saving(tmp_path):
-    """Means relative to an origin are stored in the world."""
-    g = gaussians(2).replace(origin=np.array([100.0, 0, -5]))
+def test_origin_is_kept_in_the_header(tmp_path):
+    """Means are stored relative to the origin, which a comment states, and come back so."""
+    g = gaussians(2).replace(origin=np.array([500000.1, 5400000, -0.005]))
     save_ply(g, tmp_path / "a.ply")
-    want = (g.means.double().numpy() + g.origin).astype(np.float32)
-    assert np.array_equal(load_ply(tmp_path / "a.ply").means.numpy(), want)
+    assert b"\ncomment offset 500000.1 5400000 -0.005\n" in (tmp_path / "a.ply").read_bytes()
+    back = load_ply(tmp_path / "a.ply")
+    assert torch.equal(back.means, g.means)
+    np.testing.assert_array_equal(back.origin, g.origin)
 
 
 def test_zero_gaussians_round_trip(tmp_path):

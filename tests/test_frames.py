@@ -15,6 +15,7 @@ from drgs import cli
 from drgs.codecs import load_gaussians
 from drgs.commands.frames import _moved, in_frame_of_data
 from drgs.data import load
+from drgs.ellipsoids import Gaussians
 from drgs.files import save_ply
 
 # a frame that nobody would guess: x -> 0.3 TURN x + SHIFT
@@ -73,12 +74,17 @@ def normalization(data):
     return matrix
 
 
+def places(g: Gaussians) -> torch.Tensor:
+    """(N, 3) float32 means in the world, as checkpoints without an origin hold them."""
+    return (g.means.double() + torch.from_numpy(g.origin)).float()
+
+
 def save_simple_trainer(folder, g, ranks: int = 1):
     """Results of gsplat's simple_trainer, of the Gaussians shared among ranks."""
     (folder / "ckpts").mkdir(parents=True)
     for rank in range(ranks):
         part = g.take(slice(rank, None, ranks))
-        splats = {"means": part.means, "scales": part.log_scales, "quats": part.quats}
+        splats = {"means": places(part), "scales": part.log_scales, "quats": part.quats}
         splats |= {"opacities": part.logit_opacities, "sh0": part.sh[:, :1], "shN": part.sh[:, 1:]}
         for step in (6999, 29999):
             torch.save({"step": step, "splats": splats}, folder / f"ckpts/ckpt_{step}_rank{rank}.pt")
@@ -87,7 +93,7 @@ def save_simple_trainer(folder, g, ranks: int = 1):
 def save_splatfacto(folder, g):
     """A run of nerfstudio's splatfacto, as far as it is read."""
     (folder / "nerfstudio_models").mkdir(parents=True)
-    values = {"means": g.means, "scales": g.log_scales, "quats": g.quats, "opacities": g.logit_opacities[:, None]}
+    values = {"means": places(g), "scales": g.log_scales, "quats": g.quats, "opacities": g.logit_opacities[:, None]}
     values |= {"features_dc": g.sh[:, 0], "features_rest": g.sh[:, 1:]}
     pipeline = {f"_model.gauss_params.{name}": x for name, x in values.items()} | {"_model.other": torch.zeros(1)}
     torch.save({"step": 9, "pipeline": pipeline, "optimizers": {}}, folder / "nerfstudio_models/step-000000009.ckpt")

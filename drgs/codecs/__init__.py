@@ -21,6 +21,9 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from drgs.cameras.origins import origin_of_text, origin_text
 from drgs.checks.arguments import ArgumentError, check_path
 from drgs.checks.registry import Registry
 from drgs.codecs.codec import Codec
@@ -32,18 +35,22 @@ from drgs.io.outputs import atomic_write
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    import numpy as np
-
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["CODECS", "Codec", "check_suffix", "load_gaussians", "readable", "save_gaussians"]
+__all__ = ["CODECS", "Codec", "check_suffix", "load_gaussians", "origin_file", "readable", "save_gaussians"]
 
 CODECS: Registry[Codec] = Registry(
     "format of Gaussians",
     "drgs.codecs",
     {
         "packed_ply": "drgs.codecs.packed_ply:PACKED_PLY",
-        "ply": Codec(".ply", load_ply, lambda path, head: head.startswith((b"ply\n", b"ply\r")), by_suffix=False),
+        "ply": Codec(
+            ".ply",
+            load_ply,
+            lambda path, head: head.startswith((b"ply\n", b"ply\r")),
+            by_suffix=False,
+            keeps_origin=True,
+        ),
         "spz": "drgs.codecs.spz:SPZ",
         "splat": "drgs.codecs.splat:SPLAT",
         "ksplat": "drgs.codecs.ksplat:KSPLAT",
@@ -57,6 +64,7 @@ CODECS: Registry[Codec] = Registry(
 scripts come after these. PLY is written by `drgs.save_ply`, which alone has room for more columns.
 """
 
+_OFFSET_BYTES = 200  # of a file with an offset, whose three numbers take 75 at most
 _HEAD = 1 << 18  # bytes: the longest header of a PLY
 _WHATEVER_THE_SUFFIX = (b"version https://git-lfs", b"PK\x03\x04")  # pointers and archives, which no reader opens
 _log = logging.getLogger(__name__)
@@ -77,7 +85,8 @@ def load_gaussians(path: str | os.PathLike, *, as_stored: bool = False) -> Gauss
         as_stored: Keep the axes of the file, where the format (SPZ) has others than PLY: some writers leave out the
             turn that its specification requires.
     Returns:
-        float32 `Gaussians`. Where a byte stands for an opacity of 0 or 1, or a scale is 0, its logit or logarithm is
+        float32 `Gaussians`, relative to the `origin` that the file states, or that stands beside it (`origin_file`).
+        Where a byte stands for an opacity of 0 or 1, or a scale is 0, its logit or logarithm is
         finite (drgs/codecs/values.py).
     Raises:
         FileNotFoundError: If there is no such file, or the folder holds none.
@@ -99,7 +108,8 @@ def load_gaussians(path: str | os.PathLike, *, as_stored: bool = False) -> Gauss
         head = file.read(_HEAD)
     codec = _codec_of(path, head)
     if codec is not None:
-        return codec.load_as_stored(path) if as_stored and codec.load_as_stored else codec.load(path)
+        made = codec.load_as_stored(path) if as_stored and codec.load_as_stored else codec.load(path)
+        return made if codec.keeps_origin else _with_origin_beside(path, made)
     refuse_foreign(path, "a file of Gaussians")
     raise ValueError(f"{path}: must be a file of Gaussians, is of no format that is known; what is read: {readable()}")
 
@@ -143,17 +153,53 @@ def save_gaussians(
     path = check_path("save_gaussians", path)
     suffix = check_suffix("save_gaussians", path)
     if suffix == ".ply":
+        from drgs.codecs.values import recentered
+
+        g = recentered(g)
         save_ply(g, path, extra=extra, comments=comments)
+        _note_origin(path, g.origin, "which its header states")
         return
     if extra:
         raise ValueError(f"save_gaussians: {', '.join(extra)} must go into a .ply, {suffix} has no room for them")
     g.validate("save_gaussians")
     if g.features is not None:
         _log.warning("%s: left out the %d semantic features, %s has no room", path, g.features.shape[1], suffix)
-    encode = next(codec.encode for codec in CODECS.values() if codec.suffix == suffix and codec.encode)
-    data = encode(_plain(g))
+    codec = next(codec for codec in CODECS.values() if codec.suffix == suffix and codec.encode)
+    assert codec.encode is not None  # asked for
+    plain = _plain(g)
+    data = codec.encode(plain if codec.keeps_origin else plain.replace(origin=np.zeros(3)))
     with atomic_write(path) as file:
         file.write(data)
+    beside = origin_file(path)
+    # One that is there already must not go on saying where an older file was.
+    if not codec.keeps_origin and (plain.origin.any() or beside.is_file()):
+        with atomic_write(beside) as file:
+            file.write(f"{origin_text(plain.origin)}\n".encode())
+    where = "which it states" if codec.keeps_origin else f"which {suffix} has no room for: {beside.name} states it"
+    _note_origin(path, plain.origin, where)
+
+
+def origin_file(path: Path) -> Path:
+    """The text beside a file of Gaussians whose format has no room for an offset: three numbers, as in the `offset.xyz`
+    of Pix4D.
+    """
+    return path.with_name(path.name + ".offset.xyz")
+
+
+def _with_origin_beside(path: Path, g: Gaussians) -> Gaussians:
+    """Gaussians of a file, relative to the offset that stands beside it, if there is one."""
+    beside = origin_file(path)
+    if not beside.is_file():
+        return g
+    with beside.open("rb") as file:
+        text = file.read(_OFFSET_BYTES).decode("utf-8", "replace").strip()
+    return g.replace(origin=origin_of_text(str(beside), text))
+
+
+def _note_origin(path: Path, origin: np.ndarray, where: str) -> None:
+    """Say in the log that positions in a file are relative to an offset."""
+    if origin.any():
+        _log.info("%s: positions are relative to the offset %s, %s", path, origin_text(origin), where)
 
 
 def check_suffix(where: str, path: Path) -> str:
@@ -181,17 +227,13 @@ def check_suffix(where: str, path: Path) -> str:
 
 
 def _plain(g: Gaussians) -> Gaussians:
-    """float32 values on the CPU, without an origin."""
-    import numpy as np
-    import torch
+    """float32 values on the CPU."""
+    from drgs.codecs.values import recentered
 
+    g = recentered(g)
     # A file holds values: nothing of it is differentiated.
-    values = {name: x.detach().cpu() for name, x in g.parameters().items() if name != "features"}
-    if np.any(g.origin):
-        # In float64 before it is rounded once: float32 offsets near 0 would lose their digits to an origin far away.
-        values["means"] = values["means"].double() + torch.from_numpy(np.asarray(g.origin, np.float64))
-    floats = {name: x.float() for name, x in values.items()}
-    return g.replace(**floats, features=None, origin=np.zeros(3))
+    floats = {name: x.detach().cpu().float() for name, x in g.parameters().items() if name != "features"}
+    return g.replace(**floats, features=None)
 
 
 def _codec_of(path: Path, head: bytes) -> Codec | None:

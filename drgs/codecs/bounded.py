@@ -13,7 +13,7 @@ import numpy as np
 
 from drgs.io.foreign import is_file
 
-__all__ = ["Archive", "GzipReader", "pixels_of_webp", "unzstd", "webp_of_pixels"]
+__all__ = ["Archive", "GzipReader", "gzip_comment", "gzipped", "pixels_of_webp", "unzstd", "webp_of_pixels"]
 
 _DAMAGED = "it is truncated or damaged, copy it again"
 # characters of names, and of what libraries say
@@ -24,6 +24,30 @@ _ZIP_ERRORS = (
     zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, NotImplementedError, OSError, OverflowError,
     RuntimeError, ValueError,
 )  # fmt: skip
+
+
+_FEXTRA, _FNAME, _FCOMMENT = 4, 8, 16  # flags of gzip's header (RFC 1952)
+
+
+def gzipped(data: bytes, comment: str = "") -> bytes:
+    """A gzip stream without a time: same data, same bytes; with a comment in its header, in ASCII."""
+    packer = zlib.compressobj(6, zlib.DEFLATED, 31)
+    stream = packer.compress(data) + packer.flush()
+    if not comment:
+        return stream
+    return stream[:3] + bytes([stream[3] | _FCOMMENT]) + stream[4:10] + comment.encode("ascii") + b"\0" + stream[10:]
+
+
+def gzip_comment(data: bytes) -> str:
+    """The comment in the header of a gzip stream; empty where there is none, or data are no such stream."""
+    if data[:3] != b"\x1f\x8b\x08" or len(data) < 10 or not data[3] & _FCOMMENT:
+        return ""
+    flags, at = data[3], 10
+    if flags & _FEXTRA:
+        at += 2 + int.from_bytes(data[at : at + 2], "little")
+    if flags & _FNAME:
+        at = data.find(b"\0", at) + 1
+    return data[at : max(at, data.find(b"\0", at))].decode("latin-1")
 
 
 class GzipReader:

@@ -30,8 +30,10 @@ class Codec:
             reader says best what is wrong.
         load_as_stored: Reads a file in the axes that it states, where there are writers that leave out the turn which
             the specification requires.
-        encode: Makes the bytes of a file, of float32 values on the CPU, without an origin and without features; None
-            where the format is only read.
+        encode: Makes the bytes of a file, of float32 values on the CPU, without features; None where the format is
+            only read.
+        keeps_origin: Whether files have room for `Gaussians.origin`, which `encode` writes and `load` reads. Of other
+            formats, `encode` gets none: it is written beside the file.
         made_by: Program that makes such a file of a PLY, with the places `{ply}` and `{path}`; for the message where it
             is only read.
     """
@@ -42,4 +44,5 @@ class Codec:
     by_suffix: bool = True
     load_as_stored: Callable[[Path], Gaussians] | None = None
     encode: Callable[[Gaussians], bytes] | None = None
+    keeps_origin: bool = False
     made_by: str = ""

@@ -20,6 +20,7 @@ def glb_of(
     arrays: Sequence[tuple[np.ndarray, Mapping[str, Any], int]],
     primitive: Mapping[str, Any],
     more: Mapping[str, Any],
+    offset: np.ndarray | None = None,
 ) -> bytes:
     """The bytes of a file.
 
@@ -29,6 +30,7 @@ def glb_of(
             fields beside view and count, and the target of its view. The first one is POSITION, whose range is stated.
         primitive: The primitive of the mesh.
         more: Further fields of the document.
+        offset: (3,) what positions are relative to, in the axes of glTF: `asset.extras.offset`; None or 0: left out.
     Raises:
         ValueError: If it takes more than 4 GiB.
     """
@@ -42,8 +44,9 @@ def glb_of(
     positions = arrays[0][0]
     if len(positions):
         accessors[0] |= {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
+    extras = {} if offset is None or not offset.any() else {"extras": {"offset": offset.tolist()}}
     document = {
-        "asset": {"version": "2.0", "generator": "drgs"},
+        "asset": {"version": "2.0", "generator": "drgs", **extras},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],

@@ -7,7 +7,8 @@ were written to the review draft of before February 2026, splat-transform's of b
 scales (KhronosGroup/glTF issue 2563, playcanvas/splat-transform pull request 268): negative ones tell them apart.
 
 Axes: glTF has y up and z to the front, PLY files of 3DGS y down and z to the front. Between the two, x and y turn their
-signs (a half turn about z, as splat-transform does it), and with them those of quaternions and SH.
+signs (a half turn about z, as splat-transform does it), and with them those of quaternions and SH. What positions are
+relative to is `asset.extras.offset`, in the axes of glTF; no node moves them there, for viewers are float32.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from drgs.cameras.origins import check_origin
 from drgs.codecs.codec import Codec
 from drgs.codecs.glb import BIN, JSON, glb_of
 from drgs.codecs.values import SH_COUNTS, assembled, check_count, flipped, log_of_scales, logits_of_opacities
@@ -79,7 +81,7 @@ def encode_glb(g: Gaussians) -> bytes:
         "mode": 0,
         "extensions": {_NAME: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
     }
-    return glb_of("save_gaussians", accessors, primitive, {"extensionsUsed": [_NAME]})
+    return glb_of("save_gaussians", accessors, primitive, {"extensionsUsed": [_NAME]}, g.origin)
 
 
 def load_glb(path: Path) -> Gaussians:
@@ -117,9 +119,12 @@ def load_glb(path: Path) -> Gaussians:
         log_scales = scales
     else:
         log_scales = log_of_scales(path, scales, _LEAST)
-    return flipped(
-        assembled(path, means, quats[:, [3, 0, 1, 2]], log_scales, logits_of_opacities(opacities[:, 0]), sh), _AXES
-    )
+    made = assembled(path, means, quats[:, [3, 0, 1, 2]], log_scales, logits_of_opacities(opacities[:, 0]), sh)
+    asset = document.get("asset")
+    extras = asset.get("extras") if isinstance(asset, dict) else None
+    if isinstance(extras, dict) and "offset" in extras:
+        made = made.replace(origin=check_origin(f"{path}: asset.extras.offset", extras["offset"]))
+    return flipped(made, _AXES)
 
 
 def _orders(degree: int) -> list[tuple[int, int]]:
@@ -228,4 +233,11 @@ class _Accessors:
         return np.maximum(raw.astype(np.float32) / one, -1.0)
 
 
-GLB = Codec(".glb", load_glb, lambda path, head: head.startswith(b"glTF"), by_suffix=False, encode=encode_glb)
+GLB = Codec(
+    ".glb",
+    load_glb,
+    lambda path, head: head.startswith(b"glTF"),
+    by_suffix=False,
+    encode=encode_glb,
+    keeps_origin=True,
+)

@@ -17,7 +17,7 @@ import numpy as np
 from drgs.codecs.clustering import morton_order
 from drgs.codecs.codec import Codec
 from drgs.codecs.ply import note_antialiased
-from drgs.codecs.ply_headers import is_antialiased, ply_source, read_ply_header
+from drgs.codecs.ply_headers import is_antialiased, offset_line, ply_offset, ply_source, read_ply_header
 from drgs.codecs.values import assembled, check_count, dc_of_colors, logits_of_bytes, quats_of_smallest
 from drgs.ellipsoids import Y_00
 
@@ -73,7 +73,7 @@ def load_packed_ply(path: Path) -> Gaussians:
     sh = dc_of_colors(colors)
     if coefficients > 1:
         sh = np.concatenate([sh, _higher(ply["sh"].data, coefficients - 1)], axis=1)
-    return assembled(
+    made = assembled(
         path,
         _between(chunks, ("x", "y", "z"), chunk, _unpacked(position)),
         quats_of_smallest((rotation >> 30).astype(int), (others - 0.5) * 2**0.5),
@@ -81,6 +81,8 @@ def load_packed_ply(path: Path) -> Gaussians:
         logits_of_bytes(rgba[:, 3]),
         sh,
     )
+    offset = ply_offset(path)
+    return made if offset is None else made.replace(origin=offset)
 
 
 def _check(path: Path, elements: dict[str, PlyElement]) -> tuple[int, int]:
@@ -187,7 +189,9 @@ def encode_packed_ply(g: Gaussians) -> bytes:
     names = [f"{end}_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
     names += [f"{end}_scale_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
     names += [f"{end}_{axis}" for end in ("min", "max") for axis in ("r", "g", "b")]
-    lines = ["ply", "format binary_little_endian 1.0", f"element chunk {len(starts)}"]
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [f"comment {offset_line(g.origin)}"] if g.origin.any() else []
+    lines += [f"element chunk {len(starts)}"]
     lines += [f"property float {name}" for name in names]
     lines += [f"element vertex {len(g)}", *(f"property uint {name}" for name in _PACKED)]
     body = [
@@ -220,4 +224,6 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
     return _packed(np.clip(others / 2**0.5 + 0.5, 0, 1), (10, 10, 10)) | largest.astype(np.uint32) << np.uint32(30)
 
 
-PACKED_PLY = Codec(".compressed.ply", load_packed_ply, _is_packed, by_suffix=False, encode=encode_packed_ply)
+PACKED_PLY = Codec(
+    ".compressed.ply", load_packed_ply, _is_packed, by_suffix=False, encode=encode_packed_ply, keeps_origin=True
+)

@@ -12,8 +12,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from drgs.cameras.origins import origin_text
 from drgs.checks.arguments import ArgumentError, check_path
-from drgs.codecs.ply_headers import EXTRA, extra_kind, is_antialiased, ply_source, read_ply_header
+from drgs.codecs.ply_headers import (
+    EXTRA,
+    extra_kind,
+    is_antialiased,
+    offset_line,
+    ply_offset,
+    ply_source,
+    read_ply_header,
+)
 from drgs.io.foreign import refuse_foreign
 from drgs.io.outputs import atomic_write
 
@@ -49,17 +58,22 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
             72, SH of degree 4, those up to degree 3 are kept, with a warning), opacity (logit), scale_0..2 (log) and
             rot_0..3 (wxyz), and semantic_0, ... (features) as Feature 3DGS writes them. Normals and features may be
             missing. What `save_ply` added (uncertainty_*, label) is left out; any other column, too, with a warning.
+    Positions are relative to a line `comment offset X Y Z` of the header, if there is one: it becomes their `origin`.
+    Without it, `property double x` far from 0 gets an origin, too (`drgs.cameras.origins`); float32 positions far from
+    0 stay as they are, with a warning, for their detail was lost when they were written.
+
     Returns:
         float32 `Gaussians` with the file's bits; an infinite logit becomes one of `ellipsoids.LOGIT_ENDS`, and the log
         says how many did.
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If it is no PLY, shorter than its header claims, of another layout, or holds other values that are
-            not finite (the first index is named).
+        ValueError: If it is no PLY, shorter than its header claims, of another layout, or holds other values, or an
+            offset, that are not finite (the first index is named).
     """
     import plyfile
     import torch
 
+    from drgs.codecs.values import note_lost, recentered
     from drgs.ellipsoids import Gaussians
 
     path = check_path("load_ply", path)
@@ -68,9 +82,12 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
     _check_columns(path, names, {*rest, *features})
     if is_antialiased(path):
         note_antialiased(path)
+    offset = ply_offset(path)
     try:
         vertex = plyfile.PlyData.read(ply_source(path))["vertex"].data
         arrays: dict[str, Any] = {name: _columns(vertex, group) for name, group in _COLUMNS.items()}
+        if any(vertex[name].dtype.itemsize == 8 for name in "xyz"):
+            arrays["means"] = _columns(vertex, _COLUMNS["means"], np.float64)
         higher, described = _columns(vertex, rest), _columns(vertex, features)
     except MemoryError:
         raise
@@ -85,8 +102,13 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
     if features:
         arrays["features"] = described
     arrays["logit_opacities"] = _finite_logits(path, arrays["logit_opacities"][:, 0])
-    gaussians = Gaussians(**arrays, sh=sh.contiguous())
+    held = Gaussians(**arrays, sh=sh.contiguous())
+    gaussians = recentered(held if offset is None else held.replace(origin=offset))
     gaussians.validate(str(path))
+    if held.means.dtype == torch.float32:
+        note_lost(path, held)
+    elif offset is None and gaussians.origin.any():
+        _log.info("%s: stands far from 0: positions are relative to %s now", path, origin_text(gaussians.origin))
     return gaussians
 
 
@@ -116,11 +138,11 @@ def _finite_logits(path: Path, logits: torch.Tensor) -> torch.Tensor:
     return logits.where(~infinite, logits.clamp(*LOGIT_ENDS))
 
 
-def _columns(vertex: np.ndarray, names: tuple[str, ...]) -> torch.Tensor:
-    """(N, columns) float32."""
+def _columns(vertex: np.ndarray, names: tuple[str, ...], kind: type = np.float32) -> torch.Tensor:
+    """(N, columns), float32 but for what has more digits."""
     import torch
 
-    out = np.empty((len(vertex), len(names)), np.float32)
+    out: np.ndarray = np.empty((len(vertex), len(names)), kind)
     for i, name in enumerate(names):
         out[:, i] = vertex[name]
     return torch.from_numpy(out)
@@ -137,8 +159,9 @@ def save_ply(
 
         drgs.save_ply(g, "out.ply", comments=("made by hand",))
 
-    `load_ply` gives the same bits back. Means are stored as `origin + means` rounded to float32. Features, where there
-    are any, follow as semantic_0, ..., as Feature 3DGS writes them; other viewers leave them out.
+    `load_ply` gives the same bits back. Means are stored as they are, relative to `origin`: where that is not 0, the
+    first comment is `offset X Y Z`, to be added to positions. Float64 means far from 0 get an origin first. Features,
+    where there are any, follow as semantic_0, ..., as Feature 3DGS writes them; other viewers leave them out.
 
     Args:
         g: The Gaussians.
@@ -152,6 +175,7 @@ def save_ply(
     """
     import plyfile
 
+    from drgs.codecs.values import recentered
     from drgs.ellipsoids import check_gaussians
 
     if isinstance(g, str | os.PathLike):
@@ -159,12 +183,10 @@ def save_ply(
     check_gaussians("save_ply", g)
     path = check_path("save_ply", path)
     g.validate("save_ply")
+    g = recentered(g)
     # A file holds values.
     fields = {name: x.detach().cpu().numpy() for name, x in g.parameters().items()}
     means = fields["means"]
-    if np.any(g.origin):
-        # In float64 before it is rounded once: float32 offsets would lose their digits to an origin far away.
-        means = means.astype(np.float64) + g.origin
     rest = fields["sh"][:, 1:].transpose(0, 2, 1).reshape(len(g), 3 * (g.sh.shape[1] - 1))  # channel by channel
     columns = {
         **{name: means[:, i] for i, name in enumerate("xyz")},
@@ -180,7 +202,7 @@ def save_ply(
     vertex = np.empty(len(g), [*((name, "<f4") for name in columns), *kinds.items()])
     for name, values in {**columns, **(extra or {})}.items():
         vertex[name] = values
-    lines = [" ".join(text.split()) for text in comments]
+    lines = [*([offset_line(g.origin)] if g.origin.any() else []), *(" ".join(text.split()) for text in comments)]
     ply = plyfile.PlyData([plyfile.PlyElement.describe(vertex, "vertex")], byte_order="<", comments=lines)
     with atomic_write(path) as file:
         ply.write(file)

@@ -12,7 +12,18 @@ from typing import BinaryIO
 
 import numpy as np
 
-__all__ = ["EXTRA", "PlyElement", "extra_kind", "is_antialiased", "ply_source", "read_ply_header"]
+from drgs.cameras.origins import origin_of_text, origin_text
+
+__all__ = [
+    "EXTRA",
+    "PlyElement",
+    "extra_kind",
+    "is_antialiased",
+    "offset_line",
+    "ply_offset",
+    "ply_source",
+    "read_ply_header",
+]
 
 EXTRA = ("uncertainty_", "label")
 """Beginnings of columns that `drgs.save_ply` adds, and viewers leave out."""
@@ -106,6 +117,32 @@ def is_antialiased(path: Path) -> bool:
         re.IGNORECASE | re.MULTILINE,
     )
     return bool(said) and (said[-1][0].lower(), said[-1][1]) in ((b"mip", b""), (b"", b"1"))
+
+
+def offset_line(origin: np.ndarray) -> str:
+    """The comment that says what positions are relative to: to be added to them."""
+    return f"offset {origin_text(origin)}"
+
+
+def ply_offset(path: Path) -> np.ndarray | None:
+    """(3,) float64 offset of the positions of a PLY, whose header has been read; None where it states none.
+
+    A line `comment offset X Y Z`, also with a colon; what has no number behind the word is prose.
+
+    Raises:
+        ValueError: If it is not three finite numbers, or two lines differ.
+    """
+    with path.open("rb") as file:
+        head = file.read(_MAX_HEADER)
+    lines = re.findall(
+        rb"^comment[ \t]+offset:?[ \t]+([-+.0-9]|nan|inf)([^\r\n]*)",
+        head[: head.find(b"\nend_header")].replace(b"\r", b"\n"),
+        re.IGNORECASE | re.MULTILINE,
+    )
+    texts = {(first + rest).decode("ascii", "replace").strip() for first, rest in lines}
+    if len(texts) > 1:
+        raise ValueError(f"{path}: must state one offset, states {' and '.join(sorted(texts))[:80]}; remove the others")
+    return origin_of_text(f"{path}: comment offset", texts.pop()) if texts else None
 
 
 def extra_kind(name: str, values: np.ndarray, count: int) -> str:

@@ -10,7 +10,8 @@ playcanvas/splat-transform reads (read-sog-v1.ts at 27048b2).
     shN_labels         16 bits that choose a row of shN_centroids, whose bytes choose of a codebook
 
 A scene is a zip archive (`.sog`) or a folder with these files. Axes are those of the PLY that it was made of, as
-splat-transform writes and reads it (the specification calls them x right, y up, z back).
+splat-transform writes and reads it (the specification calls them x right, y up, z back). What positions are relative to
+is `asset.offset` of meta.json, which other readers leave alone.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from drgs.cameras.origins import check_origin
 from drgs.codecs.bounded import Archive, pixels_of_webp, webp_of_pixels
 from drgs.codecs.clustering import codebook, morton_order, palette
 from drgs.codecs.codec import Codec
@@ -111,7 +113,11 @@ class _Reader:
             dc = lerped[:, :3]
             logits = lerped[:, 3]
         sh = np.concatenate([dc[:, None, :].astype(np.float32), self._higher(degree)], axis=1)
-        return assembled(self.path, means, self._quats(), log_scales, logits, sh)
+        made = assembled(self.path, means, self._quats(), log_scales, logits, sh)
+        asset = self.meta.get("asset")
+        if not isinstance(asset, dict) or "offset" not in asset:
+            return made
+        return made.replace(origin=check_origin(f"{self.path}: meta.json: asset.offset", asset["offset"]))
 
     def _image(self, field: str, index: int = 0) -> np.ndarray:
         """(N, 4) bytes of an image with a pixel a Gaussian."""
@@ -263,7 +269,7 @@ def encode_sog(g: Gaussians) -> bytes:
     }
     meta: dict[str, Any] = {
         "version": 2,
-        "asset": {"generator": "drgs"},
+        "asset": {"generator": "drgs"} | ({"offset": g.origin.tolist()} if g.origin.any() else {}),
         "count": len(g),
         "antialias": False,
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
@@ -316,4 +322,4 @@ def _bytes_of_quats(quats: np.ndarray) -> np.ndarray:
     return np.concatenate([codes, 252 + largest[:, None]], axis=1)
 
 
-SOG = Codec(".sog", load_sog, _is_sog, encode=encode_sog)
+SOG = Codec(".sog", load_sog, _is_sog, encode=encode_sog, keeps_origin=True)

@@ -11,6 +11,9 @@ Positions are 24-bit fixed point, log scales steps of 1/16 from -10, alphas and 
 its SH coefficient c. Rotations of version 2 are x, y and z in bytes; later, the three smaller components in 10 bits.
 SH are (byte - 128) / 128.
 
+The offset that positions are relative to is in the comment of gzip's header (RFC 1952, FCOMMENT), which what unpacks
+gzip skips: `offset X Y Z`, in the axes of the file.
+
 Axes: SPZ states right, up, back; PLY files of 3DGS have right, down, front. Between the two, y and z turn their signs,
 and with them those of quaternions and SH (Niantic's converter does the same). Files exist whose writer left that out:
 `as_stored` keeps what they hold.
@@ -19,6 +22,7 @@ and with them those of quaternions and SH (Niantic's converter does the same). F
 from __future__ import annotations
 
 import logging
+import math
 import struct
 import zlib
 from pathlib import Path
@@ -26,10 +30,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.codecs.bounded import GzipReader, unzstd
+from drgs.cameras.origins import origin_of_text
+from drgs.codecs.bounded import GzipReader, gzip_comment, gzipped, unzstd
 from drgs.codecs.codec import Codec
 from drgs.codecs.ply import note_antialiased
-from drgs.codecs.values import SH_COUNTS, assembled, check_count, flipped, logits_of_bytes, quats_of_smallest
+from drgs.codecs.ply_headers import offset_line
+from drgs.codecs.values import SH_COUNTS, assembled, check_count, flipped, logits_of_bytes, quats_of_smallest, spread
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
@@ -41,6 +47,11 @@ _COLOR_SCALE = 0.15  # the format holds the DC coefficient times 0.15
 _ANTIALIASED, _EXTENDED = 1, 2  # flags
 _HARMLESS = {0xADBE0002}  # extensions that change no value: limits of an orbit
 _POSITION_BITS = 12  # of a position behind the point, as Niantic's writer has it; readers exist that take no more
+_MOST_BITS = 23
+# Steps of positions, in the size of a scene, which is hundreds of pixels wide: above the first, a pixel, there are more
+# bits, above the second it is refused.
+_COARSE_STEP, _COARSEST_STEP = 1e-3, 1e-2
+_LEAST_LOG_SCALE, _LOG_SCALES = -10.0, 16.0  # logarithm that byte 0 stands for, bytes a unit of it
 _QUAT_SCALE = 511 * 2**0.5  # a component of at most sqrt(1/2), in 9 bits
 _STEP_TOLERANCE = 1e-4  # of a step: what float32 rounds off at most, some times over
 _log = logging.getLogger(__name__)
@@ -78,10 +89,13 @@ def load_spz(path: Path, as_stored: bool = False) -> Gaussians:
         path,
         means,
         quats,
-        bytes_of["s"].reshape(count, 3) / 16.0 - 10.0,
+        bytes_of["s"].reshape(count, 3) / _LOG_SCALES + _LEAST_LOG_SCALE,
         logits_of_bytes(np.frombuffer(alphas, np.uint8)),
         np.concatenate([dc.astype(np.float32), higher], axis=1),
     )
+    word, _, text = gzip_comment(data).partition(" ")
+    if word == "offset":
+        made = made.replace(origin=origin_of_text(f"{path}: offset", text))
     return made if as_stored else flipped(made, _AXES)
 
 
@@ -195,18 +209,18 @@ def _smallest_three(data: bytes) -> np.ndarray:
 def encode_spz(g: Gaussians) -> bytes:
     """An SPZ file of version 3 of Gaussians in the axes of PLY files; their features are left out.
 
-    Twelve bits behind the point, or as many as the farthest mean leaves; SH in all 8 bits, not in the 5 and 4 that
-    Niantic's writer keeps. What is out of the format's range goes to its end, and the log says how much that is.
+    Twelve bits behind the point, more for a scene that is small, as in kilometres, or as many as the farthest mean
+    leaves; SH in all 8 bits, not in the 5 and 4 that Niantic's writer keeps. What is out of the format's range goes to
+    its end, and the log says how much that is.
 
     Raises:
-        ValueError: If a mean is farther than 2^23 from 0.
+        ValueError: If a mean is farther than 2^23 from 0, or steps of positions are more than a hundredth of the size
+            of the scene, or half of the Gaussians are smaller or larger than the format knows.
     """
     g = flipped(g, _AXES)
     means = g.means.numpy().astype(np.float64)
-    far = float(np.abs(means).max(initial=0.0))
-    bits = next((b for b in range(_POSITION_BITS, -1, -1) if round(far * 2**b) < 1 << 23), None)
-    if bits is None:
-        raise ValueError(f"save_gaussians: SPZ holds means up to 2^23 from 0, got {far:g}; scale them or write a PLY")
+    _check_scales(g)
+    bits = _position_bits(g)
     fixed = np.rint(means * 2.0**bits).astype("<i4")
     positions = np.ascontiguousarray(fixed).view(np.uint8).reshape(-1, 3, 4)[..., :3]
     clipped: dict[str, int] = {}
@@ -217,7 +231,7 @@ def encode_spz(g: Gaussians) -> bytes:
         positions,
         _bytes("", opacities, clipped),
         _bytes("colors", (sh[:, 0] * _COLOR_SCALE + 0.5) * 255, clipped),
-        _bytes("log scales", (g.log_scales.numpy().astype(np.float64) + 10) * 16, clipped),
+        _bytes("log scales", (g.log_scales.numpy().astype(np.float64) - _LEAST_LOG_SCALE) * _LOG_SCALES, clipped),
         _packed_quats(g.quats.numpy().astype(np.float64)),
         _bytes("SH coefficients", sh[:, 1:] * 128 + 128, clipped),
     )
@@ -225,8 +239,38 @@ def encode_spz(g: Gaussians) -> bytes:
         _log.warning("SPZ: %d %s were out of its range and went to its end", count, name)
     header = struct.pack("<4sIIBBBB", b"NGSP", 3, len(g), g.sh_degree, bits, 0, 0)
     body = header + b"".join(np.ascontiguousarray(x).tobytes() for x in parts)
-    packer = zlib.compressobj(6, zlib.DEFLATED, 31)  # a gzip stream without a time: same Gaussians, same bytes
-    return packer.compress(body) + packer.flush()
+    return gzipped(body, offset_line(g.origin) if g.origin.any() else "")
+
+
+def _position_bits(g: Gaussians) -> int:
+    """Bits of a position behind the point; errors as of `encode_spz`."""
+    far = float(g.means.abs().max()) if len(g) else 0.0
+    size = spread(g)[1] if len(g) else 1.0
+    wanted = _POSITION_BITS
+    if 2.0**-wanted > _COARSE_STEP * size:  # as fine as 12 bits of a scene of size 1
+        wanted = min(_POSITION_BITS + math.ceil(-math.log2(size)), _MOST_BITS)
+    bits = next((b for b in range(wanted, -1, -1) if round(far * 2**b) < 1 << 23), None)
+    if bits is None:
+        raise ValueError(f"save_gaussians: SPZ holds means up to 2^23 from 0, got {far:g}; scale them or write a PLY")
+    if 2.0**-bits > _COARSEST_STEP * size:
+        raise ValueError(
+            f"save_gaussians: SPZ must hold positions in steps of a hundredth of a scene at most, got {2.0**-bits:.2g} "
+            f"for one of size {size:.2g} that reaches to {far:.2g}; write a .ply or .sog, or scale the scene"
+        )
+    if bits > _POSITION_BITS:
+        _log.info("SPZ: %d bits behind the point, 12 are too few for a scene of size %.2g", bits, size)
+    return bits
+
+
+def _check_scales(g: Gaussians) -> None:
+    """Raise ValueError if half of the Gaussians, by their largest standard deviation, are out of the format's range."""
+    low, high = _LEAST_LOG_SCALE, _LEAST_LOG_SCALE + 255 / _LOG_SCALES
+    middle = float(g.log_scales.amax(1).median()) if len(g) else low
+    if not low <= middle <= high:
+        raise ValueError(
+            f"save_gaussians: SPZ must have standard deviations of {np.exp(low):.2g} to {np.exp(high):.2g} units, "
+            f"got {np.exp(middle):.2g} (median); write a .ply or .sog, or scale the scene"
+        )
 
 
 def _bytes(name: str, values: np.ndarray, clipped: dict[str, int]) -> np.ndarray:
@@ -276,4 +320,5 @@ SPZ = Codec(
     _is_spz,
     load_as_stored=lambda path: load_spz(path, as_stored=True),
     encode=encode_spz,
+    keeps_origin=True,
 )

@@ -7,11 +7,13 @@ same byte.
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from drgs.cameras.origins import origin_near
 from drgs.ellipsoids import LOGIT_ENDS, Y_00, Gaussians
 from drgs.runtime.memory import require
 
@@ -24,11 +26,17 @@ __all__ = [
     "log_of_scales",
     "logits_of_bytes",
     "logits_of_opacities",
+    "note_lost",
     "quats_of_smallest",
+    "recentered",
+    "spread",
 ]
 
 SH_COUNTS = (1, 4, 9, 16)
 """Coefficients of a color up to degree 0, 1, 2 and 3."""
+# Step of float32 at the middle of a scene, in its size: a tenth of a pixel of a picture 1,000 wide is lost from there.
+_LOST = 1e-4
+_log = logging.getLogger(__name__)
 _END_VALUE = 0.25 / 255  # the middle of what rounds to an end: [0, 0.5 / 255] or [254.5 / 255, 1]
 # Powers of x, y and z in each basis function, modulo 2: what turns its sign when an axis turns.
 _ODD = np.array([
@@ -60,6 +68,7 @@ def assembled(
         mu, q, s, o, c = (torch.from_numpy(np.ascontiguousarray(x, np.float32)) for x in parts)
     made = Gaussians(mu, q, s, o, c)
     made.validate(str(path))
+    note_lost(path, made)
     return made
 
 
@@ -123,11 +132,49 @@ def quats_of_smallest(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
     return quats
 
 
+def spread(g: Gaussians) -> tuple[np.ndarray, float]:
+    """Middle (3,) of the means, and their median distance from it, of which floaters change nothing; N >= 1.
+
+    Where Gaussians are in one place, the median of their largest standard deviations is taken for that.
+    """
+    means = g.means.detach().cpu().double().numpy()  # measured, not optimized
+    middle = np.median(means, axis=0)
+    width = float(np.median(g.log_scales.detach().double().amax(1).exp().cpu().numpy()))
+    distance = float(np.median(np.linalg.norm(means - middle, axis=1)))
+    return middle, max(distance, width, 1e-12 * float(np.abs(middle).max()))
+
+
+def note_lost(path: Path, g: Gaussians) -> None:
+    """Say in the log that float32 positions of a file stand so far from 0 that they have lost detail."""
+    if not len(g):
+        return
+    middle, size = spread(g)
+    step = float(np.spacing(np.float32(np.abs(middle).max())))
+    if step > _LOST * size:
+        _log.warning(
+            "%s: float32 positions around %s have steps of %.2g, which has cost detail of a scene %.2g wide; "
+            "export it again relative to an offset, or as a PLY with double positions",
+            path,
+            " ".join(f"{x:g}" for x in middle),
+            step,
+            size,
+        )
+
+
+def recentered(g: Gaussians) -> Gaussians:
+    """The same Gaussians with float32 means: float64 ones that stand far from 0 become relative to another origin."""
+    means, origin = g.means, g.origin
+    if means.dtype == torch.float64 and len(g) and bool(torch.isfinite(means).all()):
+        shift = origin_near(*spread(g))
+        means, origin = means - torch.from_numpy(shift).to(means.device), origin + shift
+    return g.replace(means=means.float(), origin=origin)
+
+
 def flipped(g: Gaussians, signs: tuple[int, int, int]) -> Gaussians:
-    """Gaussians in axes of which some point the other way: means, rotations and SH; no digit changes.
+    """Gaussians in axes of which some point the other way: means, origin, rotations and SH; no digit changes.
 
     Args:
-        g: Their `origin` must be 0.
+        g: The Gaussians.
         signs: 1 or -1 for x, y and z, of product 1 (a half turn) or -1 (a mirror).
     """
     s = np.asarray(signs)
@@ -135,6 +182,7 @@ def flipped(g: Gaussians, signs: tuple[int, int, int]) -> Gaussians:
     x, y, z = (int(v) for v in s)
     return g.replace(
         means=g.means * torch.tensor(signs, dtype=g.means.dtype),
+        origin=g.origin * s + 0.0,  # no -0
         quats=g.quats * torch.tensor([1, y * z, x * z, x * y], dtype=g.quats.dtype),
         sh=g.sh * torch.from_numpy(flips).to(g.sh.dtype)[None, :, None],
     )

@@ -25,6 +25,7 @@ import torch
 
 from drgs import data as data_sets
 from drgs.codecs.folders import nerfstudio_run
+from drgs.codecs.values import recentered
 from drgs.data import Dataset
 from drgs.data.camera_lists import load_cameras_json
 from drgs.data.camera_path import quaternion_of
@@ -287,10 +288,12 @@ def _moved(g: Gaussians, rotation: np.ndarray, translation: np.ndarray, scale: f
     )
     count = g.sh.shape[1]
     turn = torch.linalg.lstsq(sh_basis(directions @ R.T, count), sh_basis(directions, count)).solution
-    means = (scale * g.means.double()) @ R.T + torch.from_numpy(translation)
-    return g.replace(
-        means=means.to(g.means.dtype),
+    places = g.means.double() + torch.from_numpy(g.origin)
+    moved = g.replace(
+        means=(scale * places) @ R.T + torch.from_numpy(translation),
+        origin=np.zeros(3),
         quats=quats.to(g.quats.dtype),
         log_scales=g.log_scales + float(np.log(scale)),
         sh=torch.einsum("kj,njc->nkc", turn, g.sh.double()).to(g.sh.dtype).contiguous(),
     )
+    return recentered(moved)  # the data set may stand far from 0
