@@ -18,7 +18,7 @@ import torch
 
 from drgs.cameras import Camera
 from drgs.cameras.sizes import at_most
-from drgs.data import scene_extent
+from drgs.data.camera_layout import scene_extent, scene_origin
 from drgs.data.resampling import resize_area
 from drgs.ellipsoids import Gaussians
 from drgs.fitting.config import FitConfig
@@ -170,10 +170,11 @@ class OnlineFit:
     def _begin(self, points: np.ndarray, colors: np.ndarray, dense: bool) -> int:
         if not len(points):
             return 0
-        rows = GaussianRows.from_points(
-            torch.from_numpy(points), torch.from_numpy(colors), *self.config.density.start_of(dense)
-        )
-        extent = scene_extent([frame.camera for frame in self._waiting], points)
+        cameras = [frame.camera for frame in self._waiting]
+        origin = scene_origin("Planner", cameras, points)
+        start = torch.from_numpy(points), torch.from_numpy(colors), *self.config.density.start_of(dense)
+        rows = GaussianRows.from_points(*start, origin)
+        extent = scene_extent(cameras, points)
         self.trainer = Trainer(self.config, self._waiting, rows, extent)
         self._waiting = []
         return len(points)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from drgs.cameras.origins import check_origin
 from drgs.codecs.ply import load_ply
 from drgs.data.camera_lists import load_cameras_json
 from drgs.fitting.components.base import Checkpoint
@@ -181,7 +182,7 @@ def load_run(run: Run | str | os.PathLike) -> LoadedRun:
         tensors, header = load_state(run.state)
         check_checkpoint(run.state, tensors, header)
         checkpoint = Checkpoint(tensors, header, str(run.state))
-        gaussians = GaussianRows.from_state(tensors).gaussians().detach()  # for rendering, not to be fitted
+        gaussians = GaussianRows.from_state(tensors, header).gaussians().detach()  # for rendering, not to be fitted
         for component in COMPONENTS.values():
             gaussians = component.load_gaussians(gaussians, checkpoint)
         gaussians.validate(str(run.state))
@@ -253,11 +254,12 @@ def _is_time(value: Any) -> bool:
 def _shows(path: Path, gaussians: Gaussians) -> bool:
     """Whether a PLY holds the same bits, as far as its layout has room for them; a damaged one does not."""
     try:
-        shown = load_ply(path).parameters()
+        shown = load_ply(path)
     except ValueError:
         return False
     held = gaussians.parameters()
-    return all(torch.equal(x, held[name]) for name, x in shown.items())
+    same = np.array_equal(shown.origin, gaussians.origin)
+    return same and all(torch.equal(x, held[name]) for name, x in shown.parameters().items())
 
 
 def is_run(path: Path) -> bool:
@@ -308,6 +310,7 @@ def config_record(
         "size": sorted({(f.camera.width, f.camera.height) for f in frames + held_out}),
         "masks": sorted({kind for frame in frames for kind in _mask_kinds(frame)}),
         "points": source,
+        **({"origin": trainer.rows.origin.tolist()} if trainer.rows.origin.any() else {}),
         **({"frames": list(dataset.frames)} if dataset.frames else {}),
         **({"absent": [view.name for view in dataset.absent]} if dataset.absent else {}),
         "fit": trainer.config.to_json(),
@@ -416,6 +419,7 @@ def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict)
     for component in COMPONENTS.values():
         kind |= {name: x for name, x in component.header_kinds.items() if name in header}
     kind |= {"skybox": int} if "skybox" in header else {}
+    kind |= {"origin": [float]} if "origin" in header else {}
     check_json(str(path), header, kind, advice)
     try:
         FitConfig.from_json(header["config"])
@@ -425,6 +429,7 @@ def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict)
     for name, low in least.items():
         if header.get(name, low) < low:
             raise ValueError(f"{path}: {name} must be >= {low}, got {header[name]}; {advice}")
+    check_origin(f"{path}: origin", header.get("origin", [0.0] * 3))
     skybox = header.get("skybox", 0)
     if skybox and "parameter.means" in tensors and not 0 < skybox < len(tensors["parameter.means"]):
         most = len(tensors["parameter.means"]) - 1

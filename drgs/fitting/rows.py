@@ -10,6 +10,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 
 from drgs.ellipsoids import Y_00, Gaussians
@@ -27,11 +28,13 @@ class GaussianRows:
             (N, D), and any others (N, ...) whose rows shall follow the Gaussians.
         far: How many of the first rows are far away, beyond the scene (a skybox): density control leaves them alone,
             and means over all Gaussians leave them out.
+        origin: (3,) float64 world that means are relative to.
         optimizer: One parameter group a tensor, named as in `tensors`.
     """
 
-    def __init__(self, tensors: dict[str, torch.Tensor]) -> None:
+    def __init__(self, tensors: dict[str, torch.Tensor], origin: np.ndarray | None = None) -> None:
         self.far = 0
+        self.origin = np.zeros(3) if origin is None else origin
         # Leaves of their own: what the caller has is neither changed nor differentiated.
         self.tensors = {name: x.detach().clone().requires_grad_() for name, x in tensors.items()}
         groups = [{"params": [x], "name": name} for name, x in self.tensors.items()]
@@ -40,28 +43,36 @@ class GaussianRows:
 
     @classmethod
     def from_points(
-        cls, points: torch.Tensor, colors: torch.Tensor, opacity: float = 0.1, scale: float = 1.0
+        cls,
+        points: torch.Tensor,
+        colors: torch.Tensor,
+        opacity: float = 0.1,
+        scale: float = 1.0,
+        origin: np.ndarray | None = None,
     ) -> GaussianRows:
         """One isotropic Gaussian a point, as wide as the points around it are far apart.
 
         Args:
-            points: (N, 3) world.
+            points: (N, 3) world; far from 0 in float64.
             colors: (N, 3) in [0, 1].
             opacity: Opacity of all of them.
             scale: Times the root of the mean squared distance to the three nearest points.
+            origin: (3,) world that means are relative to; None for 0.
         """
         n = len(points)
+        means = points if origin is None else points.double() - torch.from_numpy(origin)
         quats = torch.zeros(n, 4)
         quats[:, 0] = 1
         return cls(
             {
-                "means": points.float(),
+                "means": means.float(),
                 "quats": quats,
                 "log_scales": (scale * _spacing(points)).log().float()[:, None].repeat(1, 3),
                 "logit_opacities": torch.full((n,), math.log(opacity / (1 - opacity))),
                 "sh_dc": ((colors.float() - 0.5) * (1 / Y_00))[:, None, :],
                 "sh_rest": torch.zeros(n, 0, 3),
-            }
+            },
+            origin,
         )
 
     def __len__(self) -> int:
@@ -76,7 +87,12 @@ class GaussianRows:
         """The Gaussians; gradients reach `tensors`."""
         t = self.tensors
         sh = torch.cat([t["sh_dc"], t["sh_rest"]], dim=1) if self.sh_degree else t["sh_dc"]
-        return Gaussians(t["means"], t["quats"], t["log_scales"], t["logit_opacities"], sh, t.get("features"))
+        features = t.get("features")
+        return Gaussians(t["means"], t["quats"], t["log_scales"], t["logit_opacities"], sh, features, self.origin)
+
+    def places(self) -> torch.Tensor:
+        """(N, 3) float64 means in the world, values without a graph."""
+        return self.tensors["means"].detach().double() + torch.from_numpy(self.origin)  # measured, not optimized
 
     def set_rates(self, rates: dict[str, float]) -> None:
         """Learning rates by tensor name."""
@@ -146,19 +162,22 @@ class GaussianRows:
 
     def header(self) -> dict:
         """What a checkpoint's header says of the rows."""
-        return {"skybox": self.far} if self.far else {}
+        origin = {"origin": self.origin.tolist()} if self.origin.any() else {}
+        return ({"skybox": self.far} if self.far else {}) | origin
 
     @classmethod
     def from_state(cls, state: dict[str, torch.Tensor], header: Mapping[str, Any] | None = None) -> GaussianRows:
         """The inverse of `state` and `header`; other keys are ignored."""
         prefix = "parameter."
-        rows = cls({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+        header = header or {}
+        origin = np.array(header.get("origin", [0.0] * 3), np.float64)
+        rows = cls({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}, origin)
         for name, x in rows.tensors.items():
             prefix = f"adam.{name}."
             moments = {k.removeprefix(prefix): v.clone() for k, v in state.items() if k.startswith(prefix)}
             if moments:
                 rows.optimizer.state[x] = moments
-        rows.far = (header or {}).get("skybox", 0)
+        rows.far = header.get("skybox", 0)
         return rows
 
     def _moments(self, name: str) -> list[torch.Tensor]:
@@ -184,7 +203,6 @@ class GaussianRows:
 def _spacing(points: torch.Tensor) -> torch.Tensor:
     """(N,) root of the mean squared distance to the three nearest other points, at least 1e-3 of the median."""
     import cv2
-    import numpy as np
 
     n = len(points)
     if n < 2:

@@ -46,7 +46,7 @@ def start(setup: Setup, begin: Path | None = None) -> tuple[Trainer, str]:
         with Bar("Gaussians of the earlier fit") as bar:
             rows, source = begin_with(begin, setup.frames, dataset.points, dataset.colors, config)
             bar.note(f"begins with {source}")
-        setup.points = rows.tensors["means"].detach()[rows.far :].numpy()  # places that are compared, no gradient
+        setup.points = rows.places()[rows.far :].numpy()
     extent = scene_extent([frame.camera for frame in setup.frames], setup.points)
     return Trainer(config, setup.frames, rows, extent, list(setup.components), setup), source
 
@@ -84,7 +84,8 @@ def _rows_at_points(setup: Setup) -> tuple[GaussianRows, str]:
     _log.info("%d initial points: %s", len(points), source)
     dense = not given and any(view.depth_path is not None for view in setup.views)
     kind = config.density.start_of(dense)
-    return GaussianRows.from_points(torch.from_numpy(points), torch.from_numpy(colors), *kind), source
+    made = GaussianRows.from_points(torch.from_numpy(points), torch.from_numpy(colors), *kind, dataset.origin)
+    return made, source
 
 
 def _warn_of_masks(setup: Setup) -> None:
@@ -149,7 +150,7 @@ def begin_with(
         raise ValueError(
             f"{checkpoint}: a fit must go on from Gaussians with colors alone, these have {other[0]}; fit anew"
         )
-    rows = GaussianRows(old.tensors)
+    rows = GaussianRows(old.tensors, old.origin)
     rows.far = old.far
     before = len(rows)
     new = [frame for frame in frames if frame.name not in header["views"]]
@@ -159,7 +160,8 @@ def begin_with(
         shown = np.sort(np.random.default_rng(config.seed).permutation(shown)[:room])
         if len(shown):
             chosen = torch.from_numpy(points[shown]), torch.from_numpy(colors[shown])
-            more = GaussianRows.from_points(*chosen, *config.density.start_of(False)).take(torch.arange(len(shown)))
+            made = GaussianRows.from_points(*chosen, *config.density.start_of(False), rows.origin)
+            more = made.take(torch.arange(len(shown)))
             del more["sh_rest"]  # 0 up to the degree that the others have
             rows.append(more)
     source = f"{before} Gaussians of an earlier fit, and {len(rows) - before} points that new photographs show"

@@ -178,7 +178,8 @@ class Trainer:
 
     def add_points(self, points: torch.Tensor, colors: torch.Tensor, opacity: float, scale: float) -> None:
         """Add Gaussians at points, as `GaussianRows.from_points` makes them; those that are there stay as they are."""
-        new = GaussianRows.from_points(points, colors, opacity, scale).take(torch.arange(len(points)))
+        rows = GaussianRows.from_points(points, colors, opacity, scale, self.rows.origin)
+        new = rows.take(torch.arange(len(points)))
         del new["sh_rest"]  # 0 up to the degree that the others have
         for component in self.components:
             new |= component.new_rows(self, len(points))
@@ -188,7 +189,8 @@ class Trainer:
     def restart(self, points: torch.Tensor, colors: torch.Tensor) -> None:
         """Begin again with Gaussians at other points; schedules, networks and photographs stay as they are."""
         degree = self.rows.sh_degree
-        self.rows = GaussianRows.from_points(points, colors, *self.config.density.start_of(False))
+        origin = self.rows.origin
+        self.rows = GaussianRows.from_points(points, colors, *self.config.density.start_of(False), origin)
         for component in self.components:
             component.restart(self)
         self.terms = terms_of(self.config, self.extent)

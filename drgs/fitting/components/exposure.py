@@ -556,7 +556,7 @@ def _trial(fit: Fit, views: list[View], estimate: ExposureEstimate) -> float:
     errors = []
     with Bar("whether exposure is of use", 2 * short.max_steps) as bar:
         for use in (False, True):
-            few = GaussianRows.from_points(begin.means[kept], colors, *short.density.start_of(False))
+            few = GaussianRows.from_points(rows.places()[kept], colors, *short.density.start_of(False), rows.origin)
             seen = [frames[row] for row in rest]
             component = ExposureComponent()
             if use:

@@ -59,13 +59,13 @@ class Filter3D(torch.nn.Module):
         """Take the sampling rates anew, after Gaussians have come or gone.
 
         Args:
-            means: (N, 3) world; nothing is differentiated through them.
+            means: (N, 3) float64 world, without a graph.
             cameras: Those of the photographs, of the size at which these are fitted.
             far: How many of the first means are far away.
         """
         # A rate is a maximum over cameras of what changes little from step to step: constant in between, and after the
         # last density control.
-        rates = sampling_rates(means.detach().double().cpu().numpy(), cameras)
+        rates = sampling_rates(means.cpu().numpy(), cameras)
         seen = rates[far:][rates[far:] > 0]
         # Nothing shows what no camera sees: it gets the filter of the most coarsely sampled of the others [1, code].
         lowest = seen.min() if len(seen) else np.inf
@@ -155,7 +155,7 @@ class Filter3DComponent(Component):
         if fit.config.filter_3d == "on":
             self.filter = self.filter or Filter3D()
             cameras = [frame.camera for frame in fit.photographs()]
-            self.filter.sample(fit.rows.tensors["means"], cameras, fit.rows.far)
+            self.filter.sample(fit.rows.places(), cameras, fit.rows.far)
 
     def gaussians(self, gaussians: Gaussians) -> Gaussians:
         """See `Component`."""

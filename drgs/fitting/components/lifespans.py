@@ -404,7 +404,7 @@ class NewGaussians(NamedTuple):
     """M places where something is at a time.
 
     Attributes:
-        points: (M, 3) world.
+        points: (M, 3), relative to the origin of the Gaussians beside which they were found.
         colors: (M, 3) in [0, 1].
         times: (M,) times at which something is there.
         velocities: (M, 3) world units in a unit of time.
@@ -439,7 +439,7 @@ class _Comparison:
     """A photograph beside its rendering.
 
     Attributes:
-        camera: Pinhole of its size.
+        camera: Pinhole of its size, relative to the origin of the Gaussians, as all that is compared.
         time: Time at which it was taken.
         maps: (4, H, W): RGB of the photograph, and where it shows something else, in [0, 1].
         distance: (H, W) to what is rendered; infinite where rays end in nothing.
@@ -492,14 +492,15 @@ def find_new_gaussians(
         shown: What a photograph shows of a rendering; None: the rendering.
         search: How they are searched for.
     """
-    means = scene.at(frames[0].camera.time).means.detach()  # how far things are is a constant
-    places = torch.from_numpy(np.stack([frame.camera.center for frame in frames])).to(means)
+    beside = scene.at(frames[0].camera.time)
+    means = beside.means.detach()  # how far things are is a constant
+    places = torch.from_numpy(np.stack([frame.camera.center - beside.origin for frame in frames])).to(means)
     far = float(torch.cdist(places, means).quantile(search.far, dim=1).max())
     comparisons = []
     background = _backgrounds(frames, search)
     with Bar("looking for what moves", (1 + search.iterations) * len(frames)) as bar:
         for frame, still in zip(frames, background, strict=True):
-            comparisons.append(_compared(frame, still, scene, settings, generator, shown, search))
+            comparisons.append(_compared(frame, still, scene, beside.origin, settings, generator, shown, search))
             bar.advance()
         times = np.array([comparison.time for comparison in comparisons])
         step = spacing([comparison.time for comparison in comparisons])
@@ -600,6 +601,7 @@ def _compared(
     frame: Frame,
     background: torch.Tensor | None,
     scene: Scene,
+    origin: np.ndarray,
     settings: RenderSettings,
     generator: torch.Generator,
     shown: Callable[[Output, Frame], Output] | None,
@@ -633,8 +635,9 @@ def _compared(
     if len(where):
         where = where[torch.randperm(len(where), generator=generator)[: search.samples]]
     rows, columns = where[:, 0], where[:, 1]
+    moved = camera.relative_to(origin)
     return _Comparison(
-        camera=camera,
+        camera=moved,
         time=camera.time,
         maps=torch.cat([image, other.float()[None]]),
         distance=distance,
@@ -642,7 +645,7 @@ def _compared(
         rays=rays[rows, columns],
         colors=image[:, rows, columns].T.contiguous(),
         share=float(other.float().mean()),
-        center=torch.from_numpy(camera.center).float(),
+        center=torch.from_numpy(moved.center).float(),
         depth=torch.zeros(len(where)),
         velocity=torch.zeros(len(where), 3),
         score=torch.zeros(len(where)),

@@ -135,9 +135,8 @@ class MotionComponent(Component):
             rows: Get gates.
             extent: Extent of the scene, in world units.
         """
-        means = rows.tensors["means"].detach().double()  # where the field lies is a constant
         ends = torch.tensor([_OUTSIDE_SHARE, 1 - _OUTSIDE_SHARE], dtype=torch.float64)
-        bounds = torch.quantile(means, ends, dim=0)
+        bounds = torch.quantile(rows.places(), ends, dim=0)
         margin = _MARGIN * (bounds[1] - bounds[0])
         rows.add_tensor("motion", torch.full((len(rows),), _OPEN_LOGIT))
         # Cameras may stand far from what they film, and what they film may reach to the horizon.

@@ -187,7 +187,7 @@ class Poses(torch.nn.Module):
         """W of a photograph, and what its pose moves its picture by; arguments as of `begin`."""
         camera = self._cameras[row]
         # A metric of steps, not part of the loss.
-        means = gaussians.means[far:].detach().cpu().double()
+        means = gaussians.means[far:].detach().cpu().double() + torch.from_numpy(gaussians.origin)
         opacities = gaussians.logit_opacities[far:].detach().cpu().double().sigmoid()
         tangents = {"camera": self._twist_of[row].T.contiguous()}
         small = at_most(camera, _INFORMATION_PIXELS)

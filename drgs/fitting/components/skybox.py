@@ -136,13 +136,13 @@ class Skybox:
     def __len__(self) -> int:
         return len(self.means)
 
-    def rows(self) -> dict[str, torch.Tensor]:
-        """Rows for `GaussianRows`."""
+    def rows(self, origin: np.ndarray | None = None) -> dict[str, torch.Tensor]:
+        """Rows for `GaussianRows`, whose means are relative to `origin` (3,); None for 0."""
         count = len(self)
         quats = torch.zeros(count, 4)
         quats[:, 0] = 1
         return {
-            "means": torch.from_numpy(self.means).float(),
+            "means": torch.from_numpy(self.means if origin is None else self.means - origin).float(),
             "quats": quats,
             "log_scales": torch.from_numpy(self.scales).log().float()[:, None].repeat(1, 3),
             "logit_opacities": torch.full((count,), math.log(_OPACITY / (1 - _OPACITY))),
@@ -413,7 +413,7 @@ class SkyboxComponent(Component):
             with Bar("colors of the skybox"):
                 skybox = Skybox.around(fit.frames, fit.extent, self._count, fit.config.seed)
             _log.info("skybox: %d Gaussians, %.4g and more away", len(skybox), RADIUS * fit.extent)
-            fit.rows.add_far(skybox.rows())
+            fit.rows.add_far(skybox.rows(fit.rows.origin))
 
     def record(self, fit: Fit, before: Mapping[str, Any]) -> dict[str, Any]:
         """See `Component`."""
