@@ -313,7 +313,8 @@ def test_spz_says_what_it_cannot_hold(tmp_path, rng, caplog):
     )
     save_gaussians(far, tmp_path / "c.glb")
     back = load_gaussians(tmp_path / "c.glb")
-    assert back.means.tolist() == [[1.0, 1.0, 1.0]] and back.origin.tolist() == [7.0, 7.0, 7.0]
+    assert back.means.tolist() == [[1.0, 1.0, 1.0]]
+    assert back.origin.tolist() == [7.0, 7.0, 7.0]
 
 
 def test_activations_beyond_what_a_format_holds(tmp_path):

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera
+from drgs.cameras.origins import rounding
 from drgs.data.colmap import find_model
 from drgs.data.colmap_model import model_camera, model_points, read_model
 from drgs.data.dataset import Dataset
@@ -28,7 +29,7 @@ __all__ = ["CAMERA_FOLDERS", "add_model_points", "frame_folders", "frames_of", "
 _NUMBER = re.compile(r"(?<!\d)(\d{1,20})$")  # at the end of a name
 _MODEL = "sparse_"  # where 4DGaussians has it
 _SAME_POSE = 1e-2  # of the cameras' extent, and between the axes
-_ROUNDING = 1e-6  # of coordinates in text; one camera alone has no extent
+_ROUNDING = 1e-6  # of coordinates in text, scene units; one camera alone has no extent
 
 _log = logging.getLogger(__name__)
 
@@ -149,8 +150,8 @@ def _extent(cameras: Iterable[Camera]) -> float:
 def _same_pose(a: Camera, b: Camera, extent: float) -> bool:
     """Whether two cameras, of several that are spread over `extent`, have one pose, but for errors of its estimate."""
     moved = np.linalg.norm(a.center - b.center)
-    rounding = _ROUNDING * max(1.0, float(np.abs(a.center).max()))
-    return moved <= _SAME_POSE * extent + rounding and np.abs(a.c2w[:3, :3] - b.c2w[:3, :3]).max() <= _SAME_POSE
+    text = max(_ROUNDING, rounding(a.center))
+    return moved <= _SAME_POSE * extent + text and np.abs(a.c2w[:3, :3] - b.c2w[:3, :3]).max() <= _SAME_POSE
 
 
 def _check_still(model: Path, reconstruction: Any, images: dict[str, list[tuple[int, Camera]]]) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.codecs.ply_headers import ply_source
+from drgs.codecs.ply_headers import ply_offset, ply_source
 from drgs.io.foreign import is_file, refuse_foreign
 
 __all__ = ["read_point_ply"]
@@ -21,12 +21,12 @@ _PLY_BYTES = {
 
 
 def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Points (P,3) float64 and colors (P,3) float32 of a PLY point cloud; gray where it has no
-    colors.
+    """Points (P,3) float64 world and colors (P,3) float32 of a PLY point cloud; gray where it has no colors. The offset
+    of a line `comment offset X Y Z` is added.
 
     Raises:
         FileNotFoundError: No such file.
-        ValueError: No PLY with x, y, z, shorter than it claims, or not finite.
+        ValueError: No PLY with x, y, z, shorter than it claims, or points or the offset are not finite.
     """
     if not is_file(path):
         raise FileNotFoundError(f"{path}: must be a PLY point cloud, found none; restore it or drop ply_file_path")
@@ -51,7 +51,8 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(bad):
         raise ValueError(f"{path}: points must be finite, got NaN or Inf at index {bad[0]}; export it again")
-    return points, colors
+    offset = ply_offset(path)
+    return points if offset is None else points + offset, colors
 
 
 def _check_ply_size(path: Path) -> None:

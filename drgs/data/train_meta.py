@@ -15,7 +15,7 @@ import numpy as np
 
 from drgs.cameras import Camera
 from drgs.cameras.checks import check_distance
-from drgs.data.camera_layout import Focus
+from drgs.data.camera_layout import Focus, scene_origin
 from drgs.data.checks import file_inside, read_npz, repaired_pose
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
@@ -178,4 +178,5 @@ def _visible_share(cameras: list[Camera], points: np.ndarray | None) -> float:
         return 0.0
     # Matrices read the wrong way round may put all cameras into the place that they look at.
     distances = np.linalg.norm(focus.eyes - focus.center, axis=1)
-    return float((distances > 1e-3 * max(1.0, float(np.abs(focus.center).max()))).sum() / len(cameras))
+    size = np.abs(focus.center - scene_origin("train_meta", cameras)).max()
+    return float((distances > 1e-3 * max(1.0, float(size))).sum() / len(cameras))
