@@ -123,9 +123,11 @@ def test_a_world_that_float64_cannot_hold_is_refused(tmp_path):
 
 
 def test_a_camera_relative_to_an_origin_sees_what_it_saw():
-    """Points less the origin are projected where the points were; with a rolling shutter, too."""
+    """Points less the origin are projected where the points were; with a rolling shutter of a camera that only moves,
+    too.
+    """
     pose = drgs.cameras.look_at(UTM + (3, 0, 1), UTM)
-    end = drgs.cameras.look_at(UTM + (3, 0.2, 1), UTM)
+    end = drgs.cameras.look_at(UTM + (3, 0.2, 1), UTM + (0, 0.2, 0))
     K = drgs.cameras.intrinsics(40.0, 40.0, 16.0, 16.0)
     still = drgs.Camera(K, pose, 32, 32)
     rolling = dataclasses.replace(still, shutter="rolling_top_to_bottom", w2c_end=end)

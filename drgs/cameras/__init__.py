@@ -201,7 +201,10 @@ class Camera:
         return dataclasses.replace(self, model="pinhole", distortion=())
 
     def relative_to(self, origin: np.ndarray) -> Camera:
-        """The same camera in a world whose 0 is `origin` (3,), as means of Gaussians are; itself if that is 0."""
+        """The same camera in a world whose 0 is `origin` (3,), as means of Gaussians are; itself if that is 0.
+
+        A rolling shutter has the same poses at its first and its last line (between them: shutters.py).
+        """
         if not np.any(origin):
             return self
         poses: dict[str, Any] = {}

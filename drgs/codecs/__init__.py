@@ -28,7 +28,7 @@ from drgs.checks.arguments import ArgumentError, check_path
 from drgs.checks.registry import Registry
 from drgs.codecs.codec import Codec
 from drgs.codecs.folders import file_of_folder
-from drgs.codecs.ply import load_ply, save_ply
+from drgs.codecs.ply import load_ply, note_offset, save_ply
 from drgs.io.foreign import refuse_foreign
 from drgs.io.outputs import atomic_write
 
@@ -157,7 +157,7 @@ def save_gaussians(
 
         g = recentered(g)
         save_ply(g, path, extra=extra, comments=comments)
-        _note_origin(path, g.origin, "which its header states")
+        note_offset(path, g.origin)
         return
     if extra:
         raise ValueError(f"save_gaussians: {', '.join(extra)} must go into a .ply, {suffix} has no room for them")
@@ -176,7 +176,7 @@ def save_gaussians(
         with atomic_write(beside) as file:
             file.write(f"{origin_text(plain.origin)}\n".encode())
     where = "which it states" if codec.keeps_origin else f"which {suffix} has no room for: {beside.name} states it"
-    _note_origin(path, plain.origin, where)
+    note_offset(path, plain.origin, where)
 
 
 def origin_file(path: Path) -> Path:
@@ -194,12 +194,6 @@ def _with_origin_beside(path: Path, g: Gaussians) -> Gaussians:
     with beside.open("rb") as file:
         text = file.read(_OFFSET_BYTES).decode("utf-8", "replace").strip()
     return g.replace(origin=origin_of_text(str(beside), text))
-
-
-def _note_origin(path: Path, origin: np.ndarray, where: str) -> None:
-    """Say in the log that positions in a file are relative to an offset."""
-    if origin.any():
-        _log.info("%s: positions are relative to the offset %s, %s", path, origin_text(origin), where)
 
 
 def check_suffix(where: str, path: Path) -> str:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["load_ply", "note_antialiased", "save_ply"]
+__all__ = ["load_ply", "note_antialiased", "note_offset", "save_ply"]
 
 _log = logging.getLogger(__name__)
 
@@ -119,6 +119,12 @@ def note_antialiased(path: Path) -> None:
         "gsplat and inria; files that are written of it do not say what it was",
         path,
     )
+
+
+def note_offset(path: Path, origin: np.ndarray, where: str = "which its header states") -> None:
+    """Say in the log that positions of a file that was written are relative to an offset, and `where` that is said."""
+    if origin.any():
+        _log.info("%s: positions are relative to the offset %s, %s", path, origin_text(origin), where)
 
 
 def _finite_logits(path: Path, logits: torch.Tensor) -> torch.Tensor:

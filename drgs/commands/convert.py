@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.codecs import check_suffix, load_gaussians, save_gaussians
+from drgs.codecs import check_suffix, load_gaussians, origin_file, save_gaussians
 from drgs.commands.scene_input import SceneInput
 from drgs.display.progress import Bar
 from drgs.gain import Prior, check, variances
@@ -31,7 +31,8 @@ def run(args: Convert) -> None:
             f"{wanted[0]} must have a .ply to write to, {suffix} has no room for columns; convert to a .ply"
         )
     prior = Prior(args.prior)
-    with lock_folder(args.out.parent, "convert", [args.out.name], [args.scene, args.uncertainty or ""]):
+    names = [args.out.name, origin_file(args.out).name]
+    with lock_folder(args.out.parent, "convert", names, [args.scene, args.uncertainty or ""]):
         with Bar("reading", show=not args.quiet):
             given = _given(args)
         g = still(args, given)

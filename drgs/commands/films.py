@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.cameras import Camera, intrinsics
-from drgs.codecs.ply import save_ply
+from drgs.codecs.ply import note_offset, save_ply
 from drgs.commands.viewpoints import frame_size
 from drgs.data.camera_layout import level_frame, upright
 from drgs.data.camera_path import read_camera_path
@@ -297,4 +297,5 @@ def write_plys(scene: Scene, cameras: list[Camera], folder: Path, moving: bool, 
             save_ply(seen, folder / name)
             written.append({"file": name, "time": time, "gaussians": len(seen)})
             bar.advance()
+    note_offset(folder, seen.origin, "which headers state")
     return written

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from drgs.cameras.sizes import at_most
-from drgs.codecs.ply import save_ply
+from drgs.codecs import save_gaussians
 from drgs.commands.orbits import OrbitShape
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.semantic_pictures import OPAQUE
@@ -70,7 +70,7 @@ def run(args: Query) -> None:
         for camera, name in zip(cameras, names, strict=True):
             views.append(_view(g, camera, settings, query, decoder, args.output, name))
             bar.advance()
-    save_ply(kept, args.output / ply)
+    save_gaussians(kept, args.output / ply)
     report = {
         "schema": SCHEMA,
         "command": "query",
