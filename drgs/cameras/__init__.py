@@ -203,15 +203,14 @@ class Camera:
     def relative_to(self, origin: np.ndarray) -> Camera:
         """The same camera in a world whose 0 is `origin` (3,), as means of Gaussians are; itself if that is 0.
 
-        A rolling shutter has the same poses at its first and its last line (between them: shutters.py).
+        A rolling shutter has the same poses at its first and its last line (between them: shutters.py). Gradients of a
+        pose that is a tensor pass.
         """
-        if not np.any(origin):
+        origin = np.asarray(origin, np.float64)
+        if not origin.any():
             return self
-        poses: dict[str, Any] = {}
-        for name in ("w2c", *(["w2c_end"] if self.is_rolling else [])):
-            rotation, translation = self._rigid(name)
-            poses[name] = _homogeneous(rotation, translation + rotation @ np.asarray(origin, np.float64))
-        return dataclasses.replace(self, **poses)
+        poses = ("w2c", "w2c_end") if self.is_rolling else ("w2c",)
+        return dataclasses.replace(self, **{name: _relative(getattr(self, name), origin) for name in poses})
 
     def pixel_directions(self) -> np.ndarray:
         """(H,W,3) float64 unit world directions through the pixel centers, lens and shutter included.
@@ -379,6 +378,16 @@ def _homogeneous(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
     pose[:3, :3] = rotation
     pose[:3, 3] = translation
     return pose
+
+
+def _relative(pose: Any, origin: np.ndarray) -> Any:
+    """(4,4) of the pose that takes x where `pose` takes x + origin; in float64, for far from 0 the two cancel."""
+    if is_tensor(pose):
+        pose = pose.double()
+        shift, last = pose.new_tensor(origin.tolist()), pose.new_tensor([0.0, 0.0, 0.0, 1.0])
+    else:
+        shift, last = origin, np.array([0.0, 0.0, 0.0, 1.0])
+    return pose + (pose[:, :3] @ shift)[:, None] * last
 
 
 def rigid(w2c: Any) -> tuple[Any, Any]:
