@@ -252,11 +252,14 @@ def camera_rays(cam: Any, rotation: torch.Tensor) -> tuple[torch.Tensor, torch.T
     return torch.stack([u, v], dim=-1), local
 
 
-def rolling_poses(cam: Any) -> tuple[torch.Tensor, torch.Tensor]:
+def rolling_poses(cam: Any, origin: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
     """Rotation (P, 3, 3) and translation (P, 3) of w2c for each pixel of a rolling shutter, and, last, in the middle of
-    the exposure: rotations by slerp of unit quaternions, translations linearly (shutters.py).
+    the exposure: rotations by slerp of unit quaternions, translations linearly (shutters.py). Of a world whose 0 is
+    `origin` (3,), by default the camera's.
     """
     (R0, t0), (R1, t1) = (rigid(float64(pose)) for pose in (cam.w2c, cam.w2c_end))
+    if origin is not None:
+        t0, t1 = t0 + R0 @ origin, t1 + R1 @ origin
     row, column = torch.meshgrid(
         *(torch.arange(n, dtype=torch.float64) for n in (cam.height, cam.width)), indexing="ij"
     )
@@ -348,9 +351,9 @@ def view_rays(g: Any, cam: Any, rays: Sequence | None, window: Sequence[int] | N
     center: torch.Tensor | Any = None
     rolling = cam is not None and getattr(cam, "shutter", "global") != "global"
     if rolling:
-        turns, translations = rolling_poses(cam)
+        turns, translations = rolling_poses(cam, offset)
         rotation = turns[-1]
-        center = -rotation.T @ translations[-1] - offset
+        center = -rotation.T @ translations[-1]
     elif cam is not None:
         rotation, translation = rigid(float64(cam.w2c))
         center = -rotation.T @ translation - offset
@@ -358,7 +361,7 @@ def view_rays(g: Any, cam: Any, rays: Sequence | None, window: Sequence[int] | N
         pixels, local = camera_rays(cam, rigid(float64(cam.w2c))[0])
         if rolling:
             directions = torch.einsum("pj,pjk->pk", local, turns[:-1])
-            origins = -torch.einsum("pj,pjk->pk", translations[:-1], turns[:-1]) - offset
+            origins = -torch.einsum("pj,pjk->pk", translations[:-1], turns[:-1])
         else:
             directions = local @ rotation
             origins = center.expand_as(directions)

@@ -231,7 +231,7 @@ def _unscented(scene: OracleScene, cam: Any, view: OracleRays, offset: Tensor, t
         pixels = local[:, :2] / local[:, 2:] @ scale.T + shift
         seen = local[:, 2] > 0
     else:
-        pixels, z = (torch.from_numpy(x) for x in cam.project((points + offset).numpy()))
+        pixels, z = (torch.from_numpy(x) for x in cam.relative_to(offset.numpy()).project(points.numpy()))
         seen = torch.isfinite(pixels).all(-1) & ((z > 0) | (cam.model != "pinhole"))
     pixels = torch.where(seen[:, None], pixels, 0.0).reshape(-1, 7, 2)
     size = torch.tensor([cam.width, cam.height], dtype=torch.float64)

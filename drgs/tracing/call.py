@@ -96,6 +96,7 @@ class Call:
         motion: How rays move with the lens, if derivatives by it are wanted.
         free: Pixels have rays without a common origin.
         origin: (3,) float64, what was taken off the world: x_world = x + origin.
+        zero: (3,) float64, the Gaussians' own origin, about which a rolling shutter's poses are interpolated.
     """
 
     def __init__(
@@ -132,6 +133,7 @@ class Call:
         self._check_memory(gaussians, rays)
         gaussians.validate("render")
         self.device = gaussians.means.device
+        self.zero = torch.from_numpy(np.array(gaussians.origin, np.float64))
         middle = None
         if (settings.traversal == "bvh" or self.free) and gaussians.means.dtype == torch.float64 and len(gaussians):
             # World records are float32, so a world far from 0 is moved there; where to has no derivative.
@@ -242,7 +244,7 @@ class Call:
         if self.pixel_rays is None:
             local_rays, known = self._local_rays_and_mask()
             ends = start, rigid_pose(camera, "w2c_end")
-            pose, o, d = rolling_view(camera, *ends, local_rays if local is None else local)
+            pose, o, d = rolling_view(camera, *ends, local_rays if local is None else local, self.zero)
         else:
             pose = start
             o, d, known = checked_pixel_rays(self.pixel_rays, camera)
@@ -297,7 +299,8 @@ class Call:
             lens = self.table or lens_of(lib, self.camera, TILE)
             cull = None
             if s.culling == "ut":
-                cull = lambda g: unscented_boxes(lib, g, self.camera, self.origin)  # noqa: E731
+                seen_by = self.camera.relative_to(self.zero.numpy())
+                cull = lambda g: unscented_boxes(lib, g, seen_by, self.origin - self.zero)  # noqa: E731
             given = lib, p, p["w2c"]
             if self.table is not None:
                 screen = Screen(pinhole, *size, None, None, lens)

@@ -6,6 +6,7 @@ import torch
 
 from drgs.cameras import Camera
 from drgs.cameras.shutters import BY_COLUMN, line_times
+from drgs.tracing.pose import shifted
 
 __all__ = ["middle_pose", "rolling_view"]
 
@@ -13,7 +14,7 @@ _SERIES_BELOW = 1e-6  # of a squared sine or angle, below which series replace q
 
 
 def rolling_view(
-    camera: Camera, start: torch.Tensor, end: torch.Tensor, local: torch.Tensor
+    camera: Camera, start: torch.Tensor, end: torch.Tensor, local: torch.Tensor, zero: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """The pose in the middle of the exposure, (3, 4), whose depths count, and origins and unit directions (P, 3) of all
     pixels, in the world.
@@ -22,7 +23,9 @@ def rolling_view(
         camera: Says which way lines are exposed, and the size of its image.
         start, end: (3, 4) world-to-camera matrices of the first and of the last line; differentiable.
         local: (P, 3) unit directions in camera axes; differentiable.
+        zero: (3,) the Gaussians' origin, where translations are 0: those between two poses depend on where that is.
     """
+    start, end = (shifted(pose, zero).reshape(3, 4) for pose in (start, end))
     times = torch.from_numpy(line_times(camera.shutter, camera.width, camera.height).copy())
     every = _poses(start, end, torch.cat([times, times.new_tensor([0.5])]))
     poses, middle = every[:-1], every[-1]
@@ -35,7 +38,7 @@ def rolling_view(
     else:
         directions = torch.einsum("hwj,hjk->hwk", image, turns)
         origins = centers[:, None].expand_as(directions)
-    return middle, origins.reshape(-1, 3), directions.reshape(-1, 3)
+    return shifted(middle, -zero).reshape(3, 4), origins.reshape(-1, 3) + zero, directions.reshape(-1, 3)
 
 
 def middle_pose(start: torch.Tensor, end: torch.Tensor) -> torch.Tensor:

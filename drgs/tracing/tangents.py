@@ -120,7 +120,7 @@ def _free_column(call: Call, given: dict) -> dict:
 
     def view(start: torch.Tensor, end: torch.Tensor, lens: torch.Tensor) -> tuple[torch.Tensor, ...]:
         local = call.motion.directions(lens) if "lens" in given else call.local_directions()
-        pose, o, d = rolling_view(camera, start, end, local)
+        pose, o, d = rolling_view(camera, start, end, local, call.zero)
         return shifted(pose, call.origin), o - call.origin, d
 
     twists = [

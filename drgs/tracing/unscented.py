@@ -62,7 +62,7 @@ def unscented_boxes(lib: Lib, g: Activated, camera: Camera, origin: torch.Tensor
         lib: Dr.Jit types of the backend.
         g: Gaussians, in the axes of the camera.
         camera: Its lens and shutter are followed.
-        origin: (3,) what was taken off the world.
+        origin: (3,) what was taken off the camera's world.
     """
     F = lib.Float64
     points = _pixels(lib, g, camera, origin)
