@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["FAR", "check_origin", "origin_near", "origin_of_text", "origin_text", "rounding"]
+__all__ = ["FAR", "check_origin", "decimals", "origin_near", "origin_of_text", "origin_text", "rounding"]
 
 FAR = 10.0
 """Extents of a scene that its middle may be from 0 with an origin of 0: float32 rounds by 6e-7 of the extent there,
@@ -79,3 +79,10 @@ def check_origin(where: str, values: Any) -> np.ndarray:
 def rounding(coordinates: np.ndarray) -> float:
     """Difference between coordinates of any shape that may come of rounding alone, in files and in inverse matrices."""
     return max(1e-9, 1e-12 * float(np.abs(coordinates).max(initial=0.0)))
+
+
+def decimals(coordinates: np.ndarray) -> int:
+    """Decimals that coordinates of any shape are rounded to so that those are equal which differ by `rounding` alone: 9
+    near 0, 5 at millions.
+    """
+    return -math.ceil(math.log10(rounding(coordinates)))

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import torch
 
+from drgs.cameras.origins import decimals
 from drgs.cameras.sizes import at_most
 from drgs.ellipsoids import colors_only
 from drgs.information.complement import remaining
@@ -102,7 +103,8 @@ def backdrop_sphere(
     # Of the cameras, not of their order, which the last bits of a running sum depend on.
     center = np.array([math.fsum(along) / len(cameras) for along in centers.T.tolist()])
     if len(cameras) > _DEPTH_VIEWS:
-        in_order = sorted(cameras, key=_place)
+        digits = decimals(centers)
+        in_order = sorted(cameras, key=lambda camera: _place(camera, digits))
         cameras = [in_order[i * len(cameras) // _DEPTH_VIEWS] for i in range(_DEPTH_VIEWS)]
     quantity = SurfaceDepths()
     if compute is not None:
@@ -117,9 +119,12 @@ def backdrop_sphere(
     return Sphere((float(center[0]), float(center[1]), float(center[2])), radius)
 
 
-def _place(camera: Camera) -> tuple[list, list, float]:
-    """Where a camera is, which way it looks, and its time: no two orders of the same cameras are sorted differently."""
-    return camera.center.tolist(), camera.w2c.tolist(), -math.inf if camera.time is None else camera.time
+def _place(camera: Camera, digits: int) -> tuple[list, list, float]:
+    """Where a camera is, to so many decimals, which way it looks, and its time: no two orders of the same cameras are
+    sorted differently.
+    """
+    place = (camera.center.round(digits) + 0.0).tolist()  # + 0.0: -0 and 0 are equal
+    return place, camera.w2c.tolist(), -math.inf if camera.time is None else camera.time
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.cameras import Camera
+from drgs.cameras.origins import decimals, rounding
 from drgs.checks.arguments import ArgumentError, kind_of
 
 if TYPE_CHECKING:
@@ -99,12 +100,13 @@ class _Bounds:
     def hold(self, camera: Camera, start: Camera) -> bool:
         """Whether a camera keeps them; a candidate outside of the box may stay outside, not go further out."""
         beyond = lambda x: np.maximum(np.maximum(self.low - x, x - self.high), 0).max()  # noqa: E731
-        if beyond(camera.center) > beyond(start.center) + 1e-9 * np.abs(self.high - self.low).max():
+        tiny = rounding(np.stack([self.low, self.high]))  # of where it is, by turning, too
+        if beyond(camera.center) > beyond(start.center) + max(1e-9 * np.abs(self.high - self.low).max(), tiny):
             return False
         cosine = float(np.clip(camera.c2w[:3, 2] @ self.forward, -1, 1))
         if math.degrees(math.acos(cosine)) > self.turn + 1e-6:
             return False
-        return _distance(self.solid, camera.center) >= min(self.clearance, _distance(self.solid, start.center))
+        return _distance(self.solid, camera.center) >= min(self.clearance, _distance(self.solid, start.center)) - tiny
 
 
 def _distance(solid: np.ndarray, center: np.ndarray) -> float:
@@ -164,7 +166,8 @@ def refined(
 
 def _shift(cameras: Sequence[Camera]) -> float:
     """Half of how far candidates are from the next one, the median; 0 where all are in one place."""
-    centers = np.unique(np.stack([x.center for x in cameras]).round(9), axis=0)
+    centers = np.stack([x.center for x in cameras])
+    centers = np.unique(centers.round(decimals(centers)), axis=0)
     if len(centers) < 2:
         return 0.0
     apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)

@@ -17,12 +17,13 @@ import numpy as np
 import torch
 
 from drgs.cameras import Camera, places_in_time
+from drgs.cameras.origins import decimals
 from drgs.selection.pool import Pool, Selection
 
 __all__ = ["farthest", "random", "uniform"]
 
 _T = TypeVar("_T", bound=Hashable)
-_TIE_DIGITS = 9  # digits that distances are rounded to: what differs less is a tie
+_POSE_DIGITS = 9  # decimals of poses that are equal
 
 
 def farthest(pool: Pool) -> Selection:
@@ -41,8 +42,9 @@ def farthest(pool: Pool) -> Selection:
     scores = distance.tolist()
     picks = []
     left = np.ones(len(centers), bool)
+    digits = decimals(centers)  # what differs less is a tie
     for _ in range(pool.k):
-        order = np.argsort(np.where(left, -distance, np.inf), kind="stable")
+        order = np.argsort(np.where(left, -distance.round(digits), np.inf), kind="stable")
         best, margin = order[0], None
         if left.sum() > 1:
             margin = float(distance[best] - distance[order[1]])
@@ -111,7 +113,8 @@ def _farthest_in_time(pool: Pool) -> Selection:
     """
     points = places_in_time([*pool.train, *pool.candidates])
     known, new = points[: len(pool.train)], points[len(pool.train) :]
-    distances = np.linalg.norm(new[:, None] - known[None], axis=2).round(_TIE_DIGITS)
+    digits = decimals(points)  # what differs less is a tie
+    distances = np.linalg.norm(new[:, None] - known[None], axis=2).round(digits)
     scores = distances.min(1).tolist() if len(known) else [0.0] * len(new)
     picks = []
     left = list(range(len(new)))
@@ -123,7 +126,7 @@ def _farthest_in_time(pool: Pool) -> Selection:
         margin = score - nearest[order[1]][0] if len(order) > 1 and nearest[best] else None
         picks.append(pool.pick(best, score, margin=margin))
         left.remove(best)
-        reach = np.linalg.norm(new - new[best], axis=1).round(_TIE_DIGITS)
+        reach = np.linalg.norm(new - new[best], axis=1).round(digits)
         distances = np.c_[distances, reach]
     return Selection(picks, scores, evaluations=pool.k * len(new))
 
@@ -156,7 +159,7 @@ def _uniform_in_time(pool: Pool) -> Selection:
 
 def _pose(camera: Camera) -> bytes:
     """Equal for cameras of one pose; 0 and -0 are equal."""
-    return (np.asarray(camera.c2w).round(_TIE_DIGITS) + 0.0).tobytes()
+    return (np.asarray(camera.c2w).round(_POSE_DIGITS) + 0.0).tobytes()
 
 
 def _count(views: Sequence[Camera], key: Callable[[Camera], Hashable], value: Hashable) -> int:
