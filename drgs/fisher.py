@@ -353,7 +353,8 @@ def variance_map(
 def pose_information(gaussians: Scene, camera: Camera, settings: RenderSettings | None = None) -> torch.Tensor:
     """(6, 6) float64: the information of a view about its own pose.
 
-    Of the world-frame twist c2w <- exp(xi) c2w, rotation (radians) first, then translation (world units).
+    Of the twist c2w <- exp(xi) c2w, rotation (radians) first, then translation (world units), in the axes of the world
+    and about the Gaussians' origin, which is the world's 0 unless that is far away.
     """
     return PoseInformation().compute(_view("fisher.pose_information", gaussians, camera, settings))["pose"]
 
