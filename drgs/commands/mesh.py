@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.cameras.origins import origin_text
 from drgs.commands.convert import still
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import check_lenses, evenly, known_views
@@ -66,6 +67,8 @@ def run(args: Mesh) -> None:
             f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, {size}, of {len(cameras)} views "
             f"({seen.source}), {args.meshing.depth} depth, voxels of {mesh.voxel:.3g}: {args.output}"
         )
+        if mesh.origin.any():
+            print(f"positions are relative to the offset {origin_text(mesh.origin)}, which the file states")
 
 
 def _without_skybox(gaussians: Gaussians, given: SceneInput) -> Gaussians:

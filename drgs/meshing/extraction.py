@@ -42,7 +42,7 @@ class TriangleMesh:
     """Triangles with colors.
 
     Attributes:
-        vertices: (V, 3) float64 world.
+        vertices: (V, 3) float64, relative to `origin`.
         faces: (F, 3) int64 vertices of each triangle, counter-clockwise seen from outside.
         colors: (V, 3) float32 in [0, 1], as the photographs have them, without a transfer function.
         views: (V,) int32 number of views that see each vertex.
@@ -50,6 +50,7 @@ class TriangleMesh:
             the known views has it; None where it is not wanted.
         voxel: Distance of neighboring points of the lattice in scene units.
         trunc: Truncation of the fused distance in scene units.
+        origin: (3,) float64, added to the vertices.
     """
 
     vertices: np.ndarray
@@ -59,6 +60,7 @@ class TriangleMesh:
     spread: np.ndarray | None
     voxel: float
     trunc: float
+    origin: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
 
     def only(self, faces: np.ndarray) -> TriangleMesh:
         """The mesh of some of its triangles: (F,) bool; vertices that none has are left out."""
@@ -104,6 +106,8 @@ def mesh_of(
         known: Views whose information says how uncertain the surface is; default the same cameras. Read where
             `options.crop` is above 0.
         advance: Called with a label, the steps done and their number.
+    Returns:
+        The mesh, around the origin of the Gaussians.
     Raises:
         ModuleNotFoundError: If scikit-image is missing (`pip install 'drgs[mesh]'`).
         ValueError: If no view sees a surface, the lattice would have more than `max_voxels` points, or nothing is left.
@@ -117,6 +121,9 @@ def mesh_of(
         raise ValueError("mesh: there must be a view, got none; name cameras")
     pixels = sum(camera.width * camera.height for camera in cameras)
     memory.require("mesh", pixels * _VIEW_BYTES, f"the depth of {len(cameras)} views", "use fewer or smaller views")
+    origin = np.asarray(gaussians.origin, np.float64)
+    gaussians = gaussians.replace(origin=np.zeros(3))  # the lattice is around its zero, wherever the scene is
+    cameras, known = ([camera.relative_to(origin) for camera in some] for some in (cameras, known))
     deviations = None
     if options.crop > 0:
         # What is cut at a voxel needs no exact order, which takes eight times as long and moves deviations by 3 %.
@@ -125,7 +132,7 @@ def mesh_of(
     views = depth_views(
         gaussians, cameras, settings, options.depth, deviations, _counter("depth", len(cameras), advance)
     )
-    return mesh_of_depths(views, options, advance)
+    return dataclasses.replace(mesh_of_depths(views, options, advance), origin=origin)
 
 
 def mesh_of_depths(
@@ -137,7 +144,8 @@ def mesh_of_depths(
     """The surface of depth images: fusion, colors, and cuts where views do not determine it.
 
     Args:
-        views: Depth images; with `spread` where `options.crop` is above 0.
+        views: Depth images; with `spread` where `options.crop` is above 0. The lattice is around 0 and ends at 2^24
+            voxels from there: cameras far from 0 are moved there first (`Camera.relative_to`).
         options: How it is made.
         advance: Called with a label, the steps done and their number.
         empty: Weight of a pixel that hits nothing solid, as free space along its whole ray.

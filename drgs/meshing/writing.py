@@ -1,7 +1,9 @@
 """Meshes in files: PLY, binary glTF and Wavefront OBJ, each with a color a vertex.
 
 PLY and OBJ keep the axes of the scene. glTF has y up and z to the front, so that x and y turn their signs, as for
-Gaussians (`drgs.codecs.gltf`), and colors that are linear: what photographs show is decoded from sRGB.
+Gaussians (`drgs.codecs.gltf`), and colors that are linear: what photographs show is decoded from sRGB. Vertices are
+relative to the origin of the mesh, as float32 must be far from 0: the offset that files state as those of Gaussians do
+(`comment offset X Y Z` of a PLY, `asset.extras.offset` of glTF in its axes, `# offset X Y Z` of an OBJ).
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.codecs.glb import glb_of
+from drgs.codecs.ply_headers import offset_line
 from drgs.display.srgb import linear_from_srgb
 from drgs.io.outputs import replacing
 
@@ -66,12 +69,15 @@ def _write_ply(mesh: TriangleMesh, name: str) -> None:
     faces = np.empty(len(mesh.faces), [("vertex_indices", "i4", (3,))])
     faces["vertex_indices"] = mesh.faces
     elements = [plyfile.PlyElement.describe(rows, "vertex"), plyfile.PlyElement.describe(faces, "face")]
-    plyfile.PlyData(elements, byte_order="<").write(name)
+    comments = [offset_line(mesh.origin)] if mesh.origin.any() else []
+    plyfile.PlyData(elements, byte_order="<", comments=comments).write(name)
 
 
 def _write_obj(mesh: TriangleMesh, name: str) -> None:
     with open(name, "w", encoding="ascii") as file:
         file.write("# vertices: x y z r g b, colors in [0, 1]\n")
+        if mesh.origin.any():
+            file.write(f"# {offset_line(mesh.origin)}\n")
         np.savetxt(file, np.column_stack([mesh.vertices, mesh.colors]), "v %.7g %.7g %.7g %.4f %.4f %.4f")
         np.savetxt(file, mesh.faces + 1, "f %d %d %d")
 
@@ -92,4 +98,5 @@ def _glb(mesh: TriangleMesh) -> bytes:
     ]
     rough = {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 1}
     primitive = {"attributes": {"POSITION": 0, "COLOR_0": 1}, "indices": 2, "material": 0, "mode": 4}
-    return glb_of("mesh", arrays, primitive, {"materials": [{"pbrMetallicRoughness": rough, "doubleSided": True}]})
+    materials = {"materials": [{"pbrMetallicRoughness": rough, "doubleSided": True}]}
+    return glb_of("mesh", arrays, primitive, materials, mesh.origin * _TURN)
