@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 import torch
 
+from drgs.cameras.origins import origin_text
 from drgs.checks.arguments import ArgumentError, kind_of, must_be
 from drgs.checks.derivatives import check_has_numbers, ends_of
 
@@ -330,7 +331,9 @@ def ellipsoids_shape(gaussians: Gaussians, extent: float = 3.0) -> dict:
         extent: Radius in standard deviations that Mitsuba bounds them by (the integrator `drgs` uses its own).
     Returns:
         A dict with centers, scales, quaternions (xyzw, normalized) and the attributes `opacities` (N, 1) and
-        `sh_coeffs` (N, 3 K) that the integrators `drgs` and `volprim_rf_basic` read. Values are detached.
+        `sh_coeffs` (N, 3 K) that the integrators `drgs` and `volprim_rf_basic` read. Values are detached. Mitsuba is
+        float32: centers are relative to `gaussians.origin`, and so must sensors be
+        (`camera.relative_to(gaussians.origin).to_mitsuba()`); an origin that is not 0 is warned about.
     Raises:
         ValueError: If there are no Gaussians (Mitsuba refuses an empty shape).
     """
@@ -341,9 +344,14 @@ def ellipsoids_shape(gaussians: Gaussians, extent: float = 3.0) -> dict:
     mi = runtime.mitsuba()
     g = gaussians.detach()  # Mitsuba takes values; gradients of its scene parameters are its own
     quats = torch.nn.functional.normalize(g.quats.double(), dim=1)[:, [1, 2, 3, 0]]
-    means = g.means.double().cpu() + torch.from_numpy(np.asarray(g.origin, np.float64))
+    if np.any(g.origin):
+        warnings.warn(
+            f"ellipsoids_shape: centers are relative to the Gaussians' origin {origin_text(g.origin)}, and so must "
+            "sensors be: camera.relative_to(gaussians.origin).to_mitsuba()",
+            stacklevel=2,
+        )
     arrays = {
-        "centers": means,
+        "centers": g.means,
         "scales": g.scales,
         "quaternions": quats,
         "opacities": g.opacities[:, None],

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from drgs import runtime
+from drgs.cameras.origins import origin_text
 from drgs.cameras.sizes import at_most
 from drgs.commands.orbits import OrbitShape
 from drgs.commands.scene_input import SceneInput
@@ -44,6 +47,8 @@ def run(args: Crossval) -> int:
         rasterizers.export(args.export, g, cameras, given.background, args.seed)
         if not args.quiet:
             print(f"{len(g)} Gaussians, {len(cameras)} views of {cameras[0].width}x{cameras[0].height}: {args.export}")
+            if np.any(g.origin):
+                print(f"positions are relative to the offset {origin_text(g.origin)}, which the file states")
         return 0
     rasterizer = rasterizers.load_rasterizer(args.rasterizer, g, cameras, fields, along_rays)
     with Bar("crossval", show=not args.quiet) as bar:

@@ -351,7 +351,7 @@ def _race(g: Gaussians, camera: Camera, repeats: int) -> dict:
     from drgs.ellipsoids import ellipsoids_shape
 
     settings = RenderSettings.preset("fast")
-    sensor = camera.to_mitsuba()
+    sensor = camera.relative_to(g.origin).to_mitsuba()
     sensor["sampler"] = {"type": "stratified", "sample_count": 1, "jitter": False}  # pixel centers, as ours
     # Its sRGB step is for colors in linear light; those of Gaussians are not.
     integrator = {"type": "volprim_rf_basic", "srgb_primitives": False}

@@ -33,7 +33,7 @@ from drgs.integrator import render
 from drgs.lab import conventions
 from drgs.lab.conventions import ReferenceModel
 from drgs.lab.image_errors import error_line
-from drgs.lab.parameters import COLORS, MOTIONS, PARAMETERS, raw_of, with_colors, with_pose
+from drgs.lab.parameters import COLORS, MOTIONS, PARAMETERS, around_origin, raw_of, with_colors, with_pose
 from drgs.lab.paths import PathRow, path_rows, status_of
 from drgs.lab.rasterizers import Dump, Rasterizer, cotangents, one_line
 from drgs.lab.verdicts import VERDICTS, Case, Compared, GroupRow, ViewRow, compared, judge, with_errors
@@ -75,8 +75,9 @@ class Result:
         views: A row a view.
         findings: Conventions that differ from the preset's.
         model: The model at the rasterizer's conventions.
-        gaussians: Gaussians that were compared (a part of a large scene where the oracle is the reference).
-        cameras: Views that were compared, as they were cropped.
+        gaussians: Gaussians that were compared (a part of a large scene where the oracle is the reference), in a world
+            whose 0 is their origin.
+        cameras: Views that were compared, as they were cropped, in that world.
         paths: A row a path of the rasterizer: tested or not, and what was found.
     """
 
@@ -138,7 +139,7 @@ def crossval(
 
     Args:
         rasterizer: The rasterizer, as `drgs.lab.rasterizers.load_rasterizer` returns it.
-        g: Gaussians of the scene.
+        g: Gaussians of the scene. A function is given means and poses relative to their origin.
         cameras: Cameras of one image size; lenses are of presets along rays.
         preset: Preset that it claims to be, or `auto`: the one whose image needs least to be explained.
         fields: Settings that replace the preset's, `background` among them.
@@ -160,6 +161,8 @@ def crossval(
     say = advance or (lambda _: None)
     if len(g) == 0:
         raise ValueError("crossval: the scene must have Gaussians, got 0")
+    of_lenses = [camera.relative_to(g.origin) for camera in lenses or []]
+    g, cameras = around_origin(g, cameras)
     starts = _starting_models(rasterizer, preset, fields or {}, cameras)
     first_start = next(iter(starts.values()))
     background = first_start.settings.background
@@ -222,7 +225,7 @@ def crossval(
     report = _report(case, comparison, search, claimed, given, places, not_offered, seed)
     rows: list[PathRow] = []
     if paths:
-        lens = _lens_row(rasterizer, g, lenses or [], fields or {}, seed)
+        lens = _lens_row(rasterizer, g, of_lenses, fields or {}, seed)
         rows = _path_rows(case, comparison, report, model, not_offered, seed, functools.partial(ties_of, model), lens)
         verdicts = [row.verdict for row in rows if row.verdict]
         report["verdict"] = min((report["verdict"], *verdicts), key=VERDICTS.index)

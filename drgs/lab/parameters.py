@@ -20,6 +20,7 @@ __all__ = [
     "MOTIONS",
     "POSE_END",
     "PARAMETERS",
+    "around_origin",
     "depth_of",
     "gaussians_of",
     "image_of",
@@ -35,6 +36,14 @@ POSE_END = "viewmats_rs"  # (6,) of the pose at the end of a rolling shutter, li
 MOTIONS = (POSE, POSE_END)
 COLORS = "colors"  # (N, D) in place of `sh`
 BACKGROUNDS = "backgrounds"  # (C, D) of the views of a call, where the gradient by them is compared
+
+
+def around_origin(g: Gaussians, cameras: list[Camera]) -> tuple[Gaussians, list[Camera]]:
+    """Gaussians and cameras relative to the origin of the Gaussians, in a world whose 0 that is.
+
+    What is compared takes means and cameras alone, some of it in float32, which has no detail far from 0.
+    """
+    return g.replace(origin=np.zeros(3)), [camera.relative_to(g.origin) for camera in cameras]
 
 
 def raw_of(g: Gaussians) -> dict[str, torch.Tensor]:

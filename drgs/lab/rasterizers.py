@@ -34,6 +34,7 @@ from drgs.lab.parameters import (
     MOTIONS,
     PARAMETERS,
     POSE,
+    around_origin,
     gaussians_of,
     image_of,
     posed,
@@ -399,7 +400,8 @@ def cotangents(cameras: list[Camera], seed: int, channels: int = 3) -> torch.Ten
 
 
 def scene_arrays(g: Gaussians, cameras: list[Camera], background: tuple) -> dict[str, np.ndarray]:
-    """The arrays that identify a scene: float32 raw parameters, world frame, cameras and background."""
+    """The arrays that identify a scene: float32 raw parameters, cameras and background, relative to its origin."""
+    g, cameras = around_origin(g, cameras)
     arrays = {name: x.float().numpy() for name, x in raw_of(g).items()}
     # A file holds values, in float32 as rasterizers take them; a pose may be a leaf.
     arrays["viewmat"] = np.stack([float64(c.w2c).detach().float().numpy() for c in cameras])
@@ -414,7 +416,8 @@ def export(path: Path, g: Gaussians, cameras: list[Camera], background: tuple, s
     """Write the scene, its cameras and cotangents for a rasterizer on another machine (.npz).
 
     Arrays: `means` (N,3), `quats` (N,4), `log_scales` (N,3), `logit_opacities` (N,), `sh` (N,K,3), `viewmat` (C,4,4),
-    `K` (C,3,3), `width`, `height`, `background` (3,), `cotangent` (C,H,W,3).
+    `K` (C,3,3), `width`, `height`, `background` (3,), `cotangent` (C,H,W,3). Of a scene far from 0 `offset` (3,), what
+    means and poses are relative to.
 
     Raises:
         ValueError: If a camera has a lens or a rolling shutter.
@@ -425,6 +428,8 @@ def export(path: Path, g: Gaussians, cameras: list[Camera], background: tuple, s
         )
     arrays = scene_arrays(g, cameras, background)
     arrays["cotangent"] = cotangents(cameras, seed).float().numpy()
+    if np.any(g.origin):
+        arrays["offset"] = np.asarray(g.origin, np.float64)
     arrays[_EXPORT] = _signature(arrays)
     with atomic_write(path) as file:
         np.savez_compressed(file, **arrays)
@@ -497,7 +502,10 @@ def read_dump(path: Path, g: Gaussians, cameras: list[Camera], background: tuple
 
 
 def along_motions(g: Gaussians, cameras: list[Camera], slopes: torch.Tensor) -> torch.Tensor:
-    """(C, 6) derivatives by the motions of `parameters.posed` of those by the entries of w2c, (C, 4, 4)."""
+    """(C, 6) derivatives by the motions of `parameters.posed` of those by the entries of w2c, (C, 4, 4), of a world
+    whose 0 is the origin of the Gaussians.
+    """
+    g, cameras = around_origin(g, cameras)
     rows = []
     for camera, slope in zip(cameras, slopes, strict=True):
         raw = with_pose(raw_of(g))
