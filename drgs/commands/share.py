@@ -7,6 +7,9 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from drgs.cameras.origins import origin_text
 from drgs.commands.orbits import scene_orbit
 from drgs.commands.scene_input import SceneInput
 from drgs.fitting.frames import load_dataset
@@ -46,6 +49,8 @@ def run(args: Share) -> None:
     if not args.quiet:
         shown = ", ".join(f"{name} {size / 1e6:.2f} MB" for name, size in sizes.items())
         print(f"{len(shared.gaussians)} Gaussians: {path} ({path.stat().st_size / 1e6:.2f} MB: {shown})")
+        if np.any(shared.gaussians.origin):
+            print(f"positions are relative to the offset {origin_text(shared.gaussians.origin)}, which the page states")
 
 
 def _output(args: Share) -> Path:

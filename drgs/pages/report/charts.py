@@ -12,6 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from drgs.cameras.origins import origin_near, origin_text
+from drgs.data.camera_layout import scene_extent
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -130,6 +133,11 @@ def camera_map(
     if not cameras:
         return None
     centers = np.array([camera.center for camera in cameras], float)
+    origin = origin_near(centers.mean(0), scene_extent(cameras))
+    centers -= origin
+    groups = {name: [camera.relative_to(origin) for camera in group] for name, group in groups.items()}
+    picked = [(camera.relative_to(origin), text) for camera, text in picked]
+    ways = [(camera.relative_to(origin), start - origin, text) for camera, start, text in ways]
     up = -np.mean([camera.c2w[:3, 1] for camera in cameras], axis=0)
     axes = _ground_axes(up, centers)
     reach = max(float(np.ptp(centers @ axes.T, axis=0).max()), 1e-9) * 0.06  # of one camera, too, there is a length
@@ -144,10 +152,10 @@ def camera_map(
         _mark_cameras(axis, group, axes, reach, styles[name], f"{name} ({len(group)})")
     _mark_cameras(axis, [x for x, _ in picked], axes, reach, ("o", _RED, 1.0), f"picked, in order ({len(picked)})")
     _mark_cameras(axis, [x for x, *_ in ways], axes, reach, ("^", _RED, 1.0), f"to be taken next ({len(ways)})")
-    for camera, origin, text in ways:
+    for camera, start, text in ways:
         place = axes @ camera.center
         arrow = {"arrowstyle": "->", "color": _RED, "lw": 1.2, "shrinkA": 3, "shrinkB": 3}
-        axis.annotate("", tuple(place), xytext=tuple(axes @ origin), arrowprops=arrow)
+        axis.annotate("", tuple(place), xytext=tuple(axes @ start), arrowprops=arrow)
         axis.annotate(text, tuple(place), xytext=(5, 5), textcoords="offset points", color=_RED, fontsize=8)
     texts: dict[tuple[float, float], list[str]] = {}  # a camera may be picked at several times
     for camera, text in picked:
@@ -157,7 +165,8 @@ def camera_map(
         text = _plain(", ".join(found))
         axis.annotate(text, place, xytext=(4, 4), textcoords="offset points", color=_RED, fontsize=8)
     axis.set_aspect("equal", "datalim")
-    axis.set(xlabel="from above; ticks are lengths of the data set")
+    zero = f", around {origin_text(origin)}" if origin.any() else ""
+    axis.set(xlabel=f"from above{zero}; ticks are lengths of the data set")
     axis.margins(0.12)
     axis.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, 1.16), ncols=2)
     return _svg(figure, "cameras")

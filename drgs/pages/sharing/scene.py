@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from drgs.cameras.origins import origin_text
 from drgs.cameras.sizes import at_most
 from drgs.data.camera_layout import Focus, upright
 from drgs.fitting.records import fitted_views, load_run
@@ -135,6 +136,8 @@ def _with_photographs(
         if around is None:
             raise ValueError(f"{title}: there must be a camera that sees the scene, got none; restore its data set")
         cameras = [("other", dataclasses.replace(around(gaussians), name="all of it"))]
+    if np.any(gaussians.origin):
+        lines = [*lines, f"Positions are relative to the offset {origin_text(gaussians.origin)}."]
     return Shared(
         title=title,
         lines=lines,

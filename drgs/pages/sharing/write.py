@@ -89,6 +89,7 @@ def write_page(shared: Shared, path: str | os.PathLike) -> dict[str, int]:
         "near": _NEAR_PLANE,
         "far": _FAR_FACTOR * max(float(distances.max()), reach),
         "reach": reach,
+        "offset": origin.tolist(),  # what positions are relative to
         "target": (shared.target - origin).tolist(),
         "upright": columns(upright_matrix(shared.up)),
         "photos": [photo(camera, kind, origin) for kind, camera in shared.cameras],
