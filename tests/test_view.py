@@ -709,6 +709,19 @@ def test_a_slider_moves_what_moves(viewers):
         assert "show" in client.labels()
 
 
+def test_a_camera_stays_where_it_is_in_the_world(viewers):
+    """A file that is written again may be relative to another origin: the browser's 0 moves, its camera does not."""
+    means, origin = torch.zeros(1, 3), np.array([500000.0, 5400000.0, 120.0])
+    viewer = viewers(subject(means))
+    with Client(viewer.port) as client:
+        client.look((1, 0, 0, 0), (0, 0, -3))
+        client.picture()
+        at = len(client.heard)
+        viewer.replace(subject(means, scene=blobs(means).replace(origin=origin), origin=origin))
+        moved = client.wait(lambda m: m["type"] == "SetCameraPositionMessage", after=at)
+    assert moved["position"] == pytest.approx((0, 0, -3) - origin, abs=1e-6)
+
+
 @pytest.mark.parametrize("times", [(), (0.0, 0.5, 1.0)])
 def test_a_flight_is_made_in_the_browser(viewers, tmp_path, times):
     """Keyframes where the camera is, with the time that is shown; a preview ends at the last one; what is saved is read

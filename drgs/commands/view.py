@@ -131,7 +131,10 @@ def subject_of(args: View, given: SceneInput, before: Subject | None = None) -> 
     placed_views = _placed_views(args, given, ranking, notes)
     uncertainty = _uncertainty(args, given, known)
     origin = np.array(given.gaussians.origin, np.float64)
-    first = before.first if before else _first_camera(args, given.gaussians, known.cameras if known else [])
+    if before is not None and np.array_equal(before.origin, origin):  # the client's frame is what it was
+        first = before.first
+    else:
+        first = _first_camera(args, given.gaussians, known.cameras if known else [])
     # What a network leaves uncertain takes tangents of all pixels; the rest of a map costs no more than a picture.
     pixels = known.pixels if known and given.moving is not None else None
     if before is not None and _same_places(before.placed_views, placed_views) and before.ranking == ranking:

@@ -38,7 +38,7 @@ class KeyframeFolder:
         client: viser's handle of the browser.
         here: Function that returns where the browser's camera is, in the world, as a keyframe at 0 seconds.
         go: Function that moves the browser's camera, and its time, to a keyframe; and whether it is the last one.
-        origin: (3,) what the world is moved by in the browser.
+        origin: Function that returns (3,) world coordinates of the browser's 0.
         expanded: Whether the folder is open at first.
     """
 
@@ -47,7 +47,7 @@ class KeyframeFolder:
         client: viser.ClientHandle,
         here: Callable[[], Keyframe],
         go: Callable[[Keyframe, bool], None],
-        origin: np.ndarray,
+        origin: Callable[[], np.ndarray],
         expanded: bool = False,
     ) -> None:
         self.client = client
@@ -165,7 +165,7 @@ class KeyframeFolder:
         if count < 2:
             return
         shares = np.linspace(0.0, 1.0, _PATH_SEGMENTS * count)
-        way = np.array([key.position for key in self.flight.at(shares)]) - self._origin
+        way = np.array([key.position for key in self.flight.at(shares)]) - self._origin()
         with contextlib.suppress(RuntimeError):  # the browser has gone
             self._line = self.client.scene.add_line_segments(
                 "/flight", np.stack([way[:-1], way[1:]], axis=1), _PATH_COLOR, thickness=2.0, thickness_units="screen"

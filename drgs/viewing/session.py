@@ -149,7 +149,7 @@ class Session:
         with gui.add_folder("view", visible=False) as self._view:
             self._about = gui.add_html("")
             self._photograph = gui.add_image(np.zeros((2, 2, 3), np.uint8), visible=False)
-        self._flight = KeyframeFolder(self.client, self._keyframe, self._fly_to, subject.origin)
+        self._flight = KeyframeFolder(self.client, self._keyframe, self._fly_to, lambda: self.subject.origin)
         for handle in (self._layer, self._preset, self._ours):
             handle.on_update(self._choice_made)
         self._are_shown.on_update(self._placed_views_toggled)
@@ -188,7 +188,11 @@ class Session:
         if subject.times != before.times:
             self._build_times()
         self._send_gaussians()
-        if subject.placed_views is not before.placed_views:
+        has_moved = not np.array_equal(subject.origin, before.origin)
+        if has_moved:  # the client's 0, but not where its camera is in the world
+            self.client.camera.position = self.pose.position + before.origin - subject.origin
+            self.pose, self.size = self._client_pose() or (self.pose, self.size)
+        if has_moved or subject.placed_views is not before.placed_views:
             self._show_placed_views()
         if not keeps:
             self._draw_later()
