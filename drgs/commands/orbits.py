@@ -181,7 +181,9 @@ def capture_orbit(
     elevation = np.clip(elevation, -_MOST_ELEVATION, _MOST_ELEVATION) if fixed.elevation is None else fixed.elevation
     made = _around(focus.center, up, middle, _turns(frames, span, returns), distance, float(elevation), lens)
     kind = "circle" if span >= 360 else f"swing of {span:.0f} degrees"
-    place = ", ".join(f"{x:.3g}" for x in focus.center)
+    far = float(np.abs(focus.center).max()) / distance
+    digits = 3 + max(0, math.floor(math.log10(far))) if far > 0 else 3  # so that three are of the scene's own size
+    place = ", ".join(f"{x:.{digits}g}" for x in focus.center)
     return made, f"{kind} around ({place}) at distance {distance:.3g}, {elevation:.0f} degrees up, like the photographs"
 
 
