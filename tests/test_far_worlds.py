@@ -315,6 +315,18 @@ def test_a_mesh_is_the_same_around_its_origin(meshes):
     assert np.abs(far.vertices - near.vertices).max() < 1e-4
 
 
+def test_a_lattice_that_ends_before_the_surface_is_one_line():
+    """Of depth images whose cameras nobody moved, or of float64 means without an origin."""
+    pytest.importorskip("skimage")
+    from drgs.meshing.extraction import mesh_of
+    from drgs.meshing.options import MeshOptions
+
+    g = shell()
+    g = g.replace(means=g.means.double() + torch.from_numpy(FAR))
+    with pytest.raises(ValueError, match=r"within 2\^24 voxels of 0.1 from 0.*give the Gaussians an origin"):
+        mesh_of(g, around(3, FAR), FAST, MeshOptions(voxel=0.1, crop=0.0))
+
+
 @pytest.mark.parametrize(
     ("suffix", "said"),
     [

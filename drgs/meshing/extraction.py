@@ -213,6 +213,11 @@ def _lattice(views: Sequence[DepthView], options: MeshOptions) -> tuple[float, n
         )
     most = options.max_voxels // POINTS
     fits, bricks = voxel, bricks_of(views, voxel, options.trunc * voxel, most)
+    if not len(bricks):
+        raise ValueError(
+            f"mesh: surfaces must lie within 2^24 voxels of {voxel:.3g} from 0, all are farther; give the Gaussians an "
+            "origin there, or move the cameras of depth images by Camera.relative_to"
+        )
     while len(bricks) > most:
         fits *= _VOXEL_GROWTH
         bricks = bricks_of(views, fits, options.trunc * fits, most)
