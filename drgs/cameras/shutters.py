@@ -4,8 +4,8 @@ in.
 The sensor is read line by line while the camera moves. As in gsplat the first line that is read has the pose `w2c`, the
 last one `w2c_end`; between the two the translation of the world-to-camera matrix is interpolated linearly and its
 rotation along the shortest turn, at a constant rate (slerp: Shoemake 1985). Where the camera is in between depends on
-where the world's 0 is, by about an eighth of its distance times the square of the turn: Gaussians are rendered with it
-at their origin, and what else looks at such a camera in a world far from 0 does so by `Camera.relative_to`.
+where 0 is: by about an eighth of its distance times the square of the turn. Renderings take the Gaussians' origin for
+that 0; whoever asks a camera far from 0 for the poses of its lines moves it there first (`Camera.relative_to`).
 """
 
 from __future__ import annotations

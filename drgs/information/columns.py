@@ -91,7 +91,8 @@ class PoseInformation(Quantity):
     def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
         """Float64."""
         colors = view.gaussians.replace(features=None)  # else their columns would be computed, too, for nothing
-        # About the Gaussians' origin: about a 0 that is far away a rotation were a translation by as much.
+        # Rotations are about the Gaussians' origin: one about a 0 that is far away is nearly a translation, and float64
+        # could not tell them apart.
         twists = np.eye(6)
         twists[:3, 3:] = np.cross(colors.origin, np.eye(3))
         out = render_jvp(colors, view.camera, {"camera": torch.from_numpy(twists)}, view.settings, outputs=())

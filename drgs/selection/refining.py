@@ -100,7 +100,7 @@ class _Bounds:
     def hold(self, camera: Camera, start: Camera) -> bool:
         """Whether a camera keeps them; a candidate outside of the box may stay outside, not go further out."""
         beyond = lambda x: np.maximum(np.maximum(self.low - x, x - self.high), 0).max()  # noqa: E731
-        tiny = rounding(np.stack([self.low, self.high]))  # of where it is, by turning, too
+        tiny = rounding(np.stack([self.low, self.high]))  # of a center, which turning moves by as much
         if beyond(camera.center) > beyond(start.center) + max(1e-9 * np.abs(self.high - self.low).max(), tiny):
             return False
         cosine = float(np.clip(camera.c2w[:3, 2] @ self.forward, -1, 1))
