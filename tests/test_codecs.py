@@ -374,7 +374,7 @@ def test_a_codec_of_a_script(tmp_path, rng, capsys):
         assert drgs.cli.main(["convert", str(tmp_path / "a.splat"), str(rows), "--quiet"]) == 0
         rows.rename(tmp_path / "a.bin")
         assert drgs.cli.main(["convert", str(tmp_path / "a.bin"), str(ply), "--quiet"]) == 0
-        assert ".sog, .glb and .rows, a SOG folder" in readable()
+        assert ".glb, .pt and .rows, a SOG folder" in readable()
     finally:
         del CODECS["rows"]
     found, wanted = drgs.load_ply(ply).parameters(), load_gaussians(tmp_path / "a.splat").parameters()
