@@ -79,6 +79,12 @@ def places(g: Gaussians) -> torch.Tensor:
     return (g.means.double() + torch.from_numpy(g.origin)).float()
 
 
+def parts_of(similarity):
+    """Rotation, translation and scale of a (4, 4)."""
+    scale = np.cbrt(np.linalg.det(similarity[:3, :3]))
+    return similarity[:3, :3] / scale, similarity[:3, 3], scale
+
+
 def save_simple_trainer(folder, g, ranks: int = 1):
     """Results of gsplat's simple_trainer, of the Gaussians shared among ranks."""
     (folder / "ckpts").mkdir(parents=True)
@@ -112,9 +118,7 @@ def assert_alike(found, blobs):
 def test_a_checkpoint_of_gsplat_in_its_normalized_world(place, tmp_path, caplog, ranks):
     """The results folder names the last step, all ranks are read, and photographs show which frame it is in."""
     data, blobs = place
-    matrix = normalization(data)
-    scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
-    save_simple_trainer(tmp_path / "results", _moved(blobs, matrix[:3, :3] / scale, matrix[:3, 3], scale), ranks)
+    save_simple_trainer(tmp_path / "results", _moved(blobs, *parts_of(normalization(data))), ranks)
     order = torch.cat([torch.arange(len(blobs))[rank::ranks] for rank in range(ranks)])
     found = in_frame_of_data(load_gaussians(tmp_path / "results"), tmp_path / "results", data)
     assert_alike(found, blobs.take(order))
@@ -180,6 +184,19 @@ def test_the_command_says_how_well_it_fits(place, tmp_path, caplog):
     line = ["fisher", str(tmp_path / "results"), "--train", str(data), "--limit", "1", "--preset", "fast"]
     assert cli.main([*line, "--blocks", "geometry", "-o", str(tmp_path / "out")]) == 0
     assert "dB at 3 photographs of" in caplog.text
+
+
+def test_a_page_of_a_splat_and_its_data_set(place, tmp_path, caplog, capsys):
+    """`drgs share --train`: in the data set's frame, with the photographs' cameras and what they leave uncertain."""
+    data, blobs = place
+    save_simple_trainer(tmp_path / "results", _moved(blobs, *parts_of(normalization(data))))
+    line = ["share", str(tmp_path / "results"), "--train", str(data), "-o", str(tmp_path / "page.html")]
+    assert cli.main(line) == 0
+    assert "by gsplat's normalization" in caplog.text
+    assert "uncertainty 0.00 MB" in capsys.readouterr().out
+    assert "30 Gaussians, with 9 photographs." in (tmp_path / "page.html").read_text()
+    assert cli.main([*line, "--no-uncertainty"]) == 0
+    assert "uncertainty" not in capsys.readouterr().out
 
 
 def test_checkpoints_that_are_refused(place, tmp_path):

@@ -521,12 +521,18 @@ class Report(Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Share(Common):
+class Share(Views, Common):
     """Write a run or a file of Gaussians as one HTML page that opens from disk, on a phone too."""
 
     scene: Path = _scene()
     output: Path | None = option(
         None, "Output HTML file; default scene.html in the run folder, for a file its name with .html.", short="o"
+    )
+    train: str | None = option(
+        None,
+        "Training views of a file of Gaussians, for the page's cameras and uncertainty: a data set, a run, a "
+        "cameras.json.",
+        heading="Views",
     )
     selection: Path | None = option(
         None,

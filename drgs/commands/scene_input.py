@@ -17,13 +17,15 @@ from drgs.settings import RenderSettings
 from drgs.viewing.placed_views import NEXT, Ranking, read_ranking
 
 if TYPE_CHECKING:
-    from drgs.commands.options import Crossval, Fisher, Query, Render, Select, Tradeoff
+    from drgs.commands.options import Crossval, Fisher, Query, Render, Select, Share, Tradeoff, View
     from drgs.ellipsoids import Gaussians, Scene
     from drgs.features.decoder import Decoder
     from drgs.features.segmentation import Classes
     from drgs.information.nuisances import Nuisance
     from drgs.information.scoring import Scoring
     from drgs.information.semantics import SemanticMetric
+
+    _Placed = Crossval | Fisher | Query | Render | Select | Share | Tradeoff | View  # have options that name a data set
 
 __all__ = ["SELECTION", "SceneInput", "ranking_of"]
 
@@ -57,7 +59,7 @@ class SceneInput:
     moving: Scene | None = None
 
     @classmethod
-    def of(cls, args: Crossval | Fisher | Query | Render | Select | Tradeoff) -> SceneInput:
+    def of(cls, args: Crossval | Fisher | Query | Render | Select | Tradeoff | View) -> SceneInput:
         """The scene that the command line names.
 
         Raises:
@@ -65,9 +67,7 @@ class SceneInput:
             ValueError: If --set is wrong or a file damaged.
         """
         replaced = args.replaced()
-        given = cls.at(args.scene)
-        if given.run is None and (data := _data_of(args)) is not None:
-            given = dataclasses.replace(given, gaussians=in_frame_of_data(given.gaussians, args.scene, data))
+        given = cls.at(args.scene).in_frame_of(args)
         fitted = {} if given.record is None else {"background": given.record.config.settings.background}
         return dataclasses.replace(given, fields=fitted | replaced)
 
@@ -94,6 +94,12 @@ class SceneInput:
         moving = None if scene is loaded.gaussians else scene
         known = {"step": loaded.step, "decoder": loaded.decoder, "classes": loaded.classes, "moving": moving}
         return cls(loaded.gaussians, run, loaded.record, **known)
+
+    def in_frame_of(self, args: _Placed) -> SceneInput:
+        """With Gaussians of a file in the frame of the data set that an option names, if one does."""
+        if self.run is not None or (data := _data_of(args)) is None:
+            return self
+        return dataclasses.replace(self, gaussians=in_frame_of_data(self.gaussians, args.scene, data))
 
     def settings(self, preset: str) -> RenderSettings:
         """The render settings of a preset over the background of the fit."""
@@ -143,7 +149,7 @@ class SceneInput:
         return tuple(self.fields.get("background", RenderSettings.background))
 
 
-def _data_of(args: Crossval | Fisher | Query | Render | Select | Tradeoff) -> Path | None:
+def _data_of(args: _Placed) -> Path | None:
     """The data set that an option names, itself or by a run on it; None where there are only lists and orbits."""
     for text in (getattr(args, name, None) for name in ("train", "cameras", "candidates")):
         if text is None or text in ("orbit", "dome"):

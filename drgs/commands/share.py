@@ -12,6 +12,7 @@ import numpy as np
 from drgs.cameras.origins import origin_text
 from drgs.commands.orbits import scene_orbit
 from drgs.commands.scene_input import SceneInput
+from drgs.commands.viewpoints import known_views
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import is_run, load_run
 from drgs.fitting.resume import lock_run
@@ -83,12 +84,23 @@ def shared_of(args: Share) -> Shared:
         refuse_foreign(args.selection, "a selection")
         ranking = read_ranking(args.selection)
     if not is_run(args.scene):
-        given = SceneInput.at(args.scene)
+        given = SceneInput.at(args.scene).in_frame_of(args)
         if not len(given.gaussians):
             raise ValueError(
                 f"{args.scene}: there must be at least one Gaussian, got none; fit longer, or name another"
             )
-        return scene_of_file(given.gaussians, args.scene.stem, _overview_camera, ranking, given.background)
+        photographs = [] if args.train is None else known_views(args.train, args, given).cameras
+        return scene_of_file(
+            given.gaussians,
+            args.scene.stem,
+            _overview_camera,
+            ranking,
+            given.background,
+            photographs=photographs,
+            uncertainty=args.uncertainty,
+        )
+    if args.train is not None:
+        raise ValueError("--train must be left out of a run, which knows its photographs; drop it")
     run = Run(args.scene)
     loaded = load_run(run)
     return scene_of_run(

@@ -19,6 +19,7 @@ from drgs.meshing.depths import seen_distance
 from drgs.pages.report.pictures import spread
 from drgs.pages.sharing.layers import classes_layer, uncertainty_of
 from drgs.pages.sharing.write import Shared
+from drgs.settings import RenderSettings
 from drgs.viewing.placed_views import NEXT, Ranking, placed_views_of, read_ranking
 
 if TYPE_CHECKING:
@@ -51,8 +52,11 @@ def scene_of_file(
     around: Callable[[Gaussians], Camera],
     ranking: Ranking | None = None,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    *,
+    photographs: Sequence[Camera] = (),
+    uncertainty: bool = True,
 ) -> Shared:
-    """Contents of the page of Gaussians without photographs.
+    """Contents of the page of Gaussians of a file.
 
     Args:
         gaussians: At least one.
@@ -60,11 +64,19 @@ def scene_of_file(
         around: A camera that sees all of it, where a ranking has no cameras.
         ranking: Photographs to take next.
         background: RGB in [0, 1].
+        photographs: Cameras of the photographs that they were fitted to, if they are known.
+        uncertainty: Whether to add what these leave uncertain.
     """
     shown = gaussians.replace(features=None).detach()
-    return _with_photographs(
-        shown, title, [f"{len(gaussians):,} Gaussians."], _cameras([], (), ranking), around, background
-    )
+    lines = [f"{len(gaussians):,} Gaussians{f', with {len(photographs):,} photographs' if photographs else ''}."]
+    fitted: list[tuple[PhotoKind, Camera]] = [("fitted", camera) for camera in photographs]
+    cameras = [*fitted, *_cameras([], (), ranking)]
+    page = _with_photographs(shown, title, lines, cameras, around, background)
+    if not (photographs and uncertainty):
+        return page
+    settings = RenderSettings.preset("exact", background=background)
+    some = spread([at_most(camera, _INFORMATION_PIXELS) for camera in photographs], _MOST_PHOTOGRAPHS)
+    return dataclasses.replace(page, uncertainty=uncertainty_of(shown, some, settings, Nuisances()))
 
 
 def scene_of_run(
