@@ -18,7 +18,7 @@ PYTEST_FLAGS ?= -q -n 2 --dist loadfile
 # CPU/LANES[/FEATURES] as DRGS_LLVM_TARGET takes them: packets of 4 and 8 lanes, without AVX2 and with it, as far as this
 # machine has the instructions and wider packets of its own, which `make test` is compiled for.
 TARGETS ?= $(shell grep -qsw fma /proc/cpuinfo && echo x86-64-v2/4/+fma; grep -qsw avx512vl /proc/cpuinfo && echo haswell/8)
-NUMERICS := integrator extremes order tiles lenses shutter unscented features fisher gain backdrop mitsuba_preset
+NUMERICS := integrator claims extremes order tiles lenses shutter unscented features fisher gain backdrop mitsuba_preset
 VENV := .venv
 BIN := $(VENV)/bin
 BASE := $(VENV)/.drgs-base

@@ -112,9 +112,10 @@ class RenderSettings:
             (Mitsuba's order of entry points, `bvh` only).
         traversal: `tiles` (the pixels of a camera, the fast path) or `bvh` (Mitsuba's acceleration structure, any ray).
         depth_key: Key of `order="center"`: `distance` to the camera center or camera-space `z`.
-        extent: Cut-off radius in standard deviations; None is the adaptive radius sqrt(2 ln max(alpha_i N / 1e-5, 1))
-            that bounds the sum of all N truncated tails by 1e-5; order `ray` on tiles leaves out as much as 5e-6 more
-            where a tile lists few of N, unless depth or count is asked for.
+        extent: Cut-off radius in standard deviations. None is the adaptive radius r that bounds what derivatives lose:
+            max(alpha_i N, 1) (1 + r^2) exp(-r^2 / 2) = 1e-5 (of `integral` with softplus(logit_i) in place of alpha_i),
+            at least 5.47, however faint a Gaussian is. In order `ray` on tiles n, what a tile lists, takes the place
+            of N, unless depth or count is asked for.
         alpha_min: Hits with a < alpha_min are skipped.
         alpha_max: a is clamped to this value.
         alpha_max_gradient: `zero` or `pass`: the derivative of the clamp.
@@ -175,13 +176,14 @@ class RenderSettings:
     def preset(cls, name: str, **overrides: Any) -> RenderSettings:
         """Settings of a named system.
 
-        `exact` is the claim of this package: within 1e-5 of the float64 oracle. `fast` has the cut-offs of Mitsuba's
-        `volprim_rf_basic` and draws the previews of fits; `mitsuba` is that integrator's model: its acceleration
-        structure, order of entry points, SH along each ray, 64 hits a ray, without the hits that it loses. `inria` and
-        `gsplat` are those rasterizers' models. `3dgut` is what gsplat composites with `with_ut` and `with_eval3d`: the
-        peak on each ray, with the rasterizer's cut-offs, in the tiles of the boxes that the unscented transform gives,
-        which leave out what they misjudge; `culling="extent"` draws that, too. docs/conventions.md lists the source of
-        every constant.
+        `exact` is the claim of this package: images within 1e-5, derivatives within 1e-4 of rays without a cut in
+        float64, where pixels see more of Gaussians than their tails (docs/numerics.md). `fast` has the cut-offs of
+        Mitsuba's `volprim_rf_basic` and draws the previews of fits; `mitsuba` is that integrator's model: its
+        acceleration structure, order of entry points, SH along each ray, 64 hits a ray, without the hits that it loses.
+        `inria` and `gsplat` are those rasterizers' models. `3dgut` is what gsplat composites with `with_ut` and
+        `with_eval3d`: the peak on each ray, with the rasterizer's cut-offs, in the tiles of the boxes that the
+        unscented transform gives, which leave out what they misjudge; `culling="extent"` draws that, too.
+        docs/conventions.md lists the source of every constant.
 
         Args:
             name: One of `PRESETS`.

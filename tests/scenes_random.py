@@ -19,6 +19,7 @@ from drgs.lab.accuracy import (
     relative,
     rotation,
     twist_basis,
+    weight_of,
 )
 from drgs.lab.accuracy import random_camera as camera
 from drgs.lab.accuracy import random_gaussians as gaussians
@@ -39,6 +40,7 @@ __all__ = [
     "relative",
     "rotation",
     "twist_basis",
+    "weight_of",
 ]
 
 

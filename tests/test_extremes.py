@@ -129,7 +129,7 @@ def test_rays_that_start_inside(rng, monkeypatch, listed, order):
     monkeypatch.setattr(bvh, "_MAX_LISTED", listed)
     g = gaussians(rng, 30, 1, scale=0.4, anisotropy=0.3).detach()
     origins, directions = rng.uniform(-0.7, 0.7, (40, 3)), rng.normal(size=(40, 3))
-    settings = RenderSettings.preset("exact", traversal="bvh", order=order)
+    settings = RenderSettings.preset("exact", traversal="bvh", order=order, extent=6.0)  # which says what to count
     found = render_rays(g, origins, directions, settings, outputs=("count",))
     rays = torch.tensor(origins), torch.nn.functional.normalize(torch.tensor(directions), dim=1)
     wanted = reference.render(g, None, settings, rays=rays, tolerance=3e-4 if order == "entry" else 1e-5)
@@ -242,7 +242,8 @@ def test_derivatives_of_discs(name, thin):
     found = torch.autograd.grad((u * image[0]).sum(), leaves)
     wanted = torch.autograd.grad((u * oracle.rgb).sum(), leaves)
     assert float(wanted[0].abs().min()) > 1e-3 * max(thin, 1e-20)
-    torch.testing.assert_close(found[0], wanted[0], rtol=1e-4, atol=0)
+    # Single entries, one of which is a small sum of large parts: three times the bound of norms.
+    torch.testing.assert_close(found[0], wanted[0], rtol=3e-4, atol=0)
     for got, want in zip(found[1:], wanted[1:], strict=True):
         assert float((got - want).norm() / want.norm()) < 1e-4
     if thin and settings.order != "entry":

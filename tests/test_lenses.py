@@ -9,12 +9,13 @@ import dense_jacobian as dense
 import numpy as np
 import pytest
 import torch
-from scenes_random import Oracle, around_camera, camera, compare, gaussians, relative
+from scenes_random import Oracle, around_camera, camera, compare, gaussians, relative, weight_of
 from test_integrator import check
 from test_tiles import listed_gaussians
 
 from drgs import fisher, reference, render, render_jvp, runtime
 from drgs.cameras import Camera, intrinsics
+from drgs.oracle import activate
 from drgs.settings import RenderSettings
 from drgs.tracing import tiles
 from drgs.tracing.lens_rays import LensRays, lens_of
@@ -73,10 +74,9 @@ def test_every_hit_is_listed(rng, name, response, near):
         g = gaussians(rng, 25, 1, anisotropy=1.2, spread=1.0 if near else 4.0)
         g = (around_camera(g, cam) if near else g).detach()
         listed, columns = quietly(listed_gaussians, g, cam, settings)
-        extent = (2 * torch.log((g.opacities.double() * 25 / 1e-5).clamp(min=1))).sqrt()
+        extent = activate(g, settings.replace(order="entry", traversal="bvh")).extent  # the adaptive one
         for i in range(len(g)):
-            radius = max(float(extent[i]), 1e-3)
-            one = quietly(reference.render, g.take([i]), cam, settings.replace(extent=radius))
+            one = quietly(reference.render, g.take([i]), cam, settings.replace(extent=float(extent[i])))
             hit = (one.count > 0) & (one.alpha > 1e-12)
             if response == "integral":
                 # Behind the ray's origin, what there is lies below the tails that the extent leaves out.
@@ -239,8 +239,8 @@ def test_derivatives_by_the_lens(rng, name, fields):
     good = ~truth.ambiguous & inverse
     names = ("rgb", "alpha", "depth", "features")
     u = {k: torch.tensor(rng.normal(size=tuple(getattr(truth, k).shape))) for k in names}
-    for x in u.values():
-        x *= good.reshape(*good.shape, *[1] * (x.ndim - 2))
+    for k, x in u.items():
+        x *= good.reshape(*good.shape, *[1] * (x.ndim - 2)) * weight_of(k, truth)
         x.requires_grad_()
     loss = sum((getattr(truth, k) * x).sum() for k, x in u.items())
     (slope,) = torch.autograd.grad(loss, directions, create_graph=True)
@@ -254,14 +254,15 @@ def test_derivatives_by_the_lens(rng, name, fields):
     lens = torch.tensor(at, requires_grad=True)
     out = quietly(render, g.detach(), cam, settings, outputs=("depth",), lens=lens)
     for k in names:
-        torch.testing.assert_close(getattr(out, k).double()[good], getattr(truth, k)[good], rtol=1e-5, atol=1e-5)
+        pair = ((getattr(x, k) * weight_of(k, truth))[good].double() for x in (out, truth))
+        torch.testing.assert_close(*pair, rtol=1e-5, atol=1e-5)
     sum((getattr(out, k).double() * x.detach()).sum() for k, x in u.items()).backward()
     assert relative(lens.grad, want.detach()) < 1e-4
     v = torch.tensor(rng.normal(size=len(at))) * (1 + abs(torch.tensor(at)))
     (pushed,) = (torch.autograd.grad(want @ v, list(u.values()), retain_graph=True),)
     got = quietly(render_jvp, g.detach(), cam, {"lens": v}, settings)
     for k, x in zip(names, pushed, strict=True):
-        assert relative(getattr(got, k).double()[good], x[good]) < 1e-4, k
+        assert relative(*((y.double() * weight_of(k, truth))[good] for y in (getattr(got, k), x))) < 1e-4, k
 
 
 @pytest.mark.parametrize("order", ["center", "ray"])
@@ -335,7 +336,8 @@ def test_pixels_without_a_ray(rng, fields, focal, distortion):
     truth = quietly(reference.render, g.detach(), dataclasses.replace(cam, w2c=cam.w2c.detach()), settings)
     good = torch.tensor(~holes) & ~truth.ambiguous
     for name in ("rgb", "alpha", "depth", "features"):
-        torch.testing.assert_close(getattr(out, name).double()[good], getattr(truth, name)[good], rtol=1e-5, atol=1e-5)
+        pair = ((getattr(x, name) * weight_of(name, truth))[good].double() for x in (out, truth))
+        torch.testing.assert_close(*pair, rtol=1e-5, atol=1e-5)
     out.rgb.square().sum().backward()
     for x in (*g.parameters().values(), cam.w2c, lens):
         assert torch.isfinite(x.grad).all()

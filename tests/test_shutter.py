@@ -8,7 +8,7 @@ import dense_jacobian as dense
 import numpy as np
 import pytest
 import torch
-from scenes_random import Oracle, around_camera, camera, compare, gaussians, relative, rotation
+from scenes_random import Oracle, around_camera, camera, compare, gaussians, relative, rotation, weight_of
 from test_integrator import check
 
 from drgs import fisher, reference, render, render_jvp
@@ -184,7 +184,8 @@ def test_rays_of_the_caller(rng, preset):
     ref = reference.render(g, cam, settings, rays=pair, tolerance=1e-5)
     good = there & ~ref.ambiguous
     assert (out.rgb - ref.rgb)[good].abs().max() < 1e-5
-    assert ((out.depth - ref.depth)[good].abs() / ref.depth[good].clamp_min(1)).max() < 1e-5
+    weight = weight_of("depth", ref)
+    assert ((out.depth - ref.depth) * weight / ref.depth.clamp_min(1))[good].abs().max() < 1e-5
     assert torch.allclose(out.rgb[3, 4], torch.tensor([0.2, 0.3, 0.4]))
     assert out.alpha[3, 4] == 0
     u = torch.tensor(rng.normal(size=(13, 17, 3))) * good[..., None]

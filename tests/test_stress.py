@@ -69,7 +69,7 @@ def test_a_broken_renderer_fails(monkeypatch, tmp_path, capsys, what):
     elif what == "forward":
         true = accuracy.render_jvp
         monkeypatch.setattr(
-            accuracy, "render_jvp", lambda *a: dataclasses.replace(out := true(*a), rgb=out.rgb * 1.001)
+            accuracy, "render_jvp", lambda *a, **k: dataclasses.replace(out := true(*a, **k), rgb=out.rgb * 1.001)
         )
     else:  # of duality alone: a bound that nothing meets
         monkeypatch.setitem(stress.BOUNDS, "duality", -1.0)

@@ -36,9 +36,11 @@ __all__ = [
     "squares",
     "turn",
     "twist_basis",
+    "weight_of",
 ]
 
 FIELDS = ("rgb", "alpha", "depth", "features")
+_LEAST_ALPHA = 1e-3  # of rays whose depth is compared: 100 times what an image may be off by
 _JACOBIAN_ENTRIES = 1 << 22  # entries of an intermediate of the dense Jacobian that are held at once: 32 MB
 
 
@@ -153,7 +155,8 @@ class Oracle:
     Attributes:
         out: `reference.ReferenceOutput`.
         good: (H, W) pixels that do not hang on a near tie, and are not in `skip`.
-        u, back: Cotangents of the images, 0 where not `good`, and the gradient they give, by group.
+        u, back: Cotangents of the images, 0 where not `good`, and the gradient they give, by group. That of the depth
+            has the weights that depths are compared with (`weight_of`).
         v, push: Tangents of the groups and the tangent images they give.
     """
 
@@ -175,7 +178,7 @@ class Oracle:
         self.u = {}
         for name, x in images.items():
             mask = self.good.reshape(*self.good.shape, *[1] * (x.ndim - self.good.ndim))
-            self.u[name] = torch.tensor(rng.normal(size=tuple(x.shape))) * mask
+            self.u[name] = torch.tensor(rng.normal(size=tuple(x.shape))) * mask * weight_of(name, self.out)
             self.u[name].requires_grad_()
         self.v = {name: torch.tensor(rng.normal(size=tuple(x.shape))) for name, x in g.parameters().items()}
         self.v |= {name: torch.tensor(rng.normal(size=6)) for name in _poses(cam)}
@@ -192,6 +195,14 @@ class Oracle:
         self.back = {n: x.detach().double() for n, x in back.items()}
         self.back |= {name: pose_gradient(pose, self.back[name]) for name, pose in _poses(cam).items()}
         self.u = {name: u.detach() for name, u in self.u.items()}  # it was a variable to get J v, and is a number now
+
+
+def weight_of(name: str, out: reference.ReferenceOutput) -> torch.Tensor | float:
+    """What errors of an image are multiplied by: of a depth, a mean over what a ray meets, alpha, and 0 where that is
+    below `_LEAST_ALPHA`: the depth of a ray that meets tails alone is that of those which are not cut off.
+    """
+    alpha = out.alpha.detach()  # a weight is a number
+    return torch.where(alpha < _LEAST_ALPHA, 0.0, alpha) if name == "depth" else 1.0
 
 
 def _grad(loss: torch.Tensor, groups: Mapping[str, torch.Tensor], **options: bool) -> dict[str, torch.Tensor]:
@@ -216,13 +227,15 @@ class Errors:
     """Renderer against oracle on one scene, outside of ambiguous pixels.
 
     Attributes:
-        image: Output name -> largest absolute error (depths: relative to the largest depth, or 1).
+        image: Output name -> largest absolute error, of depths and visibilities relative to the largest, or 1; depths
+            but for the median are weighted (`weight_of`).
         gradient: Group -> relative L2 error of the adjoint.
         forward: Output name -> relative L2 error of the forward mode.
         joint: Relative L2 error of the forward mode over all outputs but depth.
         duality: |<Jv, u> - <v, J^T u>| / (|Jv| |u|).
         finite: Every output, gradient and tangent is finite, ambiguous pixels included.
-        count: Largest difference of the number of hits of a pixel.
+        count: Largest difference of the number of hits of a pixel; 0 without an extent, where the oracle counts tails
+            without an end.
         out: The renderer's `Output`.
     """
 
@@ -236,9 +249,16 @@ class Errors:
     out: Output
 
 
-def compare(g: Gaussians, cam: Camera, settings: RenderSettings, oracle: Oracle) -> Errors:
-    """Render, differentiate both ways and compare with the oracle."""
-    out = render(g, cam, settings, outputs="all")
+def compare(
+    g: Gaussians, cam: Camera, settings: RenderSettings, oracle: Oracle, outputs: tuple[str, ...] | str = "all"
+) -> Errors:
+    """Render, differentiate both ways and compare with the oracle.
+
+    Args:
+        outputs: Outputs that are rendered besides color, alpha and features: those of `oracle.u` at least. With a depth
+            or a count tiles leave fewer tails out.
+    """
+    out = render(g, cam, settings, outputs=outputs)
     ref = oracle.out
     good = oracle.good
     size = max([1.0, *ref.depth.detach().abs().reshape(-1).tolist()])  # a list holds numbers
@@ -246,26 +266,28 @@ def compare(g: Gaussians, cam: Camera, settings: RenderSettings, oracle: Oracle)
     finite = True
     for name in (*FIELDS, "median_depth"):
         a, b = getattr(out, name), getattr(ref, name)
-        if b is not None:
+        if a is not None and b is not None:
             finite &= bool(torch.isfinite(a).all())
-            image[name] = _largest((a.double() - b)[good]) / (size if "depth" in name else 1.0)
-    if good.all():
-        image["visibility"] = _largest((out.visibility.double() - ref.visibility) / (1 + ref.visibility))
+            error = (a.double() - b) * weight_of(name, ref)
+            image[name] = _largest(error[good]) / (size if "depth" in name else 1.0)
+    if good.all() and out.visibility is not None:
+        image["visibility"] = _largest(out.visibility.double() - ref.visibility) / (1 + _largest(ref.visibility))
     ours = gradients(g, cam, out, oracle.u)
-    pushed = render_jvp(g, cam, oracle.v, settings)
+    pushed = render_jvp(g, cam, oracle.v, settings, outputs=tuple({"depth"} & set(oracle.u)))
     jv = {name: getattr(pushed, name).double() for name in oracle.u}
     finite &= all(bool(torch.isfinite(x).all()) for x in (*ours.values(), *jv.values()))
     scale = (inner(jv, jv) * inner(oracle.u, oracle.u)) ** 0.5
+    weighted = lambda name, x: (x * weight_of(name, ref))[good]  # noqa: E731
     colors = [name for name in jv if name != "depth"]
     both = [torch.cat([x[name][good].reshape(-1) for name in colors] or [torch.zeros(0)]) for x in (jv, oracle.push)]
     return Errors(
         image=image,
         gradient={name: relative(x, oracle.back[name]) for name, x in ours.items()},
-        forward={name: relative(x[good], oracle.push[name][good]) for name, x in jv.items()},
+        forward={name: relative(*(weighted(name, y) for y in (x, oracle.push[name]))) for name, x in jv.items()},
         joint=relative(*both),
         duality=abs(inner(jv, oracle.u) - inner(oracle.v, ours)) / max(scale, 1e-12),  # both 0: an error of 0
         finite=finite,
-        count=int(_largest((out.count - ref.count)[good])),
+        count=int(_largest((out.count - ref.count)[good])) if settings.extent and out.count is not None else 0,
         out=out,
     )
 

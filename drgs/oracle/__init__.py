@@ -90,7 +90,7 @@ class OracleScene:
         sh: (N, K, 3) coefficients.
         features: (N, D), or None.
         middle: (3,) about where world coordinates are rounded: the mean of float64 means, 0 of float32 ones.
-        extent: (N,) cut-off radius in standard deviations.
+        extent: (N,) cut-off radius in standard deviations; where settings have none, so large that nothing is cut off.
         index: (N,) places among the Gaussians that were passed in.
         colors: (N, 3) where they are those towards the means; None where they depend on the ray.
         near_margin: (N,) z / near - 1, where means behind `near` were culled; else None.
@@ -150,6 +150,8 @@ class OracleRays:
     shape: tuple[int, ...]
 
 
+# Standard deviations, beyond which there is at most exp(-40.5) = 3e-18 of an opacity: float64 ends at 1e-16.
+_NO_EXTENT = 9.0
 _COLUMNS = ("rolling_left_to_right", "rolling_right_to_left")
 _BACKWARD = ("rolling_bottom_to_top", "rolling_right_to_left")
 _GLOBAL = {"shutter": "global", "w2c_end": None}
@@ -197,10 +199,10 @@ def activate(g: Any, s: RenderSettings) -> OracleScene:
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     ]  # fmt: skip
     rotation = torch.stack(rows, dim=-1).reshape(-1, 3, 3)
-    extent = torch.full((n,), s.extent or 0.0, dtype=torch.float64)
-    if s.extent is None:
-        # The N tails beyond these radii add up to at most N alpha exp(-extent^2 / 2) = 1e-5. No derivative: a cut-off.
-        extent = (2 * torch.log((torch.sigmoid(logits.detach()) * n / 1e-5).clamp(min=1))).sqrt()
+    softplus = torch.logaddexp(logits, torch.zeros_like(logits))
+    extent = torch.full((n,), s.extent or _NO_EXTENT, dtype=torch.float64)
+    if s.extent is None and s.order == "entry":
+        extent = _entered(torch.sigmoid(logits) if s.response == "peak" else softplus)
     scales = log_scales.exp()
     width = scales.detach().amax(1)
     relative = scales / width[:, None]
@@ -213,7 +215,7 @@ def activate(g: Any, s: RenderSettings) -> OracleScene:
         adjugate=others[:, :, None] * rotation.transpose(1, 2),
         volume=relative.prod(1),
         logits=logits,
-        softplus=torch.logaddexp(logits, torch.zeros_like(logits)),
+        softplus=softplus,
         sh=sh,
         features=None if g.features is None else float64(g.features),
         # Float64 means are moved to their middle before they are rounded to float32; a number, no derivative.
@@ -221,6 +223,18 @@ def activate(g: Any, s: RenderSettings) -> OracleScene:
         extent=extent,
         index=torch.arange(n),
     )
+
+
+def _entered(strength: torch.Tensor) -> torch.Tensor:
+    """(N,) radii r of the ellipsoids whose entry points order hits, in standard deviations: with N times a strength, or
+    1 if that is less, strength (1 + r^2) exp(-r^2 / 2) = 1e-5.
+    """
+    # Which hit comes first has no derivative.
+    least = torch.log((strength.detach() * len(strength)).clamp(min=1) / 1e-5)
+    half = least
+    for _ in range(4):
+        half = least + torch.log1p(2 * half)
+    return (2 * half).sqrt()
 
 
 def scale_and_shift(cam: Any) -> tuple[torch.Tensor, torch.Tensor]:

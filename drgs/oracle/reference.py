@@ -94,7 +94,8 @@ def render(
             a gradient along rigid motions, as it is read as one (`cameras.rigid`). With `rays` it
             only gives the center for `order="center"` and SH directions and may be None: then that
             center is each ray's own origin.
-        settings: The `RenderSettings`; `traversal` plays no role here.
+        settings: The `RenderSettings`; `traversal` plays no role here, and without an `extent` none cuts anything off
+            (of order `entry` it is the adaptive one, whose ellipsoids are entered).
         rays: Origins and directions, (..., 3) each, in place of the camera's; not for `ewa`.
         tolerance: A pixel is `ambiguous` when rounding could move a weight by more than `effect`:
             neighbors in the order have keys closer than `tolerance` times the distance (exact ties
@@ -385,7 +386,9 @@ class _Peak:
     def opacity(self, scene: OracleScene, rho2: Tensor, t: Tensor, length: Tensor) -> tuple:
         """a and 1 - a, neither by a difference that cancels."""
         alpha = torch.sigmoid(scene.logits)
-        return alpha * torch.exp(-rho2 / 2), torch.sigmoid(-scene.logits) - alpha * torch.expm1(-rho2 / 2)
+        a = alpha * torch.exp(-rho2 / 2)
+        # Each has a derivative that cancels where it is not taken.
+        return a, torch.where(scene.logits < 0, 1 - a, torch.sigmoid(-scene.logits) - alpha * torch.expm1(-rho2 / 2))
 
 
 class _OddPeak(_Peak):

@@ -33,11 +33,12 @@ class Integral(Peak):
 
     def strength(self, logit: Float, opacity: Float, e: Float) -> Float:
         """softplus(logit): the optical depth -log(1 - alpha) of a full pass."""
-        return dr.select(logit >= 0, logit, 0) + dr.log(1 + e)
+        return _softplus(logit, e)
 
     def strength_slope(self, logit: Float, opacity: Float, e: Float) -> Float:
         """softplus' / softplus."""
-        return opacity / (dr.maximum(logit, 0) + dr.log(1 + e))
+        softplus = _softplus(logit, e)
+        return dr.select(softplus > 0, opacity / softplus, 1)  # 1 where both vanish in float64
 
     def slots(self, world: bool, depth: bool) -> list[int]:
         """All numbers of the shape: the opacity depends on t*, too."""
@@ -82,3 +83,9 @@ class Integral(Peak):
 
 INTEGRAL = Integral()
 """The row of `RESPONSES`."""
+
+
+def _softplus(logit: Float, e: Float) -> Float:
+    """log(1 + exp(logit)), e = exp(-|logit|); of a small e 1 + e would lose the digits."""
+    series = e * dr.fma(e, dr.fma(e, 1 / 3, -0.5), 1)
+    return dr.select(logit >= 0, logit, 0) + dr.select(e < 1e-4, series, dr.log(1 + e))

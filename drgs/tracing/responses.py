@@ -22,7 +22,8 @@ class Response(Protocol):
     Attributes:
         planar: The response is a model of the image plane: tiles, order `center` and pinhole cameras only.
         front_only: Peaks behind the origin of a ray do not count.
-        at_most_alpha: No hit has more opacity than alpha exp(-rho^2 / 2).
+        at_most_alpha: No hit has more opacity than alpha exp(-rho^2 / 2); else none has more than softplus(logit) times
+            that exponential. The adaptive extent hangs on it.
         extra: Floats a Gaussian that `slopes` needs besides the record (`extras`).
         by_tangents: These floats are tangents of the record, not closed forms.
     """

@@ -16,7 +16,7 @@ import torch
 
 from drgs import runtime
 from drgs.tracing.arrays import Float, Lib, Mask, UInt32
-from drgs.tracing.primitives import Ray
+from drgs.tracing.primitives import LEAST_EXTENT2, Ray
 from drgs.tracing.records import load_record
 from drgs.tracing.sort_keys import BEYOND, EMPTY, name_of, positive, word_of
 from drgs.tracing.walk import ListStream, Part
@@ -51,7 +51,7 @@ class SortedHits:
         in_lists: Function that makes a part with these pixels, four a lane, along the lists of the tiles.
         index: (entries,) Gaussians of all lists; of the same key the first entry is the nearer hit.
         lengths: (tiles,) of the lists of these tiles.
-        cut: (tiles,) what is taken off the squared extents, or None.
+        cut: (tiles,) what is taken off the squared extents, down to `LEAST_EXTENT2`, or None.
         budget: Memory to hold the order in once it is known.
     """
 
@@ -100,7 +100,7 @@ class SortedHits:
         starts = [first * PIXELS + column * own for column in slots.columns]
         words = dr.full(lib.Float64, BEYOND, slots.size)
         lane = dr.arange(lib.UInt32, tiles * PIXELS // share)
-        cut = lib.Float(0) if self.cut is None else dr.gather(lib.Float, self.cut, lane // (PIXELS // share))
+        cut = None if self.cut is None else dr.gather(lib.Float, self.cut, lane // (PIXELS // share))
         dr.eval(words, starts, cut)
         found = part.run(_Finder(part, words, starts, cut))
         dr.eval(found, words)  # together: one kernel
@@ -154,10 +154,10 @@ class _Finder:
         part: Rays that look for hits.
         words: Buffer of all rows.
         starts: Start of the row of each shared ray.
-        cut: What is taken off the squared extents.
+        cut: What is taken off the squared extents, or None.
     """
 
-    def __init__(self, part: Part, words: Float, starts: list[UInt32], cut: Float) -> None:
+    def __init__(self, part: Part, words: Float, starts: list[UInt32], cut: Float | None) -> None:
         self.m = part.model
         self.records = part.records
         self.words = words
@@ -174,7 +174,8 @@ class _Finder:
         lib = self.m.lib
         out = []
         record = load_record(lib, self.records, index, active)
-        record[self.m.extent2] -= self.cut
+        if self.cut is not None:
+            record[self.m.extent2] = dr.maximum(record[self.m.extent2] - self.cut, LEAST_EXTENT2)
         for start, ray, st, place in zip(self.starts, rays, states, places, strict=True):
             _, key, ok = self.m.hit(record, ray, active & (st["alive"] != 0))
             key = positive(lib, key) if self.m.signed else key

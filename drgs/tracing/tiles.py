@@ -24,7 +24,7 @@ from drgs.tracing.arrays import Float, Int32, Lib, Mask, UInt32, UInt64
 from drgs.tracing.free_rays import FreeRays
 from drgs.tracing.kernels import HitModel
 from drgs.tracing.lens_rays import LensRays
-from drgs.tracing.primitives import Patch, Projected, Ray
+from drgs.tracing.primitives import LEAST_EXTENT2, Patch, Projected, Ray
 from drgs.tracing.records import load_record
 from drgs.tracing.responses import response_of
 from drgs.tracing.rows import MemoryBudget, SortedHits
@@ -50,7 +50,6 @@ _LANE_PIXELS = {1: [(0, 0)], 2: [(0, 0), (0, 4)], 4: [(0, 0), (4, 0), (0, 4), (4
 _NO_KEY = 2**64 - 1  # key of no entry: sorted behind all others
 # bytes of the orders of all pixels that are held, because derivatives need them again; chosen
 _MAX_ORDER_BYTES = 128 << 20
-_MAX_TAIL_SUM = 5e-6  # largest sum of opacities of the tails left out of a pixel: half of the bound of images, 1e-5
 _TEST_TILES_FROM = 8  # tiles of a box, on average, from which on each tile is tested against the ellipse
 _TEST_BLOCKS_FROM = 16  # likewise, from which on blocks of tiles are tested first
 _BLOCK = 8  # tiles along the edge of a block
@@ -62,7 +61,7 @@ class TileTraversal:
     Args:
         pinhole: Opaque Float64 (fx, skew, cx, fy, cy).
         lens: The camera's, if it is no pinhole; of rays without a common origin `FreeRays`.
-        trimmed: Leave tails out, in `ray` order, whose opacities add up to `_MAX_TAIL_SUM` at most in a pixel.
+        trimmed: In `ray` order, bound the tails of the Gaussians that a tile lists in place of those of all.
     """
 
     def __init__(
@@ -271,7 +270,7 @@ class Lists:
         start, end: (tiles,) range of each tile.
         columns, rows: Tiles in x and y.
         pairs: Number of entries.
-        cut: (tiles,) what is taken off the squared extent of each entry; None: nothing.
+        cut: (tiles,) what is taken off the squared extent of each entry, down to `LEAST_EXTENT2`; None: nothing.
     """
 
     index: UInt32
@@ -365,10 +364,8 @@ def _shorter(
     count: int,
     lens: LensRays | None,
 ) -> Lists:
-    """Shorter lists: an extent that bounds the sum of the tails of all Gaussians is longer than a tile needs, which
-    lists few of them. Beyond the extent a Gaussian has at most the opacity 1e-5 / N (projection.py); beyond a squared
-    one that is less by c, exp(c / 2) times as much, so that n tails add up to
-    S = _MAX_TAIL_SUM where c = 2 ln(S N / 1e-5 n).
+    """Shorter lists: an extent that bounds the tails of all N Gaussians together is longer than a tile needs, which
+    lists n of them. Squared extents that are less by 2 ln(N / n), but no less than the least, keep the bound for n.
 
     Args:
         tile: (pairs,) of each entry.
@@ -377,7 +374,7 @@ def _shorter(
         lens: The camera's, if it is no pinhole.
     """
     listed = lib.Float(lists.end - lists.start)
-    cut = dr.maximum(2 * dr.log(_MAX_TAIL_SUM / 1e-5 * count / dr.maximum(listed, 1)), 0)
+    cut = 2 * dr.log(dr.opaque(lib.Float, count) / dr.maximum(listed, 1))
     loaded = load_record(lib, record, lists.index, lib.Bool(True))
     tiles = _Tiles(lib, settings, loaded, dr.gather(lib.Float, cut, tile), lens)
     x, y = lib.Int32(tile % lists.columns), lib.Int32(tile // lists.columns)
@@ -422,7 +419,7 @@ class _Tiles:
 
     Args:
         loaded: The first entries of each lane's record.
-        cut: What is taken off squared extents.
+        cut: What is taken off squared extents, down to `LEAST_EXTENT2`; None: nothing.
         lens: The camera's, if it is no pinhole.
         size: Pixels along the edge of a tile, or of a block of tiles.
     """
@@ -432,7 +429,7 @@ class _Tiles:
         lib: Lib,
         settings: RenderSettings,
         loaded: list[Float],
-        cut: Float | int = 0,
+        cut: Float | None = None,
         lens: LensRays | None = None,
         size: int = TILE,
     ) -> None:
@@ -442,7 +439,9 @@ class _Tiles:
         self.r = loaded
         self.response = response_of(settings)
         world = lens is not None and lens.world
-        self.limit = loaded[layout.W_EXT2 if world else layout.EXT2] - cut
+        self.limit = loaded[layout.W_EXT2 if world else layout.EXT2]
+        if cut is not None:
+            self.limit = dr.maximum(self.limit - cut, LEAST_EXTENT2)
         if settings.alpha_min > 0:
             least = dr.opaque(lib.Float, self.response.least_strength(settings.alpha_min))
             needed = 2 * dr.log(loaded[layout.W_ALPHA if world else layout.ALPHA] / least)
