@@ -60,6 +60,11 @@ class ExtremeCase:
         return RenderSettings.preset(self.preset, **self.fields)
 
     @property
+    def oracle_settings(self) -> RenderSettings:
+        """Settings of the oracle: `exact` is held to what it stands for, rays that no transmittance ends."""
+        return self.settings.replace(transmittance_min=0.0) if self.preset == "exact" else self.settings
+
+    @property
     def traversals(self) -> tuple[str, ...]:
         """Traversals that the case is run on."""
         return ("tiles",) if self.bvh == "skip" or self.settings.planar else ("tiles", "bvh")
@@ -164,6 +169,23 @@ def _opacities(g: Gaussians, cam: Camera) -> None:
     g.logit_opacities[4:8] = 16.1
     g.logit_opacities[8:10] = -100.0
     g.logit_opacities[10:] = 100.0
+
+
+def _faint(g: Gaussians, cam: Camera) -> None:
+    """Opacities of 1e-4 and 1e-5: what derivatives have is theirs."""
+    g.log_scales.add_(0.7)
+    g.logit_opacities[::2] = math.log(1e-4)
+    g.logit_opacities[1::2] = math.log(1e-5)
+
+
+def _fisheye(rng: np.random.Generator) -> Built:
+    """A fisheye that sees 175 degrees from side to side, with Gaussians in front of it and around it."""
+    g, cam = _base(rng, (24, 20), spread=2.0)
+    f = 0.5 * cam.width / math.radians(87.5)
+    K = np.array([[f, 0, cam.width / 2], [0, f, cam.height / 2], [0, 0, 1]])
+    with torch.no_grad():  # leaves are changed in place
+        g.means[:6] += torch.tensor(cam.center)
+    return g, dataclasses.replace(cam, K=K, model="opencv_fisheye", distortion=(0.02, -0.01, 0.0, 0.0))
 
 
 def _half(g: Gaussians, cam: Camera) -> None:
@@ -345,6 +367,8 @@ CASES = (
     *_cases("anisotropy 1e6:1, sheets", _change(_sheets), _ALL),
     *_cases("sub-pixel Gaussians, sigma 1e-3 px", _change(_subpixel), _ALL, bvh="rounds"),
     *_cases("opacity 1e-8 to 1 - 1e-7, logits of 100", _change(_opacities), _ALL),
+    *_cases("every opacity 1e-5 or 1e-4", _change(_faint), "exact integral ewa"),
+    *_cases("fisheye of 175 degrees", _fisheye, "exact integral"),
     *_cases("opacity exactly 1/2 (logit 0)", _change(_half), _ALL),
     *_cases("activations beyond float32", _change(_beyond_float32), _ALL, bvh="warns"),
     *_cases("2,000 coincident Gaussians", _change(_coincident, n=2000, K=1), "exact center integral"),

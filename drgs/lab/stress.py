@@ -1,5 +1,7 @@
 """The extremes of the renderer, on this machine and backend, against the float64 oracle.
 
+The oracle of `exact`, whatever its response, cuts nothing off: no extent, and no end of rays.
+
 A row a case and traversal: the largest error of the image; the relative error of the worst block of gradients, of the
 forward mode, and of the two against each other (`drgs.lab.accuracy.Errors`); the error of the exact Fisher diagonal
 against the oracle's dense Jacobian, of the group's largest entry. It holds if all are within `BOUNDS` and everything is
@@ -116,7 +118,7 @@ def truth_of(case: ExtremeCase) -> Truth:
     from drgs.lab.accuracy import FIELDS, Oracle, jacobian, squares
 
     rng = np.random.default_rng(3)
-    settings = case.settings
+    settings = case.oracle_settings
     g, cam = case.build(rng)
     names = [name for name in FIELDS if case.depth or name != "depth"]
     # 1e-6: near ties of float32 keys, ten times its rounding.
@@ -224,12 +226,19 @@ def _information(case: ExtremeCase, settings: RenderSettings, truth: Truth) -> t
     error = max(entry_error(diagonal[name], x) for name, x in truth.information.items())
     if not case.gain:
         return error, finite, truth.remark
-    gain, remark = _gain(g, view, settings, diagonal, truth.information)
+    gain, remark = _gain(g, view, settings, case.oracle_settings, diagonal, truth.information)
     return max(error, gain), finite, remark
 
 
-def _gain(g: Gaussians, cam: Camera, settings: RenderSettings, H: Information, truth: Information) -> tuple[float, str]:
-    """Relative error of the gains of a second view for lambda = 0, and a remark; NaN if one is not defined."""
+def _gain(
+    g: Gaussians, cam: Camera, settings: RenderSettings, exactly: RenderSettings, H: Information, truth: Information
+) -> tuple[float, str]:
+    """Relative error of the gains of a second view for lambda = 0, and a remark; NaN if one is not defined.
+
+    Args:
+        exactly: Settings of the oracle.
+        H, truth: Information of the first view, by the renderer and by the oracle.
+    """
     from drgs import fisher, reference
     from drgs.gain import Prior, information_gain
     from drgs.lab.accuracy import jacobian, squares
@@ -239,7 +248,7 @@ def _gain(g: Gaussians, cam: Camera, settings: RenderSettings, H: Information, t
     other = dataclasses.replace(cam, K=K)
     prior = Prior(value=0.0)
     Hc = fisher.diagonal(g, other, settings)
-    true = squares(jacobian(g, reference.render(g, other, settings), features=True))
+    true = squares(jacobian(g, reference.render(g, other, exactly), features=True))
     worst = 0.0
     informed = {name: x > 0 for name, x in truth.items()}
     for criterion in _CRITERIA:
@@ -265,7 +274,7 @@ def _gain(g: Gaussians, cam: Camera, settings: RenderSettings, H: Information, t
 
 
 def _window(cam: Camera, good: torch.Tensor, most: int) -> Camera:
-    """The camera of the largest rectangle of good pixels, shortened to `most` pixels."""
+    """The camera of the largest rectangle of good pixels, or of `most` pixels in its middle."""
     height, width = good.shape
     best = (0, 0, 0, 0, 0)
     heights = np.zeros(width, int)
@@ -279,8 +288,8 @@ def _window(cam: Camera, good: torch.Tensor, most: int) -> Camera:
                     break
                 best = max(best, (low * (right - left + 1), left, bottom + 1 - low, right - left + 1, low))
     _, x, y, w, h = (int(v) for v in best)
-    w, h = (w, max(1, min(h, most // w))) if w <= most else (most, 1)
-    return cropped(cam, x, y, w, h)
+    width, height = (w, max(1, min(h, most // w))) if w <= most else (most, 1)
+    return cropped(cam, x + (w - width) // 2, y + (h - height) // 2, width, height)
 
 
 def refused(case: Refusal) -> StressRow:
