@@ -18,7 +18,16 @@ if TYPE_CHECKING:
 
     from drgs.cameras import Camera
 
-__all__ = ["Focus", "level_frame", "middle_camera", "path", "scene_extent", "scene_origin", "upright"]
+__all__ = [
+    "REFERENCE_EXTENT",
+    "Focus",
+    "level_frame",
+    "middle_camera",
+    "path",
+    "scene_extent",
+    "scene_origin",
+    "upright",
+]
 
 # Angles and shares are chosen by hand, so that orbits, forward-facing captures, walks and drives of the data sets in
 # tests/test_orbits.py are classified rightly; no study varied them.
@@ -36,6 +45,7 @@ _MAX_PATH_TURN = 75.0  # degrees between two photographs that follow each other 
 _MIN_SMOOTHING = 0.75  # standard deviation of the smoothing in steps between photographs, at least
 _MAX_PITCH = 80.0  # degrees above or below the horizon, beyond which an axis does not say what is ahead
 _SMOOTHINGS_PER_PATH = 40  # at least 1 / 40 of the whole path, of which a video has many photographs
+REFERENCE_EXTENT = 5.0  # world units: `scene_extent` of the scenes that others' constants with a length in them are for
 _EXTENT_MARGIN = 1.1  # 3DGS's own factor of the radius of the cameras
 _MOST_ROUNDING = 1e-3  # pixels that float64 may round a place in the scene by
 

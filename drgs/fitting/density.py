@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import torch
 
+from drgs.data.camera_layout import REFERENCE_EXTENT
 from drgs.ellipsoids import semi_axes
 from drgs.fitting.rows import GaussianRows
 
@@ -19,7 +20,6 @@ __all__ = ["add_gaussians", "divide", "explore", "relocate"]
 
 _MAX_COPIES = 51  # of one Gaussian at a time [1]; binomials up to C(50, k) are exact enough in float64
 _MAX_OPACITY = 1 - 1e-6  # its logit is finite in float32
-_REFERENCE_EXTENT = 5.0  # world units: extent of the scenes of [1], whose strength of noise has a length in it
 
 
 def divide(opacity: torch.Tensor, copies: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -85,7 +85,7 @@ def explore(rows: GaussianRows, rate: float, extent: float, strength: float, gen
     Args:
         rows: Changed in place.
         rate: Relative learning rate of the means at this step (1.6e-4 to 1.6e-6 in 3DGS).
-        extent: Extent of the scene; the noise of [1] depends on the unit of length, here it does not.
+        extent: Extent of the scene; the noise of [1] has a length in it, that of scenes of `REFERENCE_EXTENT`.
         strength: Factor; 5e5 in [1].
         generator: Generator of the noise.
     """
@@ -97,7 +97,7 @@ def explore(rows: GaussianRows, rate: float, extent: float, strength: float, gen
     noise = torch.randn(len(rows), 3, generator=generator)[moving]
     axes = semi_axes(t["quats"][moving], t["log_scales"][moving].exp())
     shaped = (axes @ (axes.transpose(1, 2) @ noise[..., None]))[..., 0]
-    scale = strength * rate * _REFERENCE_EXTENT**2 / extent
+    scale = strength * rate * REFERENCE_EXTENT**2 / extent
     t["means"][moving] += gate[moving, None] * scale * shaped
 
 

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import torch
 
+from drgs.data.camera_layout import REFERENCE_EXTENT
+
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.fitting.config import FitConfig
@@ -155,8 +157,8 @@ class Scale:
 
     def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor:
         """See `LossTerm`."""
-        # The weight of MCMC's authors is for scenes with an extent of about 5.
-        return self.weight * gaussians.scales[self.far :].mean() * (5 / self.extent)
+        # The weight of MCMC's authors has a length in it.
+        return self.weight * gaussians.scales[self.far :].mean() * (REFERENCE_EXTENT / self.extent)
 
 
 def psnr_of(mse: float) -> float:
