@@ -11,6 +11,7 @@ from drgs.fitting.components.base import RunViews
 from drgs.fitting.components.table import COMPONENTS
 from drgs.fitting.frames import frames_for, load_dataset
 from drgs.fitting.metrics import VIEW_PICTURES, Lpips, evaluate, through_renderers, write_metrics
+from drgs.fitting.near_planes import warn_of_near_planes
 from drgs.fitting.records import fit_record, fitted_views, load_run
 from drgs.fitting.renderers import renderers_to_measure
 from drgs.fitting.stages import moving_labels
@@ -79,6 +80,9 @@ def evaluate_run(
     held_out = frames if split == "test" and scale == 1 else []
     more |= _component_metrics(RunViews(scene, config.settings, bool(recorded.refined), *cameras, held_out))
     wanted = renderers_to_measure(config.renderers, config.settings, renderer, config.data.undistort == "off")
+    seen = scene.at(frames[0].camera.time)
+    means = seen.means.detach().double().cpu().numpy() + seen.origin
+    warn_of_near_planes(wanted, [frame.camera for frame in frames], means)
     return write_metrics(
         run,
         split,

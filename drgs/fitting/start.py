@@ -12,7 +12,9 @@ from drgs.data import scene_extent
 from drgs.display.progress import Bar
 from drgs.fitting.components.base import Setup
 from drgs.fitting.components.table import components_of
+from drgs.fitting.near_planes import warn_of_near_planes
 from drgs.fitting.records import check_checkpoint
+from drgs.fitting.renderers import renderers_to_measure
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.trainer import Trainer
 from drgs.io.checkpoint import load_state
@@ -47,7 +49,9 @@ def start(setup: Setup, begin: Path | None = None) -> tuple[Trainer, str]:
             rows, source = begin_with(begin, setup.frames, dataset.points, dataset.colors, config)
             bar.note(f"begins with {source}")
         setup.points = rows.places()[rows.far :].numpy()
-    extent = scene_extent([frame.camera for frame in setup.frames], setup.points)
+    cameras = [frame.camera for frame in setup.frames]
+    extent = scene_extent(cameras, setup.points)
+    warn_of_near_planes(renderers_to_measure(config.renderers, config.settings), cameras, setup.points)
     return Trainer(config, setup.frames, rows, extent, list(setup.components), setup), source
 
 
