@@ -179,4 +179,4 @@ def _visible_share(cameras: list[Camera], points: np.ndarray | None) -> float:
     # Matrices read the wrong way round may put all cameras into the place that they look at.
     distances = np.linalg.norm(focus.eyes - focus.center, axis=1)
     size = np.abs(focus.center - scene_origin("train_meta", cameras)).max()
-    return float((distances > 1e-3 * max(1.0, float(size))).sum() / len(cameras))
+    return float((distances > 1e-3 * size).sum() / len(cameras))

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Shared", "write_page"]
 
-_NEAR_PLANE = 0.01  # scene units: the near plane of gsplat
+_NEAR_SHARE = 2e-3  # near plane over the distance to what is looked at: about gsplat's 0.01 in the units of COLMAP
 _FAR_FACTOR = 10.0  # far plane over the distance of the farthest Gaussian: a reader may step back as far; chosen
 
 
@@ -86,7 +86,7 @@ def write_page(shared: Shared, path: str | os.PathLike) -> dict[str, int]:
     reach = float(np.linalg.norm(shared.target - begin.center))
     scene: dict[str, Any] = {
         "background": list(shared.background),
-        "near": _NEAR_PLANE,
+        "near": _NEAR_SHARE * reach,
         "far": _FAR_FACTOR * max(float(distances.max()), reach),
         "reach": reach,
         "offset": origin.tolist(),  # what positions are relative to
