@@ -34,6 +34,8 @@ _HEADS = {"means": 3, "quats": 4, "log_scales": 3}
 _SPAN_TOLERANCE = 1e-6  # of the span: how far outside of it a time may lie, by rounding
 _LEAST_SIDE = 1e-3  # of the longest side of the bounds: shortest other side, which coordinates are divided by; chosen
 PHI = "phi."
+LENGTHS = ("mlp.means.3.weight", "mlp.means.3.bias")
+"""Weights of a field that are lengths: the last of the head for means, whose outputs are in world units."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

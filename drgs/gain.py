@@ -16,7 +16,7 @@ from drgs.information.gains import (
     scorer,
     variances,
 )
-from drgs.information.prior import Prior
+from drgs.information.prior import Prior, unit_length
 from drgs.information.sums import Information
 
 __all__ = [
@@ -34,5 +34,6 @@ __all__ = [
     "dense",
     "information_gain",
     "scorer",
+    "unit_length",
     "variances",
 ]

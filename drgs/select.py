@@ -103,7 +103,7 @@ def select(
             Not done where scores can rise (a relative lambda, lambda = 0, or z-scores).
         progress: Called with (views done, views) after each view.
         information: Camera -> Information, in place of `drgs.fisher`; the policy's own kind: {"coverage": (N,)} for
-            `coverage`, {"blocks": (N, 13, 13)} for criterion `block_logdet`.
+            `coverage`, {"blocks": (N, 13, 13)} for criterion `block_logdet`. lambda is in the units of its parameters.
         workers: Processes that compute the information of single views, here or on other machines
             (`drgs.cluster.connect.opened`); scores and picks are made here, of the same bits.
         refine: Move each pick to where its view scores higher; of `fisher`, `fisherrf` and `coverage`, whose scores add

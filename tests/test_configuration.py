@@ -79,7 +79,8 @@ def test_files_hold_the_records():
     record = json.loads(json.dumps(FULL.to_json()))
     assert FitConfig.from_json(record) == FULL
     assert record["density"]["max_gaussians"] == 50
-    assert record["selection"]["scoring"]["prior"] == {"value": 1e-3, "relative": True, "groups": {"sh": 0.5}}
+    prior = {"value": 1e-3, "relative": True, "groups": {"sh": 0.5}, "length": None}
+    assert record["selection"]["scoring"]["prior"] == prior
     assert set(record["selection"]["scoring"]) & {"settings", "semantics"} == set()
 
 

@@ -166,11 +166,12 @@ def test_information_that_the_command_wrote(tmp_path, monkeypatch):
     assert fisher("scene.ply --train cameras.json --limit 1 -o out --quiet") == 0
     assert convert("scene.ply", "b.ply", "--uncertainty", "out/information.safetensors", "--prior", "4") == 0
     column = plyfile.PlyData.read("b.ply")["vertex"]["uncertainty_means"]
-    H, _ = load_state("out/information.safetensors")
+    H, header = load_state("out/information.safetensors")
     unseen = (H["means"] == 0).all(1).numpy()
     assert 0 < unseen.sum() < 10
-    np.testing.assert_allclose(column[unseen], math.sqrt(3 / 4), rtol=1e-6)
-    assert (column[~unseen] < math.sqrt(3 / 4)).all()
+    known_before = header["length"] * math.sqrt(3 / 4)
+    np.testing.assert_allclose(column[unseen], known_before, rtol=1e-6)
+    assert (column[~unseen] < known_before).all()
 
 
 def test_labels_are_those_of_the_largest_cosine(tmp_path, caplog):

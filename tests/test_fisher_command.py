@@ -21,7 +21,7 @@ from drgs.data import load
 from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.display.pictures import map_picture
 from drgs.files import load_ply, load_state, save_ply
-from drgs.gain import Prior
+from drgs.gain import Prior, unit_length
 from drgs.integrator import render
 from drgs.settings import RenderSettings
 from drgs.train import fit
@@ -79,12 +79,15 @@ def test_lambda_is_one_unless_told_otherwise(place, monkeypatch, capsys):
     line = "run --limit 1 --preset fast --blocks geometry"
     default, _ = run(line, place, monkeypatch, capsys)
     given, _ = run(f"{line} --prior 1", place, monkeypatch, capsys)
-    assert default["prior"] == given["prior"] == {"value": 1.0, "relative": False}
+    views = {view.name: view.camera for view in load(place / "data").views}
+    known = [views[name] for name in default["known"]["names"]]
+    length = unit_length(load_ply(place / "run/point_cloud.ply"), known)
+    assert default["prior"] == given["prior"] == {"value": 1.0, "relative": False, "length": pytest.approx(length)}
     gains = [found["views"][0]["gain"] for found in (default, given)]
     assert gains[0].keys() == gains[1].keys()
     assert_same_sums(*(list(gain.values()) for gain in gains))
     relative, _ = run(f"{line} --relative-prior", place, monkeypatch, capsys)
-    assert relative["prior"] == {"value": 1e-6, "relative": True}
+    assert relative["prior"] == {"value": 1e-6, "relative": True, "length": pytest.approx(length)}
 
 
 def test_lambda_zero_leaves_unseen_parameters_out(place, monkeypatch, capsys):

@@ -103,7 +103,7 @@ def test_prior():
     H = {"means": torch.tensor([0.0, 1.0, 3.0, 100.0]).double(), "sh": torch.zeros(3).double()}
     assert Prior(0.5, groups={"sh": 2}).per_group(H) == {"means": 0.5, "sh": 2.0}
     assert Prior(0.5, relative=True).per_group(H) == {"means": 1.5, "sh": 0.0}
-    assert Prior(np.float32(0.5)).to_json() == {"value": 0.5, "relative": False} == Prior(0.5).to_json()
+    assert Prior(np.float32(0.5)).to_json() == {"value": 0.5, "relative": False, "length": None} == Prior(0.5).to_json()
     assert type(Prior(np.float32(0.5)).value) is float
     found = variances(H, Prior(0.5, relative=True))
     assert found["means"].tolist() == pytest.approx([1 / 1.5, 1 / 2.5, 1 / 4.5, 1 / 101.5])

@@ -112,7 +112,12 @@ def test_every_field_of_a_fit_is_an_option():
     offered, fields = options_in(options.Fit), options_in(FitConfig)
     assert len(fields) > 70
     assert set(fields) <= set(offered)
-    assert {name for name, one in fields.items() if one.spec.file_only} == {"weights", "groups", "prior_groups"}
+    assert {name for name, one in fields.items() if one.spec.file_only} == {
+        "weights",
+        "groups",
+        "prior_groups",
+        "prior_length",
+    }
     for name, one in fields.items():
         assert offered[name].path == ("fit", *one.path)
         assert one.spec.help[0].isupper() or one.spec.help.startswith("lambda"), name

@@ -109,7 +109,7 @@ def test_scores_are_the_oracles(world):
                 else ({"blocks": blocks[view]}, {"blocks": sum(blocks[:3])})
             )
             everything = {name: sum(x[name] for x in squares) for name in H} if criterion == "v_opt" else None
-            truth = information_gain(new, old, criterion, Prior(1e-2), pool=everything)
+            truth = information_gain(new, old, criterion, found.prior, pool=everything)
             assert found.scores[i] == pytest.approx(truth.total, rel=1e-4)
             assert found.parts[i] == pytest.approx(truth.parts, rel=1e-3, abs=1e-6 * truth.total)
         assert found.picks[0].index == int(np.argmax(found.scores))
@@ -455,7 +455,7 @@ def test_scene_that_moves(world):
     H = fisher.diagonal(moving.at(1.0), known)
     for camera, score in zip(cameras, found.scores, strict=True):
         part = fisher.diagonal(moving.at(camera.time), camera)
-        assert score == pytest.approx(information_gain(part, H, "eig").total, rel=1e-5)
+        assert score == pytest.approx(information_gain(part, H, "eig", found.prior).total, rel=1e-5)
     assert found.scores[0] != pytest.approx(found.scores[1], rel=1e-2)
     assert select(moving, cameras, known, cache=cache, blocks=("geometry",)).computed == 0
     # The speed moves nothing at time 0; other groups are other information.

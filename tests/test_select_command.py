@@ -16,7 +16,7 @@ from drgs.commands.orbits import dome
 from drgs.data import load
 from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.files import Run, load_ply, save_ply
-from drgs.gain import Prior, information_gain
+from drgs.gain import Prior, information_gain, unit_length
 from drgs.train import fit
 
 
@@ -83,7 +83,14 @@ def test_commands_know_the_backdrop(place, monkeypatch, capsys):
     for row in report["candidates"]:
         want = (everything * (1 / (H + 1e-2) - 1 / (H + 1e-2 + ask([row["name"]])))).sum()
         assert row["parts"]["backdrop"] == pytest.approx(float(want), rel=1e-4)
-    assert (report["criterion"], report["prior"]) == ("v_opt", {"value": 1e-2, "relative": False})
+    assert (report["criterion"], report["prior"]) == (
+        "v_opt",
+        {
+            "value": 1e-2,
+            "relative": False,
+            "length": pytest.approx(unit_length(g, [views[x] for x in (*report["known"]["names"], *names)])),
+        },
+    )
     assert cli.main(["fisher", "run", "--limit", "2", "--preset", "fast", "--maps", "-o", "fisher"]) == 0
     told = json.loads((place / "fisher/fisher.json").read_text())
     assert told["blocks"] == ["geometry", "backdrop"]

@@ -405,7 +405,8 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Record):
         return value.to_json()
     if dataclasses.is_dataclass(value):
-        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        kind: Any = type(value)
+        return {name: _plain(getattr(value, name)) for name in hints_of(kind)}
     if isinstance(value, Mapping):
         return {key: _plain(x) for key, x in value.items()}
     return [_plain(x) for x in value] if isinstance(value, list | tuple) else value

@@ -92,7 +92,7 @@ def uncertainty_columns(path: Path, g: Gaussians, prior: Prior) -> dict[str, np.
         FileNotFoundError: If there is no such file.
         ValueError: If it is no such file, or about other Gaussians.
     """
-    information, _ = load_state(path)
+    information, header = load_state(path)
     known = {name: information[name] for name in GROUPS if name in information}
     for name, x in known.items():
         if x.ndim == 0 or len(x) != len(g):
@@ -105,7 +105,8 @@ def uncertainty_columns(path: Path, g: Gaussians, prior: Prior) -> dict[str, np.
             f"{path}: must hold information of Gaussians, holds {', '.join(information)[:80] or 'nothing'}"
         )
     check(str(path), known)
-    found = variances(known, Prior(prior.value))
+    # An older file does not say in which unit positions counted: it was that of the world.
+    found = variances(known, prior.over(header.get("length") or 1.0))
     return {f"uncertainty_{name}": x.reshape(len(g), -1).sum(1).sqrt().float().numpy() for name, x in found.items()}
 
 

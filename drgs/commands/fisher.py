@@ -98,7 +98,7 @@ class InformationMaps:
         path: File or run that the scene is of.
         given: The scene.
         scoring: What counts, how it is computed, and the settings that views are rendered with.
-        prior: lambda.
+        prior: lambda; its unit of positions is, unless it has one, that of the known views.
         known: Known views.
         views: Views that maps are of.
         source: Where they come from, in words.
@@ -129,7 +129,8 @@ class InformationMaps:
         """
         settings, cameras = self.scoring.settings, self.known.cameras
         blocks = SceneBlocks.of(self.given.scene, self.scoring, [*cameras, *self.views], "fisher")
-        compared = ComparedMaps(self.given.scene, settings, self.prior) if self.compare else None
+        prior = self.prior.in_scene(self.given.scene, cameras)
+        compared = ComparedMaps(self.given.scene, settings, self.prior.over(1.0)) if self.compare else None
         names = pictures.file_names([camera.name for camera in self.views])
         kinds = [*_map_kinds(blocks.names), *(["maps"] if compared else [])]
         output.check(f"{name}.{kind}.png" for name in names for kind in kinds)
@@ -144,15 +145,19 @@ class InformationMaps:
         H = together(by_block)
         rows = []
         for camera, name in zip(self.views, names, strict=True):
-            rows.append(_view(output.path, blocks, camera, name, H, self.prior, compared, self.pose))
+            rows.append(_view(output.path, blocks, camera, name, H, prior, compared, self.pose))
             advance()
         groups = {name: GroupSummary.of(x, by_block, name) for name, x in H.items()}
         header = {"groups": list(H), "views": [camera.name for camera in cameras], "settings": settings}
-        save_state(output.path / "information.safetensors", H, header | {"blocks": list(by_block)})
-        write_json(output.path / "fisher.json", self._report(blocks, groups, rows))
+        save_state(
+            output.path / "information.safetensors", H, header | {"blocks": list(by_block), "length": prior.length}
+        )
+        write_json(output.path / "fisher.json", self._report(blocks, prior, groups, rows))
         return groups, rows
 
-    def _report(self, blocks: SceneBlocks, groups: dict[str, GroupSummary], rows: list[MappedView]) -> dict[str, Any]:
+    def _report(
+        self, blocks: SceneBlocks, prior: Prior, groups: dict[str, GroupSummary], rows: list[MappedView]
+    ) -> dict[str, Any]:
         """Contents of fisher.json."""
         scoring = self.scoring
         is_probed = "deformation" in blocks.names or scoring.method == "probes"
@@ -162,7 +167,7 @@ class InformationMaps:
             "scene": str(self.path),
             "gaussians": len(self.given.gaussians),
             "method": scoring.method,
-            "prior": self.prior.to_json(),
+            "prior": prior.to_json(),
             "blocks": list(blocks.names),
             "semantics": blocks.metric.to_json() if blocks.metric else None,
             **blocks.scoring.nuisances.if_any(),
@@ -377,7 +382,7 @@ class ComparedMaps:
     Args:
         scene: The scene that is seen.
         settings: Settings of the renderer.
-        prior: lambda.
+        prior: lambda of FisherRF, whose positions are in world units.
     """
 
     def __init__(self, scene: Scene, settings: RenderSettings, prior: Prior) -> None:

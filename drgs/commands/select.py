@@ -96,7 +96,7 @@ def _report(
         "policy": args.policy,
         "criterion": args.scoring.criterion if args.policy == "fisher" else None,
         "method": args.scoring.method,
-        "prior": scoring.prior_of(args.policy).to_json(),
+        "prior": selection.prior_json(scoring, args.policy),
         **selection.blocks_json(),
         **(scoring.nuisances.if_any() if args.policy == "fisher" else {}),
         "seed": args.seed,

@@ -234,7 +234,7 @@ def _uncertainty(args: View, given: SceneInput, known: Known | None) -> Uncertai
         return None
     scoring = given.scoring(args.scoring, given.settings("fast"))
     blocks = SceneBlocks.of(given.scene, scoring, cameras, "fisher")
-    prior = args.scoring.prior or MAP_PRIOR
+    prior = (args.scoring.prior or MAP_PRIOR).in_scene(given.scene, cameras)
     return Uncertainty(
         cameras,
         lambda camera: together(blocks.information(camera)),

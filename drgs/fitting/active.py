@@ -345,7 +345,7 @@ class ActiveViews:
             "seconds": time.perf_counter() - began,
             "policy": active.policy,
             "criterion": scoring.criterion if active.policy == "fisher" else None,
-            "prior": scoring.prior_of(active.policy).to_json(),
+            "prior": selection.prior_json(scoring, active.policy),
             **selection.blocks_json(),
             **(scoring.nuisances.if_any() if active.policy == "fisher" else {}),
             "gaussians": len(scene.at(frames[0].camera.time)),

@@ -529,9 +529,17 @@ class SelectionConfig(Record):
         """All fields beside each other, as selection.json has them."""
         record = self.to_json()
         scoring = record.pop("scoring")
-        prior = scoring.pop("prior") or {"value": None, "relative": False}
+        prior = scoring.pop("prior") or {"value": None, "relative": False, "length": None}
         scoring |= scoring.pop("nuisances")
-        return record | scoring | {"prior": prior["value"], "relative_prior": prior["relative"]}
+        return (
+            record
+            | scoring
+            | {
+                "prior": prior["value"],
+                "relative_prior": prior["relative"],
+                "prior_length": prior["length"],
+            }
+        )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import torch
+
 from drgs.ellipsoids import DeformableScene
 
 if TYPE_CHECKING:
-    import torch
-
     from drgs.ellipsoids import Scene
 
-__all__ = ["NETWORK_GROUPS", "network_groups"]
+__all__ = ["NETWORK_GROUPS", "network_groups", "network_lengths"]
 
 NETWORK_GROUPS = {"grid": "phi.grid.", "mlp": "phi.mlp."}
 """Group -> what the names of its parameters begin with."""
@@ -32,3 +32,18 @@ def network_groups(scene: Scene) -> dict[str, dict[str, torch.Tensor]]:
         for group, prefix in NETWORK_GROUPS.items()
     }
     return {group: own for group, own in groups.items() if own}
+
+
+def network_lengths(scene: Scene) -> dict[str, torch.Tensor]:
+    """Group -> (P,) bool: its parameters that are lengths (`drgs.deform.LENGTHS`); groups without any are left out."""
+    groups = network_groups(scene)
+    if not groups:
+        return {}
+    from drgs.deform import LENGTHS, PHI  # scenes that do not move have none
+
+    lengths = {PHI + name for name in LENGTHS}
+    found = {
+        group: torch.cat([torch.full((x.numel(),), name in lengths) for name, x in own.items()])
+        for group, own in groups.items()
+    }
+    return {group: own for group, own in found.items() if bool(own.any())}

@@ -23,6 +23,7 @@ from drgs.information.quantity import Joint
 from drgs.information.sums import Information
 
 if TYPE_CHECKING:
+    from drgs.information.prior import Prior
     from drgs.information.scoring import Scoring
 
 __all__ = ["Combination", "joint_of"]
@@ -43,6 +44,10 @@ class Combination:
     scoring: Scoring
     apart: tuple[str, ...] = ()
     traced: str = ""
+
+    def with_prior(self, prior: Prior) -> Combination:
+        """With this prior."""
+        return dataclasses.replace(self, scoring=dataclasses.replace(self.scoring, prior=prior))
 
     @property
     def pooled(self) -> bool:

@@ -123,9 +123,10 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         combination: How a score is made of it; default by that scoring, all groups together.
     """
     combination = combination or Combination(pool.scoring)
+    prior = pool.prior_of(combination.scoring)
+    combination = combination.with_prior(prior)
     if pool.refine is not None and combination.apart:
         raise ValueError("select: refine must be None with combine zscore, which compares candidates; use combine sum")
-    prior = pool.scoring.prior_of()
     if not combination.traced or combination.apart:  # a trace alone has no lambda
         _check_prior(pool, prior)
     H, everything, scores, kept = _first_round(pool, information, combination)
@@ -136,6 +137,7 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         parts=[gain.parts for gain in gains],
         unseen=[math.fsum(gain.unseen.values()) for gain in gains],
         left_out=gains[0].left_out,
+        prior=dataclasses.replace(prior, lengths={}),  # what is told of it, as of the scoring, are plain numbers
         evaluations=len(gains),
         computed=information.computed,
         notes=[*_notes(gains, combination.apart), *_silent(information.has_any), *_crowded(pool.cache, information)],

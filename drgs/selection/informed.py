@@ -61,7 +61,8 @@ def fisherrf(pool: Pool) -> Selection:
 
     prior = pool.scoring.prior_of("fisherrf")
     weights = _without_rotations(pool.scoring.weights)
-    prior = dataclasses.replace(prior, groups=_without_rotations(prior.groups))
+    # FisherRF's lambda is in world units, whatever these are.
+    prior = dataclasses.replace(prior.over(1.0), groups=_without_rotations(prior.groups))
     joint = Joint((("", Diagonal("fisherrf", without=("features",))),))
     plain = dataclasses.replace(pool, masks=None)  # which FisherRF does not have
     return _greedy(_scored(plain, criterion="eig", prior=prior, weights=weights), joint)

@@ -16,6 +16,7 @@ from drgs.checks.arguments import must_be
 from drgs.ellipsoids import Scene
 from drgs.information.choices import Combine
 from drgs.information.criteria import criterion_named
+from drgs.information.prior import Prior
 from drgs.information.quantity import Quantity, ViewContext, once_per_time
 from drgs.information.scoring import Scoring
 from drgs.information.sums import Information
@@ -65,6 +66,7 @@ class Selection:
         evaluations: How often a candidate was scored.
         computed: Views whose information was computed, not taken from the cache.
         notes: What a reader of the result should know, one sentence each.
+        prior: lambda as it counted, with its length; None for policies without.
         blocks: The blocks of the image that the information is of; empty for policies without.
         semantics: What is coupled, if anything is: the metric's estimate, gamma and width.
         network: How the block `deformation` scored, and from how many probes, if it did.
@@ -81,11 +83,16 @@ class Selection:
     evaluations: int = 0
     computed: int = 0
     notes: list[str] = dataclasses.field(default_factory=list)
+    prior: Prior | None = None
     blocks: list[str] = dataclasses.field(default_factory=list)
     semantics: dict | None = None
     network: dict | None = None
     combine: Combine = "sum"
     seconds: float = 0.0
+
+    def prior_json(self, scoring: Scoring, policy: str) -> dict[str, Any]:
+        """lambda as files hold it; where none counted, that of the policy by a scoring."""
+        return (self.prior or scoring.prior_of(policy)).to_json()
 
     def blocks_json(self) -> dict[str, Any]:
         """What of images the scores are of, as files hold it."""
@@ -198,6 +205,13 @@ class Pool:
                 "select: combine and network must be left out with information, got "
                 f"{scoring.combine or scoring.network}; its groups are scored together, by criterion"
             )
+
+    def prior_of(self, scoring: Scoring) -> Prior:
+        """lambda by a scoring, in the length of all its cameras; of information by a function in world units."""
+        prior = scoring.prior_of()
+        if self.information is not None:
+            return prior.over(1.0)
+        return prior.in_scene(self.scene, [*self.train, *self.candidates])
 
     def compute_each(self, quantity: Quantity, cameras: Iterable[Camera]) -> Iterator[Information]:
         """One quantity of several views without masks; see `compute`."""

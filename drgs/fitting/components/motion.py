@@ -152,7 +152,7 @@ class MotionComponent(Component):
 
     def _use(self, config: FitConfig, rows: GaussianRows, bounds: torch.Tensor) -> None:
         """Fit a new field in (2, 3) bounds of the world from now on."""
-        from drgs.deform import DeformationField, FieldConfig
+        from drgs.deform import LENGTHS, DeformationField, FieldConfig
 
         sizes = FieldConfig.preset(config.motion.field_preset, times=len(self.times))
         self.field = field = DeformationField(sizes, bounds, (self.times[0], self.times[-1]), seed=config.seed)
@@ -164,7 +164,7 @@ class MotionComponent(Component):
             return ends[0] * (ends[1] / ends[0]) ** share
 
         # Adam's steps have the rate's length: what makes lengths of features has them in units of what it moves.
-        lengths = dict.fromkeys(("means.3.weight", "means.3.bias"), self.field_length)
+        lengths = {name.removeprefix("mlp."): self.field_length for name in LENGTHS}
         self.networks = [
             Network(FIELD[0], field.grid, lambda part: rate(config.motion.grid_rate, part), fused=True),
             Network(FIELD[1], field.mlp, lambda part: rate(config.motion.field_rate, part), lengths, fused=True),

@@ -151,7 +151,7 @@ def uncertain(
             said = together(blocks.information(camera))
             add(total, {name: x * (len(known) / len(counted)) for name, x in said.items()})
             bar.advance()
-        weights = variances(total, MAP_PRIOR)
+        weights = variances(total, MAP_PRIOR.in_scene(scene, known))
         for name, camera in shown.items():
             plain = colors_only(scene, camera.time)
             variance = blocks.variance_map(camera, weights).numpy()

@@ -70,7 +70,7 @@ def uncertainty_of(
         for camera in cameras:
             add(total, together(blocks.information(camera)))
             bar.advance()
-    return variances(total, MAP_PRIOR)["means"].sum(1).sqrt().cpu().numpy()
+    return variances(total, MAP_PRIOR.in_scene(scene, cameras))["means"].sum(1).sqrt().cpu().numpy()
 
 
 def uncertainty_layer(values: np.ndarray) -> tuple[dict[str, Any], bytes]:
