@@ -39,6 +39,7 @@ _NAMES = {
     "Dataset": "data",
     "DeformationField": "deform",
     "DynamicGaussians": "deform",
+    "ErrorRecord": "information.expected_error",
     "FitConfig": "train",
     "Gaussians": "ellipsoids",
     "Planner": "planner",
@@ -49,6 +50,8 @@ _NAMES = {
     "SelectionConfig": "train",
     "View": "data",
     "diagonal": "fisher",
+    "error_record": "information.expected_error",
+    "expected_error": "information.expected_error",
     "fit": "train",
     "load_data": "data:load",
     "load_gaussians": "codecs",
@@ -112,6 +115,7 @@ __all__ = [
     "Dataset",
     "DeformationField",
     "DynamicGaussians",
+    "ErrorRecord",
     "FitConfig",
     "Gaussians",
     "Planner",
@@ -125,6 +129,8 @@ __all__ = [
     "data",
     "deform",
     "diagonal",
+    "error_record",
+    "expected_error",
     "fisher",
     "fit",
     "gain",
@@ -186,6 +192,7 @@ if TYPE_CHECKING:
     from drgs.fitting import metrics as metrics
     from drgs.fitting.records import load_run
     from drgs.gain import Prior
+    from drgs.information.expected_error import ErrorRecord, error_record, expected_error
     from drgs.integrator import render, render_jvp
     from drgs.lab import crossval as crossval
     from drgs.lab import ladder as ladder

@@ -87,6 +87,7 @@ def test_examples_of_docstrings_run(folder, tmp_path, monkeypatch):
         **{"drgs": drgs, "torch": torch, "camera": cameras[0], "cameras": cameras, "width": 32, "height": 24},
         **{"means": g.means, "quats": g.quats, "scales": g.log_scales.exp(), "sh": g.sh},
         **{"opacities": g.logit_opacities.sigmoid(), "rgb": torch.rand(len(g), 3), "photograph": torch.rand(24, 32, 3)},
+        "photographs": [torch.rand(24, 32, 3)] * 5,
         "viewmats": torch.from_numpy(np.stack([camera.w2c for camera in cameras])).float(),
         "Ks": torch.from_numpy(np.stack([camera.K for camera in cameras])).float(),
     }

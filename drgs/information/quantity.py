@@ -11,6 +11,7 @@ it, and everything that looks at views computes them by it: `drgs.fisher`, the s
     Backdrop            backdrop.py    about the color behind all Gaussians
     SurfaceDepths       backdrop.py    how far away surfaces are
     PoseInformation     columns.py     about the pose of the view's camera
+    Misfit              misfit.py      squared residuals of the view's photograph, by Gaussian
     Joint               this module    several of these, in one context
 
 A view's own unknowns (`Nuisances`) and the metric of decoded features (`SemanticMetric`) are fields of these. Policies
@@ -76,6 +77,7 @@ class ViewContext:
         settings: Settings of the renderer.
         mask: (H, W) in [0, 1] what the image is multiplied by; None: 1.
         number: Place of the view in a sum over views, for random images that differ between them.
+        photograph: (H, W, 3) what the view should show; None: there is none, or no quantity asks for it.
         probes: Quantity -> its sums over hits that are still to be filled, or have been.
     """
 
@@ -87,10 +89,11 @@ class ViewContext:
         mask: torch.Tensor | None = None,
         number: int = 0,
         opacity: torch.Tensor | None = None,
+        photograph: torch.Tensor | None = None,
     ) -> None:
         """
         Args:
-            scene, camera, settings, mask, number: See the attributes.
+            scene, camera, settings, mask, number, photograph: See the attributes.
             opacity: (H, W) float32, where it is known; None: a traversal gives it, or it is rendered.
         """
         self.scene = once_per_time(scene)
@@ -98,6 +101,7 @@ class ViewContext:
         self.settings = settings
         self.mask = mask
         self.number = number
+        self.photograph = photograph
         self.probes: dict[Quantity, HitProbes] = {}
         self._opacity = opacity
 

@@ -110,6 +110,7 @@ class Replay:
         with dr.suspend_grad():  # nothing is recorded: what is wanted are the hits of this view
             images = self.compositor.forward(*arguments, keep=True, joint=call.width)
         self.opacity = images["alpha"].torch().cpu().reshape(call.shape)  # (H, W)
+        self.image = images["rgb"].torch().cpu().reshape(*call.shape, 3)
         p = {name: x.array for name, x in self.inputs.items()}
         self.mask = None if mask is None else to_drjit(lib, mask.float().reshape(-1).to(call.home)).array
         self.along_ray = settings.sh_direction == "ray"

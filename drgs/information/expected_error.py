@@ -1,0 +1,324 @@
+"""How wrong a pixel's color is expected to be: the variance of a color from misfit, direction, information and what no
+view has seen, in squared units of color.
+
+A linear model of the images in which the noise has a variance of its own for each Gaussian and each direction from
+which it is seen, instead of 1 everywhere; `docs/maths.md` derives it. Of a pixel with the weights w_i, seen from the
+directions d_i, the expected squared error (mean over channels) is the sum of four variances:
+
+    misfit       sum_i w_i (sum_v k_iv R_iv) / (n_i + 1), n_i = sum_v k_iv W_iv: squared residuals of training pixels
+                 that saw Gaussian i from about this direction, and (1 - alpha) NEW s_b^2 of what lies behind
+    direction    sum_i w_i NEW s_i^2 / (n_i + 1): from a direction in which no training view saw it, the error is NEW
+                 times that of the directions which were fitted
+    information  SPREAD / 3 sum over channels and parameters k of J_pk^2 s_i(k)^2 / (H_k + 1): what noise of this
+                 variance leaves open of the parameters
+    unseen       HIDDEN (1 - alpha)^2 t^2 / (H_c + 1): a color behind everything that no view has seen
+
+W_iv and R_iv are the sums of view v (misfit.py), k_iv = exp(-angle^2 / (2 ANGLE^2)) of the angle between the pixel's
+direction and that of view v, s_i^2 = (sum_v R_iv + s^2) / (sum_v W_iv + 1) the misfit of Gaussian i, shrunk to the mean
+s^2 of all of them by one pixel, and t^2 the mean squared difference of the photographs from the background.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from drgs.checks.arguments import ArgumentError, kind_of, must_be
+from drgs.checks.records import nested, stated
+from drgs.information.backdrop import BACKDROP, Backdrop, Sphere, backdrop_sphere
+from drgs.information.diagonal import Diagonal
+from drgs.information.gains import variances
+from drgs.information.maps import variance_map
+from drgs.information.misfit import BEHIND, CONTRAST, RESIDUALS, WEIGHTS, Misfit
+from drgs.information.prior import Prior
+from drgs.information.quantity import Joint, ViewContext, checked_views, once_per_time
+from drgs.information.sums import Information, add
+from drgs.integrator import render
+from drgs.runtime import alone
+from drgs.settings import RenderSettings
+from drgs.tracing.inputs import check_view, gaussians_at
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.ellipsoids import Gaussians, Scene
+    from drgs.information.inputs import Masks
+
+__all__ = ["PARTS", "ErrorRecord", "error_parts", "error_record", "expected_error"]
+
+PARTS = ("misfit", "direction", "information", "unseen")
+"""Where the expected error of a pixel comes from."""
+
+# Chosen on half of the captures and made scenes, and measured on the other half: docs/uncertainty.md.
+ANGLE = 0.1  # radians between directions at which what one tells of the other has fallen to 0.6
+NEW = 2.0  # squared error from a new direction over that from directions that were fitted
+SPREAD = 6.0  # variance of a pixel over what the diagonal of H, without its other entries, says
+HIDDEN = 0.6  # squared error where nothing is, over the mean squared difference of photographs from the background
+_PRIOR = Prior(1.0)  # lambda: what one pixel that is fully the parameter's tells
+_MOST_PLACES = 64  # places that directions are known from; views beyond share the nearest one, so that a record of any
+# number of views has at most 512 bytes a Gaussian
+_BYTES = 64 << 20  # bytes of the angles that are held at once
+
+
+@dataclasses.dataclass(frozen=True)
+class ErrorRecord:
+    """What training views say about errors: what `expected_error` needs of them, as `error_record` makes it.
+
+    Attributes:
+        settings: Settings with which the views were rendered, and which maps are rendered with.
+        views: Number of the views.
+        places: (P, 3) float64 camera centers, world frame; of more than 64, means of those that are close together.
+        weights: (N, P) float32 sum of w over the pixels of the views from a place, in pixels.
+        residuals: (N, P) float32 sum of w times the squared residual (mean over channels), squared units of color.
+        behind: (2,) float64, both sums for what lies behind everything, with weights 1 - alpha.
+        contrast: (2,) float64 number of pixels, and sum of their squared differences from the background.
+        information: Group -> float64, that of the views about Gaussians and backdrop, as of `drgs.fisher`.
+        sphere: What the backdrop is painted on.
+    """
+
+    settings: RenderSettings
+    views: int
+    places: torch.Tensor
+    weights: torch.Tensor
+    residuals: torch.Tensor
+    behind: torch.Tensor
+    contrast: torch.Tensor
+    information: Information
+    sphere: Sphere | None
+
+    @property
+    def mean_misfit(self) -> float:
+        """Mean squared residual of all pixels, weighed by how much of them Gaussians and what lies behind are."""
+        pixels = float(self.weights.double().sum() + self.behind[0])
+        return float(self.residuals.double().sum() + self.behind[1]) / pixels if pixels else 0.0
+
+    @property
+    def misfit(self) -> torch.Tensor:
+        """(N,) float64 s_i^2, squared units of color: mean squared residual where a Gaussian is seen, shrunk to that of
+        all by one pixel. Its root is an error in units of color.
+        """
+        return (self.residuals.double().sum(1) + self.mean_misfit) / (self.weights.double().sum(1) + 1)
+
+    @property
+    def misfit_behind(self) -> float:
+        """The same of what lies behind everything."""
+        return float((self.behind[1] + self.mean_misfit) / (self.behind[0] + 1))
+
+    def to_state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+        """Tensors, and what else a file has to hold as JSON, of which `from_state` makes the record again."""
+        tensors = {name: getattr(self, name) for name in ("places", "weights", "residuals", "behind", "contrast")}
+        tensors |= {f"information.{name}": x for name, x in self.information.items()}
+        sphere = None if self.sphere is None else dataclasses.asdict(self.sphere)
+        return tensors, {"views": self.views, "settings": dataclasses.asdict(self.settings), "sphere": sphere}
+
+    @classmethod
+    def from_state(cls, tensors: Mapping[str, torch.Tensor], header: Mapping[str, Any]) -> ErrorRecord:
+        """The record that `to_state` gave these."""
+        begin = "information."
+        information = {name.removeprefix(begin): x for name, x in tensors.items() if name.startswith(begin)}
+        sphere = header["sphere"]
+        return cls(
+            settings=nested(RenderSettings, None, stated(RenderSettings, header["settings"], "ErrorRecord")),
+            views=header["views"],
+            information=information,
+            sphere=None if sphere is None else Sphere(tuple(sphere["center"]), sphere["radius"]),
+            **{name: x for name, x in tensors.items() if not name.startswith(begin)},
+        )
+
+
+@alone
+def error_record(
+    scene: Scene,
+    cameras: Camera | Sequence[Camera],
+    images: torch.Tensor | Sequence[torch.Tensor],
+    settings: RenderSettings | None = None,
+    *,
+    masks: Masks = None,
+    sphere: Sphere | None = None,
+    advance: Callable[[], None] = lambda: None,
+) -> ErrorRecord:
+    """What training views and their photographs say about the errors of a scene: made once, for any number of maps.
+
+        record = drgs.error_record(g, cameras, photographs)
+        error = drgs.expected_error(g, camera, record).sqrt()  # (H, W), units of color
+
+    It costs what the views' information costs, whose traversal finds the residuals of Gaussians on its way.
+
+    Args:
+        scene: N Gaussians, world frame, or a `drgs.ellipsoids.Scene`, whose Gaussians each camera sees at its time.
+            Where they move, directions are those from a place to where a Gaussian is when it is looked at.
+        cameras: One or several training views.
+        images: (H, W, 3) of each camera, as the scene should look in it, in [0, 1]: the photograph on the background of
+            the settings, without the exposure and white balance of its own where a fit has estimated them.
+        settings: Default `RenderSettings.preset("exact")`.
+        masks: One for each camera, (H, W) in [0, 1], which weighs its pixels; or None: 1.
+        sphere: What the colors behind everything are painted on, as `drgs.fisher.backdrop_sphere` makes it; None: that
+            of the cameras.
+        advance: Called after each view.
+    Raises:
+        ValueError: If there is no view, or images or masks are not of the cameras' sizes, or not finite.
+    """
+    where = "error_record"
+    scene = once_per_time(scene)
+    cameras, each, shown = checked_views(where, scene, cameras, settings, masks)
+    photographs = _checked_images(where, images, cameras)
+    if not any(float(mask.sum()) > 0 if mask is not None else True for mask in shown):
+        raise ValueError(f"{where}: masks must leave a pixel whose residual counts, got none above 0; pass other views")
+    sphere = sphere or backdrop_sphere(scene, cameras)
+    quantity = Joint((("", Diagonal(without=("features",), of_gaussians=True)), ("", Backdrop(sphere)), ("", Misfit())))
+    places, place_of = _grouped(np.stack([camera.center for camera in cameras]))
+    count = len(gaussians_at(where, scene, cameras[0]))
+    columns = {name: torch.zeros(count, len(places)) for name in (WEIGHTS, RESIDUALS)}
+    total: dict[str, torch.Tensor] = {}
+    for view, (camera, own, mask, place) in enumerate(zip(cameras, each, shown, place_of, strict=True)):
+        context = ViewContext(scene, camera, own, mask, photograph=photographs[view])
+        if len(context.gaussians) != count:
+            raise ValueError(
+                f"{where}: a scene must have as many Gaussians in all views, got {count} in the first and "
+                f"{len(context.gaussians)} in cameras[{view}]; take views of one time"
+            )
+        found = quantity.summand(quantity.compute(context), camera, mask)
+        for name, by_place in columns.items():
+            by_place[:, place] += found.pop(name)
+        add(total, found)
+        advance()
+    return ErrorRecord(
+        settings=each[0],
+        views=len(cameras),
+        places=torch.from_numpy(places),
+        weights=columns[WEIGHTS],
+        residuals=columns[RESIDUALS],
+        behind=total.pop(BEHIND),
+        contrast=total.pop(CONTRAST),
+        information=total,
+        sphere=sphere,
+    )
+
+
+@alone
+def expected_error(scene: Scene, camera: Camera, record: ErrorRecord) -> torch.Tensor:
+    """(H, W) float32: the expected squared error of each pixel's color, mean over channels, in squared units of color.
+
+    Its root is an error in units of color; its mean over a view's pixels, the mean squared error that is expected of
+    the view. It is the sum of `drgs.information.expected_error.error_parts`, which say why; nothing is differentiated.
+
+    Args:
+        scene: The scene of the record.
+        camera: The view; it needs no photograph.
+        record: What training views say about errors, by `drgs.error_record`.
+    Raises:
+        ValueError: If the scene has another number of Gaussians than that of the record.
+    """
+    return torch.stack(list(error_parts(scene, camera, record).values())).sum(0)
+
+
+@alone
+def error_parts(scene: Scene, camera: Camera, record: ErrorRecord) -> dict[str, torch.Tensor]:
+    """`expected_error` by where it comes from: each of `PARTS` -> (H, W) float32, squared units of color.
+
+    `misfit` has its remedy in the fit (steps, Gaussians, exposure, poses), `direction` in photographs of the same from
+    this direction, `information` in more photographs of it, `unseen` in photographs of what none shows.
+
+    Args:
+        scene, camera, record: The same as for `expected_error`.
+    """
+    where = "expected_error"
+    scene = once_per_time(scene)
+    seen = gaussians_at(where, scene, camera)
+    must_be(where, "record", record, ErrorRecord, "what drgs.error_record returns")
+    check_view(where, seen, camera, record.settings)
+    if len(seen) != len(record.weights):
+        raise ValueError(
+            f"{where}: scene must be that of the record, with {len(record.weights)} Gaussians, got {len(seen)}; make a "
+            "record of this scene"
+        )
+    seen = seen.detach()
+    misfit = record.misfit
+    fitted, new = _by_direction(seen, camera, record, misfit)
+    with torch.no_grad():  # a map is a number a pixel
+        values = torch.stack([fitted, new], 1).to(seen.means.device, torch.float32)
+        out = render(seen.replace(sh=seen.sh[:, :1], features=values), camera, record.settings, outputs=())
+    assert out.features is not None  # two channels were given
+    composited, alpha = out.features.cpu(), out.alpha.cpu()
+    weights = variances(record.information, _PRIOR)
+    behind = weights.pop(BACKDROP) * (HIDDEN * _difference(record) / 3)
+    scale = SPREAD / 3 * misfit
+    weights = {name: x * scale.reshape(-1, *[1] * (x.dim() - 1)) for name, x in weights.items()}
+    view = ViewContext(scene, camera, record.settings, opacity=alpha)
+    return {
+        "misfit": composited[..., 0] + (1 - alpha).clamp(min=0) * (NEW * record.misfit_behind),
+        "direction": composited[..., 1],
+        "information": variance_map(view, weights),
+        "unseen": variance_map(view, {BACKDROP: behind}, sphere=record.sphere),
+    }
+
+
+def _difference(record: ErrorRecord) -> float:
+    """t^2: mean squared difference of the photographs from the background."""
+    pixels, squares = record.contrast.tolist()
+    return squares / pixels if pixels else 0.0
+
+
+def _by_direction(
+    seen: Gaussians, camera: Camera, record: ErrorRecord, misfit: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """(N,) float64 each: what training pixels from about this direction say of a Gaussian's squared error, and what is
+    left to the prior of a new direction; their sum is its variance from there.
+    """
+    # Relative to the Gaussians' origin, as their means are: far from 0 nothing is rounded away.
+    means = seen.means.double().cpu()
+    places = record.places - torch.from_numpy(seen.origin)
+    towards = torch.nn.functional.normalize(means - torch.from_numpy(camera.center - seen.origin), dim=1)
+    told, pixels = (torch.zeros(len(means), dtype=torch.float64) for _ in range(2))
+    rows = max(1, _BYTES // (8 * 3 * max(1, len(places))))
+    for start in range(0, len(means), rows):
+        part = slice(start, start + rows)
+        known = torch.nn.functional.normalize(means[part, None] - places, dim=2)
+        # Of the chord, which is exact for small angles, where the cosine is 1 to rounding.
+        angle = 2 * torch.asin(((known - towards[part, None]).norm(dim=2) / 2).clamp(max=1))
+        near = torch.exp(-0.5 * (angle / ANGLE).square())
+        told[part] = (near * record.residuals[part]).sum(1)
+        pixels[part] = (near * record.weights[part]).sum(1)
+    return told / (pixels + 1), NEW * misfit / (pixels + 1)
+
+
+def _grouped(centers: np.ndarray) -> tuple[np.ndarray, list[int]]:
+    """(P, 3) places of (V, 3) camera centers, and the place of each: all centers that differ, or 64 means of those that
+    are nearest to the same of 64 that are far from each other (farthest point sampling from the first).
+    """
+    chosen = [0]
+    distance = np.linalg.norm(centers - centers[0], axis=1)
+    place = np.zeros(len(centers), np.int64)
+    while len(chosen) < _MOST_PLACES and distance.max() > 0:
+        chosen.append(int(distance.argmax()))
+        from_here = np.linalg.norm(centers - centers[chosen[-1]], axis=1)
+        place[from_here < distance] = len(chosen) - 1
+        distance = np.minimum(distance, from_here)
+    return np.stack([centers[place == k].mean(0) for k in range(len(chosen))]), place.tolist()
+
+
+def _checked_images(where: str, images: Any, cameras: Sequence[Camera]) -> list[torch.Tensor]:
+    """An image for each camera; `ArgumentError` for another number of them, another size or what is not finite."""
+    images = [images] if isinstance(images, torch.Tensor) and images.dim() == 3 else images
+    if not isinstance(images, list | tuple | torch.Tensor) or len(images) != len(cameras):
+        got = str(len(images)) if isinstance(images, list | tuple | torch.Tensor) else kind_of(images)
+        raise ArgumentError(
+            f"{where}: images must be a list with one for each of {len(cameras)} cameras, got {got}; pass their "
+            "photographs"
+        )
+    for index, (image, camera) in enumerate(zip(images, cameras, strict=True)):
+        must_be(where, f"images[{index}]", image, torch.Tensor, "(H, W, 3) in [0, 1]")
+        size = (camera.height, camera.width, 3)
+        if tuple(image.shape) != size:
+            raise ArgumentError(
+                f"{where}: images[{index}] must be {size} like its camera, got {tuple(image.shape)}; resize either"
+            )
+        if not image.is_floating_point() or not bool(torch.isfinite(image).all()):
+            raise ArgumentError(
+                f"{where}: images[{index}] must be finite floats in [0, 1], got {image.dtype} or NaN or Inf; divide "
+                "bytes by 255"
+            )
+    return list(images)

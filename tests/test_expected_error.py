@@ -1,0 +1,247 @@
+"""The expected error of a pixel: against dense sums of the float64 oracle, and that what is wrong is told."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+
+import dense_jacobian as dense
+import numpy as np
+import pytest
+import torch
+from scenes_random import camera
+
+import drgs
+from drgs import reference
+from drgs.cameras import orbit
+from drgs.checks.arguments import ArgumentError
+from drgs.information.backdrop import backdrop_cells
+from drgs.information.expected_error import ANGLE, HIDDEN, NEW, PARTS, SPREAD, error_parts
+from drgs.settings import RenderSettings
+
+
+@pytest.fixture
+def settings():
+    return RenderSettings.preset("exact", background=(0.2, 0.5, 0.7))
+
+
+def seen(g, cam, settings):
+    """(pixels, N) weights and (H, W, 3) colors of the oracle."""
+    every = dataclasses.replace(g.detach(), features=torch.eye(len(g)))
+    out = reference.render(every, cam, settings)
+    return out.features.reshape(-1, len(g)).detach(), out.rgb.detach()
+
+
+def noisy(rng, image):
+    """A photograph that is not what is rendered."""
+    return (image + torch.from_numpy(rng.normal(0, 0.1, tuple(image.shape)))).clamp(0, 1).float()
+
+
+@pytest.mark.core
+def test_brute_force(rng, settings):
+    """Every part, from the oracle's weights and its Jacobian, of two views of different masks."""
+    g, cam, out = dense.scene(rng, settings, K=4)
+    others = [camera(rng, (12, 10)) for _ in range(2)]
+    masks = [None, torch.from_numpy(rng.uniform(size=(others[1].height, others[1].width))).float()]
+    images, told, pixels, behind, contrast = [], [], [], [0.0, 0.0], [0.0, 0.0]
+    H = {name: 0.0 for name in dense.GROUPS}
+    sphere = drgs.fisher.backdrop_sphere(g, others)
+    cells = torch.zeros(1536, dtype=torch.float64)
+    for other, mask in zip(others, masks, strict=True):
+        w, rgb = seen(g, other, settings)
+        images.append(noisy(rng, rgb))
+        e = (rgb.clamp(0, 1) - images[-1]).square().mean(2).reshape(-1)
+        m = torch.ones(len(e), dtype=torch.float64) if mask is None else mask.double().reshape(-1)
+        T = 1 - w.sum(1)
+        pixels.append((w * m[:, None]).sum(0))
+        told.append((w * (m * e)[:, None]).sum(0))
+        behind = [behind[0] + float((T * m).sum()), behind[1] + float((T * m * e).sum())]
+        far = (images[-1] - torch.tensor(settings.background)).square().mean(2).reshape(-1)
+        contrast = [contrast[0] + float(m.sum()), contrast[1] + float((far * m).sum())]
+        J = dense.jacobian(g, reference.render(g, other, settings))
+        H = {
+            name: H[name] + dense.squares({name: x * m.repeat_interleave(3).reshape(-1, *[1] * (x.ndim - 1))})[name]
+            for name, x in J.items()
+        }
+        cells.index_add_(0, backdrop_cells(other, sphere).flatten(), (T * m).square())
+    mean = float((sum(told).sum() + behind[1]) / (sum(pixels).sum() + behind[0]))
+    misfit = (sum(told) + mean) / (sum(pixels) + 1)
+    towards = lambda c: torch.nn.functional.normalize(g.means.detach().double() - torch.from_numpy(c.center), dim=1)  # noqa: E731
+    near = [
+        torch.exp(-0.5 * (torch.arccos((towards(cam) * towards(o)).sum(1).clamp(-1, 1)) / ANGLE).square())
+        for o in others
+    ]
+    n = sum(k * x for k, x in zip(near, pixels, strict=True))
+    fitted = sum(k * x for k, x in zip(near, told, strict=True)) / (n + 1)
+    w, _ = seen(g, cam, settings)
+    T = 1 - w.sum(1)
+    J = dense.jacobian(g, out)
+    variance = 0.0
+    for name, x in J.items():
+        per = misfit.reshape(-1, *[1] * (x.ndim - 2)) / (H[name] + 1)
+        variance = variance + (x.square() * per).flatten(1).sum(1).reshape(-1, 3).sum(1)
+    truth = {
+        "misfit": w @ fitted + T * NEW * (behind[1] + mean) / (behind[0] + 1),
+        "direction": w @ (NEW * misfit / (n + 1)),
+        "information": SPREAD / 3 * variance,
+        "unseen": HIDDEN * contrast[1] / contrast[0] * T.square() / (cells[backdrop_cells(cam, sphere)].flatten() + 1),
+    }
+    record = drgs.error_record(g, others, images, settings, masks=masks)
+    assert float((record.misfit - misfit).abs().max()) <= 1e-4 * float(misfit.max())
+    found = error_parts(g, cam, record)
+    assert tuple(found) == tuple(truth) == PARTS
+    for name, x in truth.items():
+        assert float((found[name].reshape(-1) - x).abs().max()) <= 2e-4 * float(x.max()), name
+    total = drgs.expected_error(g, cam, record)
+    assert total.shape == (cam.height, cam.width)
+    assert total.dtype == torch.float32
+    torch.testing.assert_close(total, sum(found.values()))
+
+
+@pytest.fixture(scope="module")
+def ring():
+    """A ball of Gaussians, and eight cameras around it."""
+    rng = np.random.default_rng(3)
+    means = rng.normal(size=(60, 3))
+    means *= 0.5 / np.linalg.norm(means, axis=1, keepdims=True)
+    colors = rng.uniform(-1, 1, (60, 1, 3))
+    quats = np.tile([1.0, 0, 0, 0], (60, 1))
+    g = drgs.Gaussians.from_arrays(means, quats, np.full((60, 3), 0.15), np.full(60, 0.9), colors)
+    return g, orbit((0, 0, 0), 3.0, 8, width=32, height=24)
+
+
+def photographs(g, cameras, settings=None):
+    return [drgs.render(g, c, settings, outputs=()).rgb.clamp(0, 1) for c in cameras]
+
+
+@pytest.mark.parametrize("preset", ["exact", "fast"])
+def test_sums_of_views_add_up(preset, ring):
+    """What two views say is what each says; no view is kept but its sums, and its place."""
+    g, cameras = ring
+    settings = RenderSettings.preset(preset)
+    images = [(x + 0.1 * k).clamp(0, 1) for k, x in enumerate(photographs(g, cameras[:2], settings), 1)]
+    sphere = drgs.fisher.backdrop_sphere(g, cameras[:2])
+    both = drgs.error_record(g, cameras[:2], images, settings, sphere=sphere)
+    each = [drgs.error_record(g, c, [x], settings, sphere=sphere) for c, x in zip(cameras, images, strict=False)]
+    torch.testing.assert_close(both.weights, torch.cat([x.weights for x in each], 1))
+    torch.testing.assert_close(both.residuals, torch.cat([x.residuals for x in each], 1))
+    torch.testing.assert_close(both.behind, each[0].behind + each[1].behind)
+    for name, x in both.information.items():
+        torch.testing.assert_close(x, each[0].information[name] + each[1].information[name])
+    twice = drgs.error_record(g, [cameras[0], cameras[0]], [images[0], images[0]], settings, sphere=sphere)
+    assert twice.places.shape == (1, 3)
+    torch.testing.assert_close(twice.residuals, 2 * each[0].residuals)
+
+
+def test_many_views_share_places(ring):
+    """A record of more views than places is no larger, and has all of their pixels."""
+    g, _ = ring
+    cameras = orbit((0, 0, 0), 3.0, 80, width=8, height=6)
+    record = drgs.error_record(g, cameras, photographs(g, cameras), RenderSettings.preset("exact"))
+    assert record.weights.shape == record.residuals.shape == (60, 64)
+    assert record.views == 80
+    one = drgs.fisher.coverage(g, cameras)  # sum w^2 <= sum w
+    assert bool((record.weights.double().sum(1) >= one * (1 - 1e-5)).all())
+
+
+def test_a_wrong_color_is_told(ring):
+    """A Gaussian whose color is wrong in training views has the largest misfit, and its pixels of another view, too."""
+    g, cameras = ring
+    train, other = [c for k, c in enumerate(cameras) if k != 2], cameras[2]
+    which = int(drgs.render(g, other, outputs="visibility").visibility.argmax())
+    wrong = g.sh.clone()
+    wrong[which] += 2.0
+    wrong = g.replace(sh=wrong)
+    record = drgs.error_record(wrong, train, photographs(g, train))
+    assert int(record.misfit.argmax()) == which
+    parts = error_parts(wrong, other, record)
+    told = (parts["misfit"] + parts["direction"]).flatten()
+    true, shown = (drgs.render(x, other, outputs=()).rgb.clamp(0, 1) for x in (g, wrong))
+    top = (true - shown).square().mean(2).flatten().argsort(descending=True)[:20]
+    assert float(told[top].mean()) > 3 * float(told.mean())
+
+
+def test_a_new_direction_is_told(ring):
+    """The part of the direction is larger the farther a view is from the photographed ones; unseen cells, too."""
+    g, cameras = ring
+    images = [(x + 0.05).clamp(0, 1) for x in photographs(g, cameras[:1])]
+    record = drgs.error_record(g, cameras[:1], images)
+    direction = [float(error_parts(g, c, record)["direction"].mean()) for c in (cameras[0], cameras[1], cameras[4])]
+    assert direction[0] < 0.3 * direction[1]
+    assert direction[1] <= 1.5 * direction[2]
+    unseen = [float(error_parts(g, c, record)["unseen"].mean()) for c in (cameras[0], cameras[4])]
+    assert unseen[0] < 0.5 * unseen[1]
+
+
+def test_units(ring):
+    """An even error of 0.1 in all training views is told as one of that size where they look from; ten times smaller
+    residuals are a root that is ten times smaller.
+    """
+    g, cameras = ring
+    shown = photographs(g, cameras)
+    errors = []
+    for size in (0.1, 0.01):
+        record = drgs.error_record(g, cameras, [torch.where(x > 0.5, x - size, x + size) for x in shown])
+        assert math.sqrt(record.mean_misfit) == pytest.approx(size, rel=1e-3)
+        parts = error_parts(g, cameras[0], record)
+        covered = drgs.render(g, cameras[0], outputs=()).alpha > 0.95
+        errors.append(float((parts["misfit"] + parts["direction"])[covered].mean().sqrt()))
+    assert 0.05 < errors[0] < 0.2
+    assert errors[0] == pytest.approx(10 * errors[1], rel=1e-2)
+
+
+def test_state(ring):
+    """A record goes through tensors and JSON."""
+    g, cameras = ring
+    record = drgs.error_record(g, cameras[:2], photographs(g, cameras[:2]), RenderSettings.preset("fast"))
+    tensors, header = record.to_state()
+    again = drgs.ErrorRecord.from_state(tensors, json.loads(json.dumps(header)))
+    assert again.settings == record.settings
+    assert again.sphere == record.sphere
+    assert torch.equal(drgs.expected_error(g, cameras[3], again), drgs.expected_error(g, cameras[3], record))
+
+
+def test_no_gaussians():
+    """Of nothing, all is unseen."""
+    g = drgs.Gaussians.from_arrays(
+        np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 1, 3))
+    )
+    cameras = orbit((0, 0, 0), 3.0, 4, width=8, height=6)
+    record = drgs.error_record(g, cameras[:2], [torch.full((6, 8, 3), 0.5)] * 2)
+    error = drgs.expected_error(g, cameras[3], record)
+    assert bool(torch.isfinite(error).all())
+    assert float(error.min()) > 0
+
+
+BAD = {
+    "no view": (lambda c, x: ([], []), "there must be at least one camera, got none"),
+    "no image": (lambda c, x: (c, x[:1]), "images must be a list with one for each of 2 cameras, got 1"),
+    "size": (lambda c, x: (c, [x[0], x[1][:5]]), r"images\[1\] must be \(24, 32, 3\) like its camera"),
+    "bytes": (lambda c, x: (c, [(y * 255).byte() for y in x]), "divide bytes by 255"),
+    "NaN": (lambda c, x: (c, [x[0], x[1] * float("nan")]), r"images\[1\] must be finite floats"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_views(name, ring):
+    """One line says what is wrong."""
+    g, cameras = ring
+    change, message = BAD[name]
+    with pytest.raises(ValueError, match=message) as caught:
+        drgs.error_record(g, *change(cameras[:2], photographs(g, cameras[:2])))
+    assert "\n" not in str(caught.value)
+
+
+def test_no_residual_and_another_scene(ring):
+    """Views all of whose pixels are masked have no residual; a record is of one scene."""
+    g, cameras = ring
+    images = photographs(g, cameras[:2])
+    with pytest.raises(ValueError, match="masks must leave a pixel whose residual counts"):
+        drgs.error_record(g, cameras[:2], images, masks=[torch.zeros(24, 32)] * 2)
+    record = drgs.error_record(g, cameras[:2], images)
+    few = drgs.Gaussians(**{name: x[:59] for name, x in g.parameters().items()})
+    with pytest.raises(ValueError, match="scene must be that of the record, with 60 Gaussians, got 59"):
+        drgs.expected_error(few, cameras[2], record)
+    with pytest.raises(ArgumentError, match="what drgs.error_record returns"):
+        drgs.expected_error(g, cameras[2], None)
