@@ -21,8 +21,13 @@ from drgs.data import load
 from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.display.pictures import map_picture
 from drgs.files import load_ply, load_state, save_ply
+from drgs.fitting.errors import _as_shown, run_error_record
+from drgs.fitting.frames import Frame
+from drgs.fitting.records import load_run
 from drgs.gain import Prior, unit_length
+from drgs.information.expected_error import expected_error
 from drgs.integrator import render
+from drgs.io.run import Run
 from drgs.settings import RenderSettings
 from drgs.train import fit
 
@@ -63,6 +68,37 @@ def test_information_of_a_run(place, monkeypatch, capsys):
             assert cv2.imread(str(place / "out" / file)).shape == (SIZE, SIZE + 76, 3)
     assert "information of 4 views (run)" in text
     assert "pose" not in text
+
+
+def test_expected_error_of_a_run(place, monkeypatch, capsys):
+    """Of a run, the first map of a view is its expected error, told first; without photographs it is left out."""
+    report, text = run("run --limit 2 --preset fast --blocks geometry", place, monkeypatch, capsys)
+    record = run_error_record(Run(place / "run"), RenderSettings.preset("fast"), report["pixels"])
+    assert report["misfit"] == pytest.approx(record.mean_misfit**0.5)
+    views = {view.name: view.camera for view in load(place / "data").views}
+    scene = load_run(place / "run").scene
+    for row in report["views"]:
+        assert row["files"][0] == f"{row['name']}.error.png"
+        assert cv2.imread(str(place / "out" / row["files"][0])).shape == (SIZE, SIZE + 76, 3)
+        told = expected_error(scene, views[row["name"]], record)
+        assert row["error"]["rmse"] == pytest.approx(float(told.mean().sqrt()), rel=1e-3)
+        assert sum(row["error"]["parts"].values()) == pytest.approx(1)
+    assert text.startswith("expected error")
+    report, text = run("scene.ply --train cameras.json --limit 2", place, monkeypatch, capsys)
+    assert report["misfit"] is None
+    assert "error" not in report["views"][0]
+    assert "expected error" not in text
+
+
+def test_photographs_without_their_exposure():
+    """A photograph is divided by its own gain, but for what is known to be background."""
+    camera = orbit((0, 0, 0), 3.0, 2, width=4, height=3)[0]
+    frame = Frame("a", camera, torch.full((3, 4, 3), 0.4), mask=torch.zeros(3, 4), is_object=True)
+    frame.mask[:, :2] = 1
+    shown = _as_shown(frame, torch.tensor([2.0, 1.0, 0.5]).log())
+    torch.testing.assert_close(shown[0, 0], torch.tensor([0.2, 0.4, 0.8]))
+    torch.testing.assert_close(shown[0, 3], torch.full((3,), 0.4))
+    assert _as_shown(frame, None) is frame.pixels
 
 
 def test_maps_add_up_to_the_scores(place, monkeypatch, capsys):

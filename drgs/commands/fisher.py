@@ -1,7 +1,8 @@
-"""`drgs fisher`: information of known views about every Gaussian, and maps of the uncertainty in other views.
+"""`drgs fisher`: where a run is wrong, information of known views about every Gaussian, and maps of both.
 
-Two maps a view, both sums over the parameters k of squared derivatives J_pk of a pixel p, with H the information of the
-known views and Hc that of the view itself:
+Of a run whose photographs are there, the first map of a view is the error that is expected of each pixel, in units of
+color (`drgs.expected_error`). Two more are sums over the parameters k of squared derivatives J_pk of a pixel p, with H
+the information of the known views and Hc that of the view itself:
 
     variance    sum_k J_pk^2 / (H_k + lambda): predictive variance of the pixel for unit noise; its sum is `eig`
     share       sum_k J_pk^2 / Hc_k log(1 + Hc_k / (H_k + lambda)): the pixel's share of the view's `logdet`
@@ -31,8 +32,10 @@ from drgs.commands.viewpoints import check_lenses, evenly, known_views, views_to
 from drgs.data.camera_lists import camera_to_json
 from drgs.display import pictures, tables
 from drgs.display.progress import Bar
+from drgs.fitting.errors import run_error_record
 from drgs.gain import Information, Prior, check, information_gain, variances
 from drgs.information.blocks import MAP_PRIOR, SceneBlocks
+from drgs.information.expected_error import PARTS, error_parts
 from drgs.information.maps import fisherrf_map, moments_map
 from drgs.information.sums import add, together
 from drgs.integrator import render
@@ -48,6 +51,7 @@ if TYPE_CHECKING:
     from drgs.commands.viewpoints import Known
     from drgs.ellipsoids import Scene
     from drgs.gain import Prior
+    from drgs.information.expected_error import ErrorRecord
     from drgs.information.scoring import Scoring
     from drgs.io.outputs import LockedFolder
     from drgs.settings import RenderSettings
@@ -84,7 +88,9 @@ def run(args: Fisher) -> None:
     check_lenses("fisher", settings, [*known.cameras, *views])
     scoring = given.scoring(args.scoring, settings)
     with Bar("information", len(known.cameras) + len(views), not args.quiet) as bar:
-        maps = InformationMaps(args.scene, given, scoring, prior, known, views, source, args.pose, args.maps)
+        is_photographed = args.train is None and given.run is not None
+        errors = run_error_record(given.run, settings, known.pixels) if is_photographed else None
+        maps = InformationMaps(args.scene, given, scoring, prior, known, views, source, args.pose, args.maps, errors)
         groups, rows = maps.write(output, bar.advance)
     if not args.quiet:
         _print(args, known, groups, rows, source)
@@ -104,6 +110,7 @@ class InformationMaps:
         source: Where they come from, in words.
         pose: Whether to compute the information of each of these views about its own pose, too.
         compare: Whether to write a picture of each view beside its maps of several rules, too.
+        errors: What the photographs of the known views say about errors; None: there are none.
     """
 
     path: Path
@@ -115,6 +122,7 @@ class InformationMaps:
     source: str
     pose: bool = False
     compare: bool = False
+    errors: ErrorRecord | None = None
 
     def write(
         self, output: LockedFolder, advance: Callable[[], None] = lambda: None
@@ -132,7 +140,7 @@ class InformationMaps:
         prior = self.prior.in_scene(self.given.scene, cameras)
         compared = ComparedMaps(self.given.scene, settings, self.prior.over(1.0)) if self.compare else None
         names = pictures.file_names([camera.name for camera in self.views])
-        kinds = [*_map_kinds(blocks.names), *(["maps"] if compared else [])]
+        kinds = [*(["error"] if self.errors else []), *_map_kinds(blocks.names), *(["maps"] if compared else [])]
         output.check(f"{name}.{kind}.png" for name in names for kind in kinds)
         by_block: dict[str, dict[str, torch.Tensor]] = {}
         for camera in cameras:
@@ -145,7 +153,14 @@ class InformationMaps:
         H = together(by_block)
         rows = []
         for camera, name in zip(self.views, names, strict=True):
-            rows.append(_view(output.path, blocks, camera, name, H, prior, compared, self.pose))
+            row = _view(output.path, blocks, camera, name, H, prior, compared, self.pose)
+            if self.errors:
+                parts = {part: x.numpy() for part, x in error_parts(self.given.scene, camera, self.errors).items()}
+                error = np.sqrt(sum(parts.values()))
+                files = [f"{name}.error.png", *row.files]
+                pictures.write_png(output.path / files[0], pictures.map_picture(error))
+                row = dataclasses.replace(row, files=files, error=ErrorSummary.of(parts))
+            rows.append(row)
             advance()
         groups = {name: GroupSummary.of(x, by_block, name) for name, x in H.items()}
         header = {"groups": list(H), "views": [camera.name for camera in cameras], "settings": settings}
@@ -174,6 +189,7 @@ class InformationMaps:
             "probes": scoring.probes if is_probed else None,
             "settings": dataclasses.asdict(scoring.settings),
             "pixels": self.known.pixels,
+            "misfit": self.errors.mean_misfit**0.5 if self.errors else None,
             "known": {"source": self.known.source, "names": [camera.name for camera in self.known.cameras]},
             "groups": {name: dataclasses.asdict(row) for name, row in groups.items()},
             "source": self.source,
@@ -229,6 +245,26 @@ class MapSummary:
 
 
 @dataclasses.dataclass(frozen=True)
+class ErrorSummary:
+    """What error is expected of a view.
+
+    Attributes:
+        rmse: Root of the mean squared error of its pixels, units of color.
+        parts: Share of each part in its mean squared error.
+    """
+
+    rmse: float
+    parts: dict[str, float]
+
+    @classmethod
+    def of(cls, parts: dict[str, np.ndarray]) -> ErrorSummary:
+        """The summary of the (H, W) variances of each part."""
+        means = {name: float(x.mean(dtype=np.float64)) for name, x in parts.items()}
+        total = sum(means.values())
+        return cls(total**0.5, {name: x / total if total else 0.0 for name, x in means.items()})
+
+
+@dataclasses.dataclass(frozen=True)
 class PoseSummary:
     """A view's information about its own pose: a 6x6 matrix and its eigenvalues, ascending."""
 
@@ -247,6 +283,7 @@ class MappedView:
         variance, share: Its maps, of all blocks together.
         blocks: Block of the image -> kind -> the map of that block alone.
         pose: What it says about its own pose, with --pose; else None.
+        error: The error that is expected of it; None where there are no photographs of the known views.
     """
 
     name: str
@@ -257,6 +294,7 @@ class MappedView:
     share: MapSummary
     blocks: dict[str, dict[str, MapSummary]]
     pose: PoseSummary | None
+    error: ErrorSummary | None = None
 
     def to_json(self) -> dict[str, Any]:
         """As fisher.json holds it."""
@@ -265,6 +303,7 @@ class MappedView:
         fields |= {name: dataclasses.asdict(getattr(self, name)) for name in KINDS}
         blocks = self.blocks.items()
         fields |= {"blocks": {b: {kind: dataclasses.asdict(x) for kind, x in maps.items()} for b, maps in blocks}}
+        fields |= {} if self.error is None else {"error": dataclasses.asdict(self.error)}
         return fields | ({} if self.pose is None else {"pose": dataclasses.asdict(self.pose)})
 
 
@@ -333,7 +372,14 @@ def _view(
 
 
 def _print(args: Fisher, known: Known, groups: dict[str, GroupSummary], views: list[MappedView], source: str) -> None:
-    """Print the information as tables."""
+    """Print what is expected of views, and the information, as tables."""
+    rows = []
+    for view in views:
+        if view.error is not None:
+            shares = (f"{share:.0%}" for share in view.error.parts.values())
+            rows.append((view.name, f"{view.error.rmse:.3g}", f"{-20 * math.log10(view.error.rmse):.1f}", *shares))
+    if rows:
+        tables.show(f"expected error ({source})", ("view", "of a color", "PSNR", *PARTS), rows)
     rows = []
     several = blocks if len(blocks := tuple(next(iter(groups.values())).blocks)) > 1 else ()
     for name, row in groups.items():

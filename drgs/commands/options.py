@@ -585,7 +585,7 @@ class Select(ComparedViews, Workers):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Fisher(ComparedViews):
-    """Write the Fisher information of training views about every Gaussian, and maps of the remaining uncertainty."""
+    """Write where a run is wrong, the Fisher information of training views about every Gaussian, and maps of both."""
 
     cameras: str | None = option(
         None,
