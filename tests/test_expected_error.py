@@ -202,6 +202,32 @@ def test_state(ring):
     assert torch.equal(drgs.expected_error(g, cameras[3], again), drgs.expected_error(g, cameras[3], record))
 
 
+class Sliding:
+    """Gaussians that move along x."""
+
+    def __init__(self, g, speed):
+        self.g, self.speed = g, speed
+
+    def at(self, time):
+        return self.g.replace(means=self.g.means + torch.tensor([self.speed * (time or 0.0), 0, 0]))
+
+    def parameters(self):
+        return self.g.parameters()
+
+
+def test_what_moves(ring):
+    """Each view is compared with the scene at its time."""
+    g, cameras = ring
+    timed = [dataclasses.replace(camera, time=k / 7) for k, camera in enumerate(cameras)]
+    moving, still = Sliding(g, 0.5), Sliding(g, 0.0)
+    images = photographs(moving, timed)
+    right, wrong = (drgs.error_record(x, timed[:4], images[:4]) for x in (moving, still))
+    assert right.mean_misfit < 1e-9 < 1e-4 < wrong.mean_misfit
+    assert float(drgs.expected_error(still, timed[4], wrong).mean()) > 1e-4
+    plain = drgs.error_record(g, cameras[:4], images[:4])
+    torch.testing.assert_close(wrong.residuals, plain.residuals)
+
+
 def test_no_gaussians():
     """Of nothing, all is unseen."""
     g = drgs.Gaussians.from_arrays(
