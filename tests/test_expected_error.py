@@ -79,7 +79,8 @@ def test_brute_force(rng, settings):
     J = dense.jacobian(g, out)
     variance = 0.0
     for name, x in J.items():
-        per = misfit.reshape(-1, *[1] * (x.ndim - 2)) / (H[name] + 1)
+        prior = drgs.gain.unit_length(g, others) ** -2 if name == "means" else 1.0
+        per = misfit.reshape(-1, *[1] * (x.ndim - 2)) / (H[name] + prior)
         variance = variance + (x.square() * per).flatten(1).sum(1).reshape(-1, 3).sum(1)
     truth = {
         "misfit": w @ fitted + T * NEW * (behind[1] + mean) / (behind[0] + 1),
@@ -113,6 +114,22 @@ def ring():
 
 def photographs(g, cameras, settings=None):
     return [drgs.render(g, c, settings, outputs=()).rgb.clamp(0, 1) for c in cameras]
+
+
+def test_the_unit_and_the_zero_of_the_world_do_not_matter(ring):
+    """The same in kilometers, somewhere else."""
+    g, cameras = ring
+    images = photographs(g.replace(sh=-g.sh), cameras[:4])
+    near = drgs.expected_error(g, cameras[5], drgs.error_record(g, cameras[:4], images))
+    zero = np.array([5e5, 5.4e6, 120.0])
+    other = g.replace(means=g.means * 1e-3, log_scales=g.log_scales + math.log(1e-3), origin=zero)
+    moved = []
+    for c in cameras:
+        w2c = c.w2c.copy()
+        w2c[:3, 3] = w2c[:3, 3] * 1e-3 - w2c[:3, :3] @ zero
+        moved.append(dataclasses.replace(c, w2c=w2c))
+    far = drgs.expected_error(other, moved[5], drgs.error_record(other, moved[:4], images))
+    assert float((far - near).abs().max()) <= 1e-3 * float(near.max())
 
 
 @pytest.mark.parametrize("preset", ["exact", "fast"])

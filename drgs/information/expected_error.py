@@ -34,7 +34,7 @@ from drgs.information.diagonal import Diagonal
 from drgs.information.gains import variances
 from drgs.information.maps import variance_map
 from drgs.information.misfit import BEHIND, CONTRAST, RESIDUALS, WEIGHTS, Misfit
-from drgs.information.prior import Prior
+from drgs.information.prior import Prior, unit_length
 from drgs.information.quantity import Joint, ViewContext, checked_views, once_per_time
 from drgs.information.sums import Information, add
 from drgs.integrator import render
@@ -57,7 +57,7 @@ ANGLE = 0.1  # radians between directions at which what one tells of the other h
 NEW = 2.0  # squared error from a new direction over that from directions that were fitted
 SPREAD = 6.0  # variance of a pixel over what the diagonal of H, without its other entries, says
 HIDDEN = 0.6  # squared error where nothing is, over the mean squared difference of photographs from the background
-_PRIOR = Prior(1.0)  # lambda: what one pixel that is fully the parameter's tells
+_PRIOR = Prior(1.0)  # lambda: what one pixel that is wholly the parameter's says; of positions in a length of the scene
 _MOST_PLACES = 64  # places that directions are known from; views beyond share the nearest one, so that a record of any
 # number of views has at most 512 bytes a Gaussian
 _BYTES = 64 << 20  # bytes of the angles that are held at once
@@ -77,6 +77,7 @@ class ErrorRecord:
         contrast: (2,) float64 number of pixels, and sum of their squared differences from the background.
         information: Group -> float64, that of the views about Gaussians and backdrop, as of `drgs.fisher`.
         sphere: What the backdrop is painted on.
+        length: World units that positions count in beside a prior, of the views (`drgs.gain.unit_length`).
     """
 
     settings: RenderSettings
@@ -88,6 +89,7 @@ class ErrorRecord:
     contrast: torch.Tensor
     information: Information
     sphere: Sphere | None
+    length: float
 
     @property
     def mean_misfit(self) -> float:
@@ -112,7 +114,8 @@ class ErrorRecord:
         tensors = {name: getattr(self, name) for name in ("places", "weights", "residuals", "behind", "contrast")}
         tensors |= {f"information.{name}": x for name, x in self.information.items()}
         sphere = None if self.sphere is None else dataclasses.asdict(self.sphere)
-        return tensors, {"views": self.views, "settings": dataclasses.asdict(self.settings), "sphere": sphere}
+        settings = dataclasses.asdict(self.settings)
+        return tensors, {"views": self.views, "settings": settings, "sphere": sphere, "length": self.length}
 
     @classmethod
     def from_state(cls, tensors: Mapping[str, torch.Tensor], header: Mapping[str, Any]) -> ErrorRecord:
@@ -125,6 +128,7 @@ class ErrorRecord:
             views=header["views"],
             information=information,
             sphere=None if sphere is None else Sphere(tuple(sphere["center"]), sphere["radius"]),
+            length=header["length"],
             **{name: x for name, x in tensors.items() if not name.startswith(begin)},
         )
 
@@ -195,6 +199,7 @@ def error_record(
         contrast=total.pop(CONTRAST),
         information=total,
         sphere=sphere,
+        length=unit_length(scene, cameras),
     )
 
 
@@ -243,7 +248,7 @@ def error_parts(scene: Scene, camera: Camera, record: ErrorRecord) -> dict[str, 
         out = render(seen.replace(sh=seen.sh[:, :1], features=values), camera, record.settings, outputs=())
     assert out.features is not None  # two channels were given
     composited, alpha = out.features.cpu(), out.alpha.cpu()
-    weights = variances(record.information, _PRIOR)
+    weights = variances(record.information, _PRIOR.over(record.length))
     behind = weights.pop(BACKDROP) * (HIDDEN * _difference(record) / 3)
     scale = SPREAD / 3 * misfit
     weights = {name: x * scale.reshape(-1, *[1] * (x.dim() - 1)) for name, x in weights.items()}
@@ -272,7 +277,7 @@ def _by_direction(
     means = seen.means.double().cpu()
     places = record.places - torch.from_numpy(seen.origin)
     towards = torch.nn.functional.normalize(means - torch.from_numpy(camera.center - seen.origin), dim=1)
-    told, pixels = (torch.zeros(len(means), dtype=torch.float64) for _ in range(2))
+    fitted, pixels = (torch.zeros(len(means), dtype=torch.float64) for _ in range(2))
     rows = max(1, _BYTES // (8 * 3 * max(1, len(places))))
     for start in range(0, len(means), rows):
         part = slice(start, start + rows)
@@ -280,9 +285,9 @@ def _by_direction(
         # Of the chord, which is exact for small angles, where the cosine is 1 to rounding.
         angle = 2 * torch.asin(((known - towards[part, None]).norm(dim=2) / 2).clamp(max=1))
         near = torch.exp(-0.5 * (angle / ANGLE).square())
-        told[part] = (near * record.residuals[part]).sum(1)
+        fitted[part] = (near * record.residuals[part]).sum(1)
         pixels[part] = (near * record.weights[part]).sum(1)
-    return told / (pixels + 1), NEW * misfit / (pixels + 1)
+    return fitted / (pixels + 1), NEW * misfit / (pixels + 1)
 
 
 def _grouped(centers: np.ndarray) -> tuple[np.ndarray, list[int]]:
