@@ -28,11 +28,10 @@ from drgs.display.progress import Bar
 from drgs.fitting import metrics
 from drgs.fitting.frames import Frame, frames_for
 from drgs.fitting.losses import psnr_of
-from drgs.information.nuisances import Nuisances
+from drgs.information.expected_error import error_record, expected_error
 from drgs.integrator import render
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import LockedFolder, lock_folder, write_json
-from drgs.pages.report import pictures as report_pictures
 from drgs.pages.report.write import FILE
 from drgs.settings import RenderSettings
 from drgs.train import FitConfig, fit
@@ -270,8 +269,8 @@ class _Demo:
         page = fitted.run.path / FILE
         g = fitted.gaussians
         with self.timed("pictures"):
-            known = [frame.camera for frame in frames_for(dataset.split()[0], self.config.data)]
-            pictures.write_png(self.out_dir / "overview.png", _overview(g, known, frames, images["exact"]))
+            fitted_frames = frames_for(dataset.split()[0], self.config.data)
+            pictures.write_png(self.out_dir / "overview.png", _overview(g, fitted_frames, frames, images["exact"]))
             pictures.write_png(self.out_dir / "comparison.png", _sheet(frames, images))
             _turntable(g, self.out_dir / "turntable.webm", self.plan, self.progress)
             report_of(fitted.run, page, dataset)
@@ -375,21 +374,25 @@ def _race(g: Gaussians, camera: Camera, repeats: int) -> dict:
     }
 
 
-def _overview(g: Gaussians, known: list[Camera], frames: list[Frame], images: list[torch.Tensor]) -> np.ndarray:
-    """The held-out view that is met worst: photograph, rendering, error, and the predicted standard deviation."""
+def _overview(g: Gaussians, fitted: list[Frame], frames: list[Frame], images: list[torch.Tensor]) -> np.ndarray:
+    """The held-out view that is met worst: photograph, rendering, error, and on the same scale the error that was to be
+    expected without this photograph.
+    """
     import cv2
 
     photos = [frame.image() for frame in frames]
     worst = min(range(len(frames)), key=lambda i: metrics.psnr(images[i].clamp(0, 1), photos[i]))
     frame, photo, image = frames[worst], photos[worst], images[worst].clamp(0, 1)
     settings = RenderSettings.preset("fast")  # that of the fit
-    found = report_pictures.uncertain(g, known, {frame.name: frame.camera}, settings, Nuisances())
-    error = (image - photo).abs().mean(-1).numpy()
+    record = error_record(g, [x.camera for x in fitted], [x.image() for x in fitted], settings)
+    expected = expected_error(g, frame.camera, record).sqrt().numpy()
+    error = (image - photo).square().mean(-1).sqrt().numpy()
+    most = max(np.percentile(error, 99.5), 1e-6)
     panels = {
         "photograph, held out": photo.numpy(),
         "rendering": image.numpy(),
-        "error": pictures.inferno(error / max(np.percentile(error, 99.5), 1e-6)),
-        "predicted uncertainty": pictures.map_colors(np.sqrt(found[frame.name][0]))[0],
+        "error": pictures.inferno(error / most),
+        "expected error": pictures.inferno(expected / most),
     }
     wide = (_PANEL_WIDTH, round(_PANEL_WIDTH * frame.camera.height / frame.camera.width))
     large = {

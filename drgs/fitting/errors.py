@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
 from drgs.display.progress import Bar
@@ -21,7 +22,9 @@ if TYPE_CHECKING:
 __all__ = ["run_error_record"]
 
 
-def run_error_record(run: Run, settings: RenderSettings, max_pixels: int | None = None) -> ErrorRecord:
+def run_error_record(
+    run: Run, settings: RenderSettings, max_pixels: int | None = None, most: int | None = None
+) -> ErrorRecord:
     """The record of a run's scene and of the photographs that it was fitted to, at the poses that the fit has found.
 
     Where the fit has estimated exposure, photographs are as all of them would be with the mean exposure, in which the
@@ -31,6 +34,7 @@ def run_error_record(run: Run, settings: RenderSettings, max_pixels: int | None 
         run: The run folder.
         settings: Settings of the renderer.
         max_pixels: Pixels of a photograph at most; None: those of the fit.
+        most: Photographs that are looked at, at most, evenly spaced, which stand for all; None: all of them.
     Raises:
         FileNotFoundError, ValueError: If photographs are gone or cannot be read.
     """
@@ -41,13 +45,16 @@ def run_error_record(run: Run, settings: RenderSettings, max_pixels: int | None 
     names = fitted_views(run, loaded.record)
     if missing := [name for name in names if name not in views]:
         raise ValueError(f"{loaded.record.data}: must still hold photograph {missing[0]!r}, it is gone; restore it")
-    frames = frames_for([views[name] for name in names], config.data, max_pixels)
+    count = len(names) if most is None else min(most, len(names))
+    rows = np.linspace(0, len(names) - 1, count).round().astype(int).tolist()
+    frames = frames_for([views[names[row]] for row in rows], config.data, max_pixels)
     gains = loaded.networks.get(NETWORK, {}).get("log_gains")
-    images = [_as_shown(frame, None if gains is None else gains[row]) for row, frame in enumerate(frames)]
+    images = [_as_shown(frame, None if gains is None else gains[row]) for row, frame in zip(rows, frames, strict=True)]
     masks = [frame.mask for frame in frames]
     cameras = [frame.camera for frame in frames]
     with Bar("residuals", len(frames)) as bar:
-        return error_record(loaded.scene, cameras, images, settings, masks=masks, advance=bar.advance)
+        record = error_record(loaded.scene, cameras, images, settings, masks=masks, advance=bar.advance)
+    return record if count == len(names) else record.times(len(names) / count)
 
 
 def _as_shown(frame: Frame, log_gain: torch.Tensor | None) -> torch.Tensor:

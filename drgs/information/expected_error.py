@@ -109,6 +109,12 @@ class ErrorRecord:
         """The same of what lies behind everything."""
         return float((self.behind[1] + self.mean_misfit) / (self.behind[0] + 1))
 
+    def times(self, factor: float) -> ErrorRecord:
+        """The record of as many views again and again: of some that stand for all."""
+        scaled = {name: getattr(self, name) * factor for name in ("weights", "residuals", "behind", "contrast")}
+        information = {name: x * factor for name, x in self.information.items()}
+        return dataclasses.replace(self, views=round(self.views * factor), information=information, **scaled)
+
     def to_state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Tensors, and what else a file has to hold as JSON, of which `from_state` makes the record again."""
         tensors = {name: getattr(self, name) for name in ("places", "weights", "residuals", "behind", "contrast")}

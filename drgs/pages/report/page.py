@@ -198,9 +198,9 @@ def _views(metrics: Mapping[str, Any], drawings: Drawings) -> dict[str, Any]:
     text = "From the worst to the best by PSNR." if several else ""
     if drawings.maps:
         text += (
-            " Predictive variance: how uncertain the color of each pixel is by what the fitted views say (unit noise, "
-            "lambda = 1; bright is uncertain, and what no view has shown is brightest). Not covered: white where no "
-            "Gaussian is."
+            " Expected error: how far from a photograph each pixel's color is expected to be, in units of color, by "
+            "what the fit gets wrong in its own photographs, directions that none of them has, and what they leave "
+            "open; this view's photograph is not used. Not covered: white where no Gaussian is."
         )
     definitions = metrics.get("variants")
     listed = [(str(key), str(x)) for key, x in definitions.items()] if isinstance(definitions, dict) else []

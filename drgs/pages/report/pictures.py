@@ -15,29 +15,23 @@ import torch
 from drgs.display import pictures
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
-from drgs.gain import variances
-from drgs.information.blocks import MAP_PRIOR, SceneBlocks
-from drgs.information.scoring import Scoring
-from drgs.information.sums import add, together
+from drgs.information.expected_error import expected_error
 from drgs.integrator import render
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Scene
-    from drgs.information.choices import Block
-    from drgs.information.nuisances import Nuisances
+    from drgs.information.expected_error import ErrorRecord
     from drgs.pages.report.account import Account
     from drgs.settings import RenderSettings
 
-__all__ = ["Picture", "jpeg", "maps", "previews", "spread", "stills", "uncertain", "view_pictures"]
+__all__ = ["Picture", "jpeg", "maps", "previews", "spread", "stills", "view_pictures"]
 
 _QUALITY = 88  # of JPEG; a page of thirty pictures then has about two megabytes
 _WIDEST = 1200  # pixels of width, at most; no page is wider
 _MOST_PREVIEWS = 12  # pictures of how the fit went, evenly spaced: a slider of more is no smoother
 _MAP_WIDTH = 480  # pixels of width of a map of information, about: it takes seconds; chosen
 _MOST_BYTES = 1 << 28  # bytes of a PNG of a run folder, at most: no rendering has more
-_MAPPED: tuple[Block, ...] = ("geometry", "backdrop")
-_MOST_KNOWN = 24  # known views whose information is summed, spread evenly over more; chosen for its seconds
 _MOST_STILLS = 12  # times at which one camera of a sequence is shown, evenly spaced; chosen
 
 
@@ -109,57 +103,21 @@ def _read(path: Path) -> np.ndarray | None:
     return None if image is None else np.ascontiguousarray(image[..., ::-1])
 
 
-def maps(
-    scene: Scene,
-    known: Sequence[Camera],
-    shown: Mapping[str, Camera],
-    settings: RenderSettings,
-    nuisances: Nuisances,
-) -> dict[str, tuple[Picture, Picture]]:
-    """View -> pictures of the maps of `uncertain`."""
-    return {
-        name: (
-            jpeg(pictures.map_picture(_enlarged(variance)), "predictive variance"),
-            jpeg(_enlarged(np.repeat(bare[..., None], 3, 2)), "not covered: 1 - alpha"),
-        )
-        for name, (variance, bare) in uncertain(scene, known, shown, settings, nuisances).items()
-    }
-
-
-def uncertain(
-    scene: Scene,
-    known: Sequence[Camera],
-    shown: Mapping[str, Camera],
-    settings: RenderSettings,
-    nuisances: Nuisances,
-) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """View -> two (H, W) maps: uncertainty of each pixel given the fitted views, and how much no Gaussian covers.
-
-    The first is the predictive variance by the blocks geometry and backdrop, with lambda = 1, for noise of 1; of more
-    than 24 known views, 24 evenly chosen ones stand for all. The second is 1 - alpha. `nuisances` are eliminated from
-    what the views say.
-    """
-    if not known or not shown:
-        return {}
-    counted = spread(known, _MOST_KNOWN)
-    result = dict[str, tuple[np.ndarray, np.ndarray]]()
-    scoring = Scoring(settings=settings, blocks=_MAPPED, nuisances=nuisances)
-    blocks = SceneBlocks.of(scene, scoring, [*known, *shown.values()], "report")
-    with Bar("maps of information", len(counted) + len(shown)) as bar:
-        total: dict[str, torch.Tensor] = {}
-        for camera in counted:
-            said = together(blocks.information(camera))
-            add(total, {name: x * (len(known) / len(counted)) for name, x in said.items()})
-            bar.advance()
-        weights = variances(total, MAP_PRIOR.in_scene(scene, known))
+def maps(scene: Scene, shown: Mapping[str, Camera], record: ErrorRecord) -> dict[str, tuple[Picture, Picture]]:
+    """View -> pictures of the error that is expected of each pixel, and of how much no Gaussian covers (1 - alpha)."""
+    found = {}
+    with Bar("maps of the expected error", len(shown)) as bar:
         for name, camera in shown.items():
-            plain = colors_only(scene, camera.time)
-            variance = blocks.variance_map(camera, weights).numpy()
+            error = expected_error(scene, camera, record).sqrt().numpy()
             with torch.no_grad():  # a picture
-                alpha = render(plain, camera, settings, outputs=()).alpha.cpu().numpy()
-            result[name] = variance, 1 - np.clip(alpha, 0, 1)
+                alpha = render(colors_only(scene, camera.time), camera, record.settings, outputs=()).alpha.cpu().numpy()
+            bare = 1 - np.clip(alpha, 0, 1)
+            found[name] = (
+                jpeg(pictures.map_picture(_enlarged(error)), "expected error"),
+                jpeg(_enlarged(np.repeat(bare[..., None], 3, 2)), "not covered: 1 - alpha"),
+            )
             bar.advance()
-    return result
+    return found
 
 
 def _enlarged(values: np.ndarray) -> np.ndarray:

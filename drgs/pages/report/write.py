@@ -12,8 +12,8 @@ import numpy as np
 from drgs.cameras.sizes import at_most
 from drgs.data.camera_lists import camera_from_json
 from drgs.display.progress import Bar
+from drgs.fitting.errors import run_error_record
 from drgs.fitting.records import load_run
-from drgs.information.nuisances import Nuisances
 from drgs.io.outputs import atomic_write
 from drgs.io.run import Run
 from drgs.pages.report import charts, pictures
@@ -29,6 +29,7 @@ __all__ = ["FILE", "write_report"]
 
 FILE = "report.html"
 _SHOWN_VIEWS = 4  # views that are shown with pictures; chosen for the size of the page
+_MOST_RESIDUALS = 24  # photographs whose residuals stand for those of all, at most; chosen for its seconds
 
 _log = logging.getLogger(__name__)
 
@@ -73,9 +74,13 @@ def _pictures_and_charts(account: Account, dataset: Dataset | None) -> Drawings:
     still_name = ""
     if loaded is not None and run_cameras is not None:
         shown = {name: run_cameras.held[name] for name in names if name in run_cameras.held}
-        record = account.record
-        nuisances = Nuisances(eliminate=record.estimated)
-        found = pictures.maps(loaded.scene, run_cameras.fitted, shown, record.config.settings, nuisances)
+        try:
+            if shown:
+                settings = account.record.config.settings
+                record = run_error_record(account.run, settings, most=_MOST_RESIDUALS)
+                found = pictures.maps(loaded.scene, shown, record)
+        except (OSError, ValueError) as error:
+            notes.append(f"No maps of the expected error: {error}.")
         stills, still_name = _stills(account, loaded, run_cameras)
     picks = account.selection["picks"] if account.selection else []
     drawn: dict[str, str | None] = {}
