@@ -41,6 +41,7 @@ from drgs.information.maps import variance_map as map_of_variance
 from drgs.information.nuisances import NO_NUISANCES, Nuisances
 from drgs.information.prior import Prior
 from drgs.information.quantity import ViewContext, checked_views, once_per_time, sum_over_views
+from drgs.information.removal import REMOVAL, RemovalError
 from drgs.information.semantics import SemanticMetric
 from drgs.information.sums import Information
 from drgs.runtime import alone
@@ -66,6 +67,7 @@ __all__ = [
     "network",
     "network_variance_map",
     "pose_information",
+    "removal_error",
     "variance_map",
 ]
 
@@ -245,6 +247,39 @@ def backdrop(
     weights = three_weights("fisher.backdrop", channel_weights)
     quantity = Backdrop(sphere, False, weights, semantics, nuisances or NO_NUISANCES)
     return sum_over_views(quantity, gaussians, cameras, each, shown, seen_opacity)[BACKDROP]
+
+
+@alone
+def removal_error(
+    scene: Scene,
+    cameras: Camera | Sequence[Camera],
+    settings: RenderSettings | None = None,
+    channel_weights: Sequence[float] = (1.0, 1.0, 1.0),
+    semantics: SemanticMetric | None = None,
+    masks: Masks = None,
+) -> torch.Tensor:
+    """(N,) float64 squared change of the images if one Gaussian alone were not there, summed over pixels, channels and
+    views: exact, one traversal a view. See `drgs.information.removal`.
+
+        error = drgs.fisher.removal_error(g, cameras)
+        smaller = g.take(error > error.quantile(0.5))
+
+    What no view shows has error 0. Errors of several Gaussians do not add up: of two that hide each other each has a
+    small one. `drgs.prune` removes in rounds, therefore.
+
+    Args:
+        scene: N Gaussians, world frame, or a `drgs.ellipsoids.Scene`, whose Gaussians each camera sees at its time.
+        cameras, settings: The same as for `diagonal`.
+        channel_weights: Factors of the squares of R, G and B.
+        semantics: The metric in which features are a part of the image; None: colors are all of it.
+        masks: One for each camera: (H, W) in [0, 1] what its image is multiplied by before it is compared; or None: 1.
+    Raises:
+        ValueError: If a weight or mask is wrong, or the Gaussians of a scene are not as many in all views.
+    """
+    scene = once_per_time(scene)
+    views = checked_views("fisher.removal_error", scene, cameras, settings, masks)
+    weights = three_weights("fisher.removal_error", channel_weights)
+    return sum_over_views(RemovalError(weights, semantics), scene, *views)[REMOVAL]
 
 
 @alone

@@ -26,7 +26,7 @@ from drgs.tracing.records import load_packed, pack, packed_size
 from drgs.tracing.responses import Response
 from drgs.tracing.sums import add_row
 
-__all__ = ["GEOMETRY", "BlockSums", "SquareSums", "Rows", "SeveralSums", "VarianceSums", "extras"]
+__all__ = ["GEOMETRY", "BlockSums", "RemovalSums", "SquareSums", "Rows", "SeveralSums", "VarianceSums", "extras"]
 
 GEOMETRY = 10  # means 3, rotations 3, log-scales 3, logit-opacity 1: the order of every row
 # entries of `extras`: d log strength / dlogit, dc/dmu (9), then the response's
@@ -68,6 +68,7 @@ class Row(NamedTuple):
         slopes: d a / d geometry; None without geometry.
         g: Slopes dC / da, one per channel, 0 where the ray has no such hit; None without geometry.
         w: Weight of the hit, 0 likewise.
+        a: Opacity of the hit; whatever it is where `g` and `w` are 0.
         turned: (color, axis) w dc/dmu, or None where the color does not depend on the mean.
         color: RGB of the Gaussian on this ray, then its other channels; None where the sink does not need them.
         basis: SH basis along the ray; empty where SH are evaluated towards the mean.
@@ -76,6 +77,7 @@ class Row(NamedTuple):
     slopes: list[Float] | Any
     g: list[Float] | Any
     w: Float
+    a: Float
     turned: list[list[Float]] | None
     color: list[Float] | Any
     basis: list[Float]
@@ -86,7 +88,7 @@ class Rows:
 
     Args:
         buffer: The buffer of `extras`; None leaves the geometry out, only w is known then.
-        sink: What becomes of them: `SquareSums`, `BlockSums` or `VarianceSums`.
+        sink: What becomes of them: `SquareSums`, `BlockSums`, `RemovalSums` or `VarianceSums`.
         finals: The final state of the Primal pass, one per shared ray.
         color: The color depends on the mean, through the direction.
         masks: What the rows of each shared ray are multiplied by; None: nothing.
@@ -191,7 +193,7 @@ class Rows:
                 w = w * self.masks[k]
                 g = [x * self.masks[k] for x in g] if g else g
                 turned = [[x * self.masks[k] for x in each] for each in turned] if turned else turned
-            rows.append(Row(slopes, g, w, turned, color, ray.carried[: ray.basis]))
+            rows.append(Row(slopes, g, w, a, turned, color, ray.carried[: ray.basis]))
             hits |= ok
             out.append(new)
         return self.sink.take(lib, index, hits, rows, out)
@@ -319,6 +321,36 @@ class BlockSums:
                     total = dr.fma(slopes[i] * slopes[j], squares, total)
                 sums.append(total)
         add_row(lib, self.buffer, sums, index, self.WIDTH, 0, hits, self.mode)
+        return states
+
+
+class RemovalSums:
+    """Sums of the squared changes of the channels where a Gaussian is left out: of a hit, dC / da a, as C is linear in
+    the opacity a of each hit.
+
+    Args:
+        weights: Weights of the channels: colors first, where they are composited.
+    """
+
+    needs_color = False
+
+    def __init__(self, lib: Lib, count: int, weights: Sequence[float], mode: dr.ReduceMode) -> None:
+        self.buffer = dr.zeros(lib.Float, count)
+        self.weights = weights
+        self.mode = mode
+
+    def init(self, k: int) -> dict:
+        """Nothing is kept per ray."""
+        return {}
+
+    def take(self, lib: Lib, index: UInt32, hits: Mask, rows: list[Row], states: list[dict]) -> list[dict]:
+        """Add a hit's rows."""
+        total = lib.Float(0)
+        for row in rows:
+            for weight, slope in zip(self.weights, row.g, strict=True):
+                change = slope * row.a
+                total = dr.fma(change * change, weight, total)
+        add_row(lib, self.buffer, [total], index, 1, 0, hits, self.mode)
         return states
 
 

@@ -11,7 +11,16 @@ import torch
 
 from drgs import runtime
 from drgs.information.groups import GROUPS, Information
-from drgs.information.jacobian import GEOMETRY, BlockSums, Rows, SeveralSums, SquareSums, VarianceSums, extras
+from drgs.information.jacobian import (
+    GEOMETRY,
+    BlockSums,
+    RemovalSums,
+    Rows,
+    SeveralSums,
+    SquareSums,
+    VarianceSums,
+    extras,
+)
 from drgs.tracing.arrays import Float
 from drgs.tracing.bridge import to_drjit
 from drgs.tracing.call import Call
@@ -231,7 +240,7 @@ class Replay:
 
     def _summed(
         self,
-        sink_of: Callable[[Walk, dr.ReduceMode], SquareSums | BlockSums],
+        sink_of: Callable[[Walk, dr.ReduceMode], SquareSums | BlockSums | RemovalSums],
         width: int,
         weights: Sequence[float],
         more_sums: Sequence[WalkSums] = (),
@@ -290,6 +299,11 @@ class Replay:
         full[:, row, column] = total
         full[:, column, row] = total
         return full.cpu()
+
+    def removal_errors(self, weights: Sequence[float]) -> torch.Tensor:
+        """`fisher.removal_error` of one view, on the CPU."""
+        sink_of = lambda walk, mode: RemovalSums(self.lib, self.count, walk.weights, mode)  # noqa: E731
+        return self._summed(sink_of, 1, weights)[:, 0].cpu()
 
     def variance(self, information: Information, weights: Sequence[float]) -> torch.Tensor:
         """`fisher.variance_map` of one view, by weights of the groups (`information`) and of the channels."""

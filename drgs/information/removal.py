@@ -1,0 +1,75 @@
+"""What an image loses with one Gaussian: the squared change of a view if it were not there, of every Gaussian at once.
+
+Of a hit of opacity a and color c in front of what lies behind, B, the camera gets T (a c + (1 - a) B). Without it the
+pixel is C' = C - T a (c - B), exactly, as an image is linear in the opacity of each of its hits. T (c - B) = dC/da is
+what rows of the Jacobian are made of (jacobian.py), so that the sum of (C - C')^2 over pixels and channels takes one
+traversal, as the diagonal does. For the response `peak` it is the diagonal's entry of the logit over (1 - alpha)^2,
+which has no digits left where alpha is near 1: a sum of its own is formed, of every response.
+
+A ray ends behind an opaque hit, but would not without it: B has to be what is there. So opacities are at most 1 - 1e-6
+here, which changes C - C' by that share, and rays go on to where they would end without any one of their hits. All
+other cut-offs are those of the settings. That with the Gaussian rays do end there moves C by `transmittance_min` at
+most, as each end of a ray does; it is left out.
+
+GaussianPOP (arXiv 2602.06830, 2026) has this criterion for a rasterizer's images; LightGaussian (Fan et al. 2024) and
+PUP 3D-GS (Hanson et al. 2025) approximate what it says.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, ClassVar
+
+import torch
+
+from drgs.information.quantity import Quantity
+from drgs.information.semantics import SemanticMetric
+from drgs.runtime import alone
+
+if TYPE_CHECKING:
+    from drgs.information.quantity import ViewContext
+    from drgs.settings import RenderSettings
+
+__all__ = ["REMOVAL", "RemovalError", "seen_through"]
+
+REMOVAL = "removal"
+"""Name of what `RemovalError` computes."""
+
+_OPAQUE = 1 - 1e-6  # largest opacity of a hit: 17 times what float32 can tell from 1
+
+
+@dataclasses.dataclass(frozen=True)
+class RemovalError(Quantity):
+    """{"removal": (N,)}: sum over pixels and channels of the squared change of the image without each Gaussian.
+
+    Attributes:
+        channel_weights: Factors of the squares of R, G and B.
+        semantics: The metric of the features that are a part of the image; None: they are none.
+    """
+
+    channel_weights: Sequence[float] = (1.0, 1.0, 1.0)
+    semantics: SemanticMetric | None = None
+    where: ClassVar[str] = "fisher.removal_error"
+
+    @alone
+    def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
+        """Float64 on the CPU; 0 of a view without Gaussians."""
+        from drgs.information.replay import Replay  # loads Dr.Jit, which poses alone need not have
+
+        gaussians = view.gaussians
+        if self.semantics is not None:
+            self.semantics.check(self.where, gaussians)
+        if not len(gaussians):
+            return {REMOVAL: torch.zeros(0, dtype=torch.float64)}
+        # A replay of its own: the view's ends its rays at opaque hits.
+        replay = Replay(gaussians, view.camera, seen_through(view.settings), True, self.semantics, view.mask)
+        return {REMOVAL: replay.removal_errors(self.channel_weights)}
+
+
+def seen_through(settings: RenderSettings) -> RenderSettings:
+    """Settings by which rays end no earlier than they would by these ones without any one of their hits."""
+    alpha_max = min(settings.alpha_max, _OPAQUE)
+    return settings.replace(
+        alpha_max=alpha_max, transmittance_min=settings.transmittance_min * (1 - alpha_max), max_hits=None
+    )
