@@ -57,6 +57,7 @@ _NAMES = {
     "load_gaussians": "codecs",
     "load_ply": "files",
     "load_run": "fitting.records",
+    "prune": "pruning",
     "rasterization": "rasterize",
     "render": "integrator",
     "render_jvp": "integrator",
@@ -91,6 +92,7 @@ _MODULES = {
     "oracle": "oracle",
     "planner": "planner",
     "plugin": "plugin",
+    "pruning": "pruning",
     "rasterize": "rasterize",
     "reference": "reference",
     "report": "pages.report",
@@ -138,6 +140,7 @@ __all__ = [
     "load_gaussians",
     "load_ply",
     "load_run",
+    "prune",
     "rasterization",
     "reference",
     "render",
@@ -168,6 +171,7 @@ if TYPE_CHECKING:
     from drgs import oracle as oracle
     from drgs import planner as planner
     from drgs import plugin as plugin
+    from drgs import pruning as pruning
     from drgs import rasterize as rasterize
     from drgs import selection as selection
     from drgs import settings as settings
@@ -200,6 +204,7 @@ if TYPE_CHECKING:
     from drgs.pages import report as report
     from drgs.pages import sharing as sharing
     from drgs.planner import Planner
+    from drgs.pruning import prune
     from drgs.rasterize import rasterization
     from drgs.select import Scoring, Selection
     from drgs.select import select as select_views

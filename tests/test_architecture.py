@@ -57,6 +57,7 @@ FLOORS: list[dict[str, str]] = [
     {
         "fitting": "fits: configuration, trainer, components, measurement",
         "train": "fits, for users",
+        "pruning": "fewer Gaussians for nearly the same images, for users",
         "meshing": "a surface, cut to what information determines",
         "lab": "experiments on rasterizers: crossval, ladder, tradeoff, stress",
         "testing": "crossval as an assertion, for users",

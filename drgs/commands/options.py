@@ -49,6 +49,7 @@ __all__ = [
     "Lenses",
     "Mesh",
     "SceneTimes",
+    "Prune",
     "Query",
     "Render",
     "Report",
@@ -663,6 +664,38 @@ class Convert(Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class Prune(Settings, Views, Lenses):
+    """Remove the Gaussians that the photographs need least, and say what it costs in every renderer."""
+
+    scene: Path = _scene()
+    output: Path = option(help="Output file; its suffix is the format (docs/files.md).", short="o")
+    data: str | None = option(
+        None,
+        "Photographs of the scene: a data set or a run, or a cameras.json without any; default those of the run.",
+        heading="Views",
+    )
+    keep: float | None = option(None, "Share of the Gaussians to keep, of those that the views show, e.g. 0.3.")
+    loss: str | None = option(
+        None, "Remove as many as the mean PSNR of the training photographs may fall by, e.g. 0.1dB.", metavar="DB"
+    )
+    unseen: Literal["keep", "remove"] = option("keep", "What becomes of Gaussians that no training view shows.")
+    refit: int | None = option(
+        None, "Fit the Gaussians that are left to the photographs again, for so many steps.", within=COUNT
+    )
+    rounds: int | None = option(
+        None, "Number of rounds in which they are removed, default 5; more cost less PSNR, and more time.", within=COUNT
+    )
+    max_pixels: int | None = option(
+        None, "Views are reduced to at most this many pixels; default that of the fit, or 130000.", within=COUNT
+    )
+    preset: Preset = option(
+        "fast",
+        "Preset that errors are computed with; fast removes what exact does in a fraction of the time.",
+        heading="Rendering",
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Mesh(Settings, Views, Lenses):
     """Make a triangle mesh with colors from the depth of a run in the views that it was fitted to."""
 
@@ -936,6 +969,7 @@ COMMANDS: dict[str, type[Common]] = {
     "fisher": Fisher,
     "query": Query,
     "convert": Convert,
+    "prune": Prune,
     "mesh": Mesh,
     "crossval": Crossval,
     "tradeoff": Tradeoff,

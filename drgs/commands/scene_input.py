@@ -17,7 +17,7 @@ from drgs.settings import RenderSettings
 from drgs.viewing.placed_views import NEXT, Ranking, read_ranking
 
 if TYPE_CHECKING:
-    from drgs.commands.options import Crossval, Fisher, Query, Render, Select, Share, Tradeoff, View
+    from drgs.commands.options import Crossval, Fisher, Prune, Query, Render, Select, Share, Tradeoff, View
     from drgs.ellipsoids import Gaussians, Scene
     from drgs.features.decoder import Decoder
     from drgs.features.segmentation import Classes
@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from drgs.information.scoring import Scoring
     from drgs.information.semantics import SemanticMetric
 
-    _Placed = Crossval | Fisher | Query | Render | Select | Share | Tradeoff | View  # have options that name a data set
+    # They have options that name a data set.
+    _Placed = Crossval | Fisher | Prune | Query | Render | Select | Share | Tradeoff | View
 
 __all__ = ["SELECTION", "SceneInput", "ranking_of"]
 
@@ -59,7 +60,7 @@ class SceneInput:
     moving: Scene | None = None
 
     @classmethod
-    def of(cls, args: Crossval | Fisher | Query | Render | Select | Tradeoff | View) -> SceneInput:
+    def of(cls, args: Crossval | Fisher | Prune | Query | Render | Select | Tradeoff | View) -> SceneInput:
         """The scene that the command line names.
 
         Raises:
@@ -151,7 +152,7 @@ class SceneInput:
 
 def _data_of(args: _Placed) -> Path | None:
     """The data set that an option names, itself or by a run on it; None where there are only lists and orbits."""
-    for text in (getattr(args, name, None) for name in ("train", "cameras", "candidates")):
+    for text in (getattr(args, name, None) for name in ("train", "data", "cameras", "candidates")):
         if text is None or text in ("orbit", "dome"):
             continue
         path = Path(text)

@@ -55,6 +55,7 @@ __all__ = [
     "known_views",
     "views_to_compare",
     "views_to_sample",
+    "warn_of_unseen",
     "with_times",
 ]
 
@@ -307,7 +308,7 @@ def known_views(
         )
     known = _known_views(text, args, given, lenses, pixels)
     if text is not None:
-        _warn_of_unseen(given.gaussians, known.cameras)
+        warn_of_unseen(given.gaussians, known.cameras)
     return known
 
 
@@ -354,7 +355,7 @@ def held_out_views(args: Views, given: SceneInput, known: Known) -> list[Camera]
     return [_camera(view, known.sizes, known.pixels, known.lenses) for view in views]
 
 
-def _warn_of_unseen(gaussians: Gaussians, cameras: list[Camera]) -> None:
+def warn_of_unseen(gaussians: Gaussians, cameras: list[Camera]) -> None:
     """Warn if most of the cameras see no Gaussian's center: the file may be in another coordinate frame."""
     means = gaussians.means[:: max(1, len(gaussians) // _CHECKED_GAUSSIANS)].detach().cpu().numpy() + gaussians.origin
     looked = evenly(cameras, _CHECKED_CAMERAS)

@@ -1,0 +1,278 @@
+"""Fewer Gaussians for nearly the same images: those without which given views change least are removed, in rounds.
+
+A round takes the error that the scene makes without each one of its Gaussians (`drgs.fisher.removal_error`), exactly,
+and removes those of the smallest. Errors of several Gaussians do not add up: where two hide each other, each alone can
+go. So a round removes a part, and the next one looks at what is left. Five rounds reach what ten reach, to 0.05 dB
+(docs/prune.md).
+
+What changes no given view has error 0, and is another matter than what changes them little: it may be what other views
+show. It is kept, unless the caller says otherwise.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import torch
+
+from drgs.cameras import some_cameras
+from drgs.data import scene_extent
+from drgs.display.progress import Bar
+from drgs.ellipsoids import Gaussians, check_gaussians
+from drgs.fisher import removal_error
+from drgs.fitting.frames import Frame
+from drgs.fitting.losses import psnr
+from drgs.fitting.rows import GaussianRows
+from drgs.fitting.threads import fewer_torch_threads
+from drgs.fitting.trainer import Trainer
+from drgs.information.inputs import mask_list
+from drgs.integrator import render
+from drgs.settings import RenderSettings
+
+if TYPE_CHECKING:
+    from drgs.cameras import Camera
+    from drgs.fitting.config import FitConfig, RateConfig
+    from drgs.information.inputs import Masks
+    from drgs.information.semantics import SemanticMetric
+
+__all__ = ["ROUNDS", "Pruned", "Round", "Unseen", "check_amount", "fit_on", "prune"]
+
+Unseen = Literal["keep", "remove"]
+
+ROUNDS = 5
+"""Rounds of `prune`: on `banana` half of the Gaussians cost 5.9 dB by one round, 2.7 dB by five, 2.6 dB by ten."""
+
+_BISECTIONS = 8  # renderings of all views for a `loss`: as many are removed as it allows, but for 1/256 of them
+
+_BEGUN = 0.5  # part of the schedule that `fit_on` takes as done: 0 to 0.9 end within 0.1 dB on `banana`
+
+
+@dataclasses.dataclass(frozen=True)
+class Round:
+    """A round of `prune`.
+
+    Attributes:
+        removed: How many Gaussians it removed.
+        error: Sum of their errors, each as if it alone were removed: squared color, summed over pixels and channels.
+        psnr: Mean PSNR of the views behind it, in dB; None where no images were given.
+    """
+
+    removed: int
+    error: float
+    psnr: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Pruned:
+    """Result of `prune`.
+
+    Attributes:
+        gaussians: Those that are left, in their order.
+        kept: (N,) bool, which of the given ones these are.
+        unseen: How many of the given ones change no given view.
+        rounds: What each round removed.
+        psnr: Mean PSNR of the views before, in dB; None where no images were given.
+    """
+
+    gaussians: Gaussians = dataclasses.field(repr=False)
+    kept: torch.Tensor = dataclasses.field(repr=False)
+    unseen: int
+    rounds: tuple[Round, ...]
+    psnr: float | None = None
+
+
+def prune(
+    gaussians: Gaussians,
+    cameras: Camera | Sequence[Camera],
+    settings: RenderSettings | None = None,
+    *,
+    keep: float | None = None,
+    loss: float | None = None,
+    images: Sequence[torch.Tensor] | None = None,
+    masks: Masks = None,
+    rounds: int = ROUNDS,
+    unseen: Unseen = "keep",
+    semantics: SemanticMetric | None = None,
+) -> Pruned:
+    """Remove the Gaussians that given views need least.
+
+        smaller = drgs.prune(g, cameras, keep=0.5).gaussians
+
+    Args:
+        gaussians: N Gaussians, world frame; they are not changed.
+        cameras: The views, which should show all that matters.
+        settings: Default `RenderSettings.preset("fast")`: what it removes costs no more in other renderers than what
+            `exact` does, which takes six times as long (docs/prune.md).
+        keep: Share of the Gaussians that is left, in (0, 1), of those that change a view. Either this or `loss`.
+        loss: By how much the mean PSNR of the views may fall, in dB, > 0; needs `images`. As many are removed as that
+            allows, to within some percent of it.
+        images: (H, W, 3) in [0, 1], a photograph of each camera.
+        masks: One for each camera: (H, W) in [0, 1] what counts of its image; or None: all.
+        rounds: In how many rounds; more are better, each takes a traversal of every view.
+        unseen: What becomes of Gaussians that change no view: `keep` or `remove`.
+        semantics: The metric in which features are a part of the image; None: colors are all of it.
+    Raises:
+        ValueError: If a number is out of range, or the views show nothing of the scene.
+    """
+    where = "prune"
+    check_gaussians(where, gaussians)
+    cameras = some_cameras(where, cameras)
+    check_amount(where, keep, loss, rounds)
+    if unseen not in ("keep", "remove"):
+        raise ValueError(f"{where}: unseen must be 'keep' or 'remove', got {unseen!r}; choose one")
+    if loss is not None and images is None:
+        raise ValueError(
+            f"{where}: loss must have images that the views are compared with, got none; pass keep instead"
+        )
+    settings = settings or RenderSettings.preset("fast")
+    with Bar("errors without a Gaussian", rounds * len(cameras)) as bar:
+        views = _Views(cameras, settings, mask_list(where, masks, cameras), images, semantics, bar)
+        return _pruned(gaussians, views, keep, loss, rounds, unseen)
+
+
+def _pruned(
+    gaussians: Gaussians, views: _Views, keep: float | None, loss: float | None, rounds: int, unseen: Unseen
+) -> Pruned:
+    """`prune`, of arguments that have been checked."""
+    start = views.psnr(gaussians)
+    left = torch.arange(len(gaussians))
+    ever_seen = torch.zeros(len(gaussians), dtype=torch.bool)
+    seen = 0  # in the first round; a share of these is kept
+    done = []
+    for number in range(rounds):
+        error = views.removal_error(gaussians.take(left))
+        ever_seen[left] |= error > 0
+        seen = seen or int(ever_seen.sum())
+        if not seen:
+            raise ValueError(
+                f"prune: the views must show something of the scene, the {len(views.cameras)} given ones show nothing; "
+                "check that they are of this scene, and in its frame"
+            )
+        # Least first; what changes nothing is no candidate.
+        order = error.argsort()[int((error == 0).sum()) :]
+        part = (number + 1) / rounds
+        if keep is not None:
+            # Every round keeps the same share of what there is; something is left of the last one.
+            goal = len(gaussians) - seen + max(1, round(seen * keep**part))
+            count = max(0, len(left) - goal)
+        elif loss is not None and start is not None:
+            count = views.most_removed(gaussians, left, order, start - loss * part)
+        error_of_these = float(error[order[:count]].sum())
+        left = _without(left, order[:count])
+        done.append(Round(count, error_of_these, views.psnr(gaussians.take(left))))
+    if unseen == "remove":
+        left = left[ever_seen[left]]
+    kept = torch.zeros(len(gaussians), dtype=torch.bool)
+    kept[left] = True
+    return Pruned(gaussians.take(left), kept, int((~ever_seen).sum()), tuple(done), start)
+
+
+def check_amount(where: str, keep: float | None, loss: float | None, rounds: int = ROUNDS) -> None:
+    """Raise ValueError unless exactly one of `keep` and `loss` is given, and numbers are as `prune` takes them."""
+    if (keep is None) == (loss is None):
+        raise ValueError(
+            f"{where}: either keep or loss must say how many Gaussians are removed, got "
+            f"{'none' if keep is None else 'both'}; e.g. keep 0.5, or loss 0.1 dB"
+        )
+    if keep is not None and not 0 < keep < 1:
+        hint = "to remove nothing, leave the scene as it is" if keep == 1 else "0.5 keeps half of the Gaussians"
+        raise ValueError(f"{where}: keep must be a share above 0 and below 1, got {keep:g}; {hint}")
+    if loss is not None and not 0 < loss < math.inf:
+        raise ValueError(f"{where}: loss must be above 0 dB and finite, got {loss:g}; try 0.1")
+    if not (isinstance(rounds, int) and rounds >= 1):
+        raise ValueError(f"{where}: rounds must be a whole number >= 1, got {rounds!r}; try {ROUNDS}")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Views:
+    """What Gaussians are pruned by."""
+
+    cameras: list[Camera]
+    settings: RenderSettings
+    masks: list[torch.Tensor | None]
+    images: Sequence[torch.Tensor] | None
+    semantics: SemanticMetric | None
+    bar: Bar
+
+    def removal_error(self, gaussians: Gaussians) -> torch.Tensor:
+        """(N,) summed over the views."""
+        total = torch.zeros(len(gaussians), dtype=torch.float64)
+        for camera, mask in zip(self.cameras, self.masks, strict=True):
+            total += removal_error(gaussians, camera, self.settings, semantics=self.semantics, masks=[mask])
+            self.bar.advance()
+        return total
+
+    def psnr(self, gaussians: Gaussians) -> float | None:
+        """Mean PSNR of the views in dB; None without images."""
+        if self.images is None:
+            return None
+        seen, found = gaussians.detach().replace(features=None), []
+        for camera, target, mask in zip(self.cameras, self.images, self.masks, strict=True):
+            image = render(seen, camera, self.settings, outputs=()).rgb.cpu().clamp(0, 1)
+            found.append(psnr(image, target, mask))
+        return float(np.mean(found))
+
+    def most_removed(self, gaussians: Gaussians, left: torch.Tensor, order: torch.Tensor, least: float) -> int:
+        """How many of `left` may go, in an order, so that the PSNR stays at `least` dB or above: by bisection."""
+        low, high = 0, len(order)
+        for _ in range(_BISECTIONS):
+            count = (low + high) // 2
+            reached = self.psnr(gaussians.take(_without(left, order[:count])))
+            assert reached is not None  # there are images
+            low, high = (count, high) if reached >= least else (low, count)
+        return low
+
+
+def _without(left: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
+    """Indices without those at some places, in their order."""
+    is_left = torch.ones(len(left), dtype=torch.bool)
+    is_left[places] = False
+    return left[is_left]
+
+
+def fit_on(gaussians: Gaussians, frames: Sequence[Frame], config: FitConfig, steps: int, far: int = 0) -> Gaussians:
+    """Fit Gaussians to photographs for some steps more: colors, shapes and places, not how many there are.
+
+    Args:
+        gaussians: What a fit, or `prune`, has left; features stay as they are.
+        frames: Photographs, at the size of the fit; their cameras stay as they are.
+        config: Configuration of the fit: its loss, renderers and learning rates, which are those of its second half.
+        steps: How many, at least 1.
+        far: How many of the first Gaussians are those of a skybox.
+    """
+    dc, rest = gaussians.sh.detach()[:, :1], gaussians.sh.detach()[:, 1:]
+    parameters = {name: getattr(gaussians, name) for name in ("means", "quats", "log_scales", "logit_opacities")}
+    rows = GaussianRows({**parameters, "sh_dc": dc, "sh_rest": rest})
+    rows.far = far
+    done = round(steps * _BEGUN / (1 - _BEGUN))
+    fixed = dataclasses.replace(config.density, refine_start=1.0, refine_stop=1.0)  # as many rows as there are
+    config = config.replace(max_steps=done + steps, density=fixed, sh_degree=gaussians.sh_degree)
+    frames = [dataclasses.replace(frame, camera=_about(frame.camera, gaussians.origin)) for frame in frames]
+    trainer = Trainer(config, frames, rows, scene_extent([frame.camera for frame in frames]), components=[])
+    trainer.step_index = done
+    with fewer_torch_threads(), Bar("fitting on", steps) as bar:
+        for step in range(steps):
+            # To 0, so that the end is no step of Adam away from what fits best.
+            trainer.config = config.replace(rates=_faded(config.rates, 1 - step / steps))
+            trainer.step()
+            bar.advance()
+    return trainer.gaussians().replace(features=gaussians.features, origin=gaussians.origin)
+
+
+def _faded(rates: RateConfig, factor: float) -> RateConfig:
+    """All learning rates times a factor."""
+    names = ("dc_rate", "rest_rate", "opacity_rate", "scale_rate", "rotation_rate")
+    first, last = rates.means_rate
+    faded = {name: factor * getattr(rates, name) for name in names}
+    return dataclasses.replace(rates, means_rate=(factor * first, factor * last), **faded)
+
+
+def _about(camera: Camera, origin: np.ndarray) -> Camera:
+    """A camera in the world whose zero is at `origin`, where a trainer has the means."""
+    w2c = np.array(camera.w2c, np.float64)
+    w2c[:3, 3] += w2c[:3, :3] @ origin
+    return dataclasses.replace(camera, w2c=w2c)

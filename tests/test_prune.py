@@ -1,0 +1,245 @@
+"""Pruning: what is removed, what never is, `drgs prune` with its files, and bad input."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from scenes_random import gaussians
+from test_active import write_still
+
+import drgs
+from drgs import cli, fisher
+from drgs.cameras import orbit
+from drgs.codecs import load_gaussians
+from drgs.data import load
+from drgs.data.camera_lists import save_cameras_json
+from drgs.files import save_ply
+from drgs.fitting.config import FitConfig
+from drgs.fitting.frames import load_frames
+from drgs.fitting.losses import psnr
+from drgs.pruning import fit_on, prune
+from drgs.settings import RenderSettings
+
+FAST = RenderSettings.preset("fast")
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Eighty Gaussians and cameras around them."""
+    rng = np.random.default_rng(4)
+    g = gaussians(rng, 80, 1, scale=0.2, spread=0.7).detach()
+    return g, orbit((0, 0, 0), 3.0, 4, width=24, height=20)
+
+
+def _psnr(g, cameras, images):
+    """Mean PSNR, as a caller would measure it."""
+    return float(np.mean([psnr(x, image) for x, image in zip(_images(g, cameras), images, strict=True)]))
+
+
+def _images(g, cameras):
+    return [drgs.render(g, camera, FAST).rgb.clamp(0, 1) for camera in cameras]
+
+
+def test_one_round_removes_the_least_errors(scene):
+    """Exactly as many as asked, those of the smallest error, and tells which."""
+    g, cameras = scene
+    found = prune(g, cameras, FAST, keep=0.25, rounds=1)
+    error = fisher.removal_error(g, cameras, FAST)
+    assert found.unseen == 0
+    assert int(found.kept.sum()) == 20
+    assert float(error[found.kept].min()) >= float(error[~found.kept].max())
+    assert torch.equal(found.gaussians.means, g.means[found.kept])
+    (only,) = found.rounds
+    assert only.removed == 60
+    assert only.error == pytest.approx(float(error[~found.kept].sum()))
+
+
+def test_rounds_see_what_stands_for_each_other():
+    """Of two Gaussians in one place each alone can go, and not both: a second round sees that."""
+    places = [[0, 0, 0], [0, 0, 0], [0.6, 0, 0], [-0.6, 0, 0], [0, 0, 0.6], [0, 0, -0.6]]
+    opacities = [0.99, 0.99, 0.7, 0.8, 0.9, 0.95]
+    g = drgs.Gaussians.from_arrays(places, [[1, 0, 0, 0]] * 6, [[0.1] * 3] * 6, opacities, [[[1.0] * 3]] * 6)
+    cameras = orbit((0, 0, 0), 3.0, 4, width=24, height=20)
+    once = prune(g, cameras, FAST, keep=4 / 6, rounds=1)
+    twice = prune(g, cameras, FAST, keep=4 / 6, rounds=2)
+    assert once.kept.tolist() == [False, False, True, True, True, True]
+    assert sorted(twice.kept[:2].tolist()) == [False, True]
+    assert twice.kept[2:].tolist() == [False, True, True, True]
+
+
+def test_what_no_view_shows_is_kept_unless_asked(scene):
+    """It has error 0, the least of all, and yet stays."""
+    g, cameras = scene
+    means = g.means.clone()
+    means[:30] += 100.0
+    g = g.replace(means=means)
+    found = prune(g, cameras, FAST, keep=0.5)
+    assert found.unseen == 30
+    assert bool(found.kept[:30].all())
+    assert int(found.kept.sum()) == 30 + 25
+    removed = prune(g, cameras, FAST, keep=0.5, unseen="remove")
+    assert not removed.kept[:30].any()
+    assert torch.equal(removed.kept[30:], found.kept[30:])
+
+
+def test_a_loss_is_kept_to(scene):
+    """As many go as the loss allows: it is not exceeded, and one twice as large takes more."""
+    g, cameras = scene
+    images = [(x + 0.05).clamp(0, 1) for x in _images(g, cameras)]
+    start = _psnr(g, cameras, images)
+    counts = []
+    for loss in (0.25, 1.0):
+        found = prune(g, cameras, FAST, loss=loss, images=images)
+        reached = _psnr(found.gaussians, cameras, images)
+        assert found.psnr == pytest.approx(start, abs=1e-3)
+        assert found.rounds[-1].psnr == pytest.approx(reached, abs=1e-3)
+        assert start - loss <= reached
+        counts.append(len(found.gaussians))
+    assert counts[1] < counts[0] < len(g)
+
+
+def test_masked_pixels_decide_nothing(scene):
+    """A view whose mask is 0 shows nothing."""
+    g, cameras = scene
+    masks = [None, *[torch.zeros(20, 24)] * 3]
+    one = prune(g, cameras[:1], FAST, keep=0.5)
+    assert torch.equal(prune(g, cameras, FAST, keep=0.5, masks=masks).kept, one.kept)
+
+
+def test_fitting_on_repairs(tmp_path):
+    """It ends nearer to the photographs, with as many Gaussians; features and an origin stay."""
+    g = write_still(tmp_path)
+    frames = load_frames(load(tmp_path).views, 10_000, mask="ignore")
+    spoiled = g.replace(sh=g.sh - 0.5, features=torch.ones(len(g), 3))
+    config = FitConfig(renderers=("fast",), settings=FAST)
+    images, cameras = [frame.image() for frame in frames], [frame.camera for frame in frames]
+    better = fit_on(spoiled, frames, config, 30)
+    assert _psnr(better, cameras, images) > _psnr(spoiled, cameras, images) + 1
+    assert len(better) == len(g)
+    assert torch.equal(better.features, spoiled.features)
+    assert better.sh.shape == g.sh.shape
+    shift = np.array([1e6, -2e6, 3e6])
+    moved = []
+    for frame in frames:
+        w2c = frame.camera.w2c.copy()
+        w2c[:3, 3] -= w2c[:3, :3] @ shift
+        moved.append(dataclasses.replace(frame, camera=dataclasses.replace(frame.camera, w2c=w2c)))
+    there = fit_on(spoiled.replace(origin=shift), moved, config, 30)
+    assert np.array_equal(there.origin, shift)
+    torch.testing.assert_close(there.means, better.means, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        ({}, "either keep or loss must say"),
+        ({"keep": 0.5, "loss": 0.1}, "got both"),
+        ({"keep": 0.0}, "keep must be a share above 0 and below 1, got 0"),
+        ({"keep": 1.0}, "to remove nothing, leave the scene as it is"),
+        ({"loss": 0.0}, "loss must be above 0 dB"),
+        ({"loss": 0.1}, "loss must have images"),
+        ({"keep": 0.5, "rounds": 0}, "rounds must be a whole number >= 1"),
+        ({"keep": 0.5, "unseen": "hide"}, "unseen must be 'keep' or 'remove'"),
+    ],
+)
+def test_refuses_what_cannot_be(scene, arguments, word):
+    g, cameras = scene
+    with pytest.raises(ValueError, match=word):
+        prune(g, cameras, FAST, **arguments)
+
+
+def test_views_that_show_nothing(scene):
+    g, cameras = scene
+    with pytest.raises(ValueError, match="the 4 given ones show nothing"):
+        prune(g.replace(means=g.means + 100), cameras, FAST, keep=0.5)
+
+
+# -------------------------------------------------- the command
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """`data`, a run `run` on it, `scene.ply` and `cameras.json`."""
+    folder = tmp_path_factory.mktemp("prune")
+    save_ply(write_still(folder / "data"), folder / "scene.ply")
+    config = FitConfig().replace(max_steps=12, max_gaussians=200)
+    drgs.fit(load(folder / "data"), folder / "run", config, progress=False)
+    save_cameras_json(folder / "cameras.json", orbit((0, 0, 0), 3.0, 5, width=24, height=20))
+    return folder
+
+
+def test_command_on_a_run(place, monkeypatch, capsys):
+    """Gaussians in the format of the suffix, what it cost beside them and on stdout; once more over its own files."""
+    monkeypatch.chdir(place)
+    line = ["prune", "run", "--keep", "0.5", "--refit", "3", "-o", "out/small.spz"]
+    assert cli.main(line) == 0
+    said = capsys.readouterr().out
+    record = json.loads((place / "out/small.json").read_text())
+    count = record["gaussians"]
+    assert len(load_gaussians(place / "out/small.spz")) == count["after"] < count["before"]
+    assert count["after"] - count["unseen"] == round(0.5 * (count["before"] - count["unseen"]))
+    assert set(record["psnr"]) == {"exact", "fast", "inria", "gsplat", "3dgut"}
+    assert set(record["psnr"]["fast"]) == {"before", "pruned", "refitted"}
+    assert record["split"] == "test"
+    assert len(record["rounds"]) == 5
+    assert "held-out views" in said
+    assert f"{count['after']:,} of {count['before']:,} Gaussians" in said
+    assert cli.main([*line, "--quiet"]) == 0
+    assert capsys.readouterr().out == ""
+
+
+def test_command_on_a_file(place, monkeypatch, capsys):
+    """By the photographs of a data set, to a loss; the file that it is of is never replaced."""
+    monkeypatch.chdir(place)
+    line = ["prune", "scene.ply", "--data", "data", "--loss", "20dB", "--quiet"]
+    before = (place / "scene.ply").read_bytes()
+    assert cli.main([*line, "-o", "lossy.ply"]) == 0
+    record = json.loads((place / "lossy.json").read_text())
+    assert record["train_psnr"] - record["rounds"][-1]["psnr"] <= 20
+    assert record["gaussians"]["after"] < 30
+    assert cli.main([*line, "-o", "scene.ply"]) == 2
+    assert "it is an input" in capsys.readouterr().err
+    (place / "mine.ply").write_bytes(b"mine")
+    assert cli.main([*line, "-o", "mine.ply"]) == 2
+    assert "must not be replaced" in capsys.readouterr().err
+    assert ((place / "scene.ply").read_bytes(), (place / "mine.ply").read_bytes()) == (before, b"mine")
+
+
+def test_command_by_cameras_alone(place, monkeypatch, capsys):
+    """Errors need no photographs; what it costs is then not told, and that is said."""
+    monkeypatch.chdir(place)
+    assert cli.main(["prune", "scene.ply", "--data", "cameras.json", "--keep", "0.5", "-o", "half.ply"]) == 0
+    assert "cameras.json has no photographs: what it costs is not measured" in capsys.readouterr().out
+    assert len(load_gaussians(place / "half.ply")) == 15
+    assert json.loads((place / "half.json").read_text())["psnr"] == {}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (("scene.ply", "--keep", "0.5"), "--data must name a data set"),
+        (("scene.ply", "--data", "data"), "either keep or loss must say"),
+        (("scene.ply", "--data", "data", "--keep", "0"), "keep must be a share above 0 and below 1, got 0"),
+        (("scene.ply", "--data", "data", "--keep", "1"), "leave the scene as it is"),
+        (("scene.ply", "--data", "data", "--loss", "much"), "--loss must be a number of decibels"),
+        (("scene.ply", "--data", "cameras.json", "--loss", "1"), "--loss must have photographs"),
+        (("scene.ply", "--data", "cameras.json", "--keep", "0.5", "--refit", "3"), "--refit must have photographs"),
+        (("scene.ply", "--data", "data", "--loss", "1e-9"), "none of its 30 Gaussians can go"),
+        (("run", "--keep", "0.5", "-o", "small.stl"), "must end with"),
+        (("scene.ply", "--data", "nowhere", "--keep", "0.5"), "nowhere"),
+    ],
+)
+def test_command_refuses_in_one_line(place, arguments, word, monkeypatch, capsys):
+    """Exit code 2, one line, and nothing written."""
+    monkeypatch.chdir(place)
+    there = {x.name for x in place.iterdir()}
+    output = () if "-o" in arguments else ("-o", "no.ply")
+    assert cli.main(["prune", *arguments, *output, "--quiet"]) == 2
+    told = capsys.readouterr().err
+    assert word in told
+    assert told.count("\n") == 1, told
+    assert {x.name for x in place.iterdir()} == there
