@@ -254,32 +254,36 @@ def removal_error(
     scene: Scene,
     cameras: Camera | Sequence[Camera],
     settings: RenderSettings | None = None,
+    power: float = 2,
     channel_weights: Sequence[float] = (1.0, 1.0, 1.0),
     semantics: SemanticMetric | None = None,
     masks: Masks = None,
 ) -> torch.Tensor:
-    """(N,) float64 squared change of the images if one Gaussian alone were not there, summed over pixels, channels and
-    views: exact, one traversal a view. See `drgs.information.removal`.
+    """(N,) float64 change of the images if one Gaussian alone were not there: exact, in one traversal a view.
 
         error = drgs.fisher.removal_error(g, cameras)
         smaller = g.take(error > error.quantile(0.5))
 
     What no view shows has error 0. Errors of several Gaussians do not add up: of two that hide each other each has a
-    small one. `drgs.prune` removes in rounds, therefore.
+    small one. `drgs.prune` removes in rounds, therefore. See `drgs.information.removal`.
 
     Args:
         scene: N Gaussians, world frame, or a `drgs.ellipsoids.Scene`, whose Gaussians each camera sees at its time.
         cameras, settings: The same as for `diagonal`.
+        power: Of the length, over the channels, of a pixel's change: 2 is squared color, summed over pixels, channels
+            and views. 1.5 and 1 say more of what many Gaussians change together.
         channel_weights: Factors of the squares of R, G and B.
         semantics: The metric in which features are a part of the image; None: colors are all of it.
         masks: One for each camera: (H, W) in [0, 1] what its image is multiplied by before it is compared; or None: 1.
     Raises:
-        ValueError: If a weight or mask is wrong, or the Gaussians of a scene are not as many in all views.
+        ValueError: If a power, weight or mask is wrong, or the Gaussians of a scene are not as many in all views.
     """
+    if power not in (1, 1.5, 2):
+        raise ValueError(f"fisher.removal_error: power must be 1, 1.5 or 2, got {power!r}; 2 sums up squares")
     scene = once_per_time(scene)
     views = checked_views("fisher.removal_error", scene, cameras, settings, masks)
     weights = three_weights("fisher.removal_error", channel_weights)
-    return sum_over_views(RemovalError(weights, semantics), scene, *views)[REMOVAL]
+    return sum_over_views(RemovalError(power, weights, semantics), scene, *views)[REMOVAL]
 
 
 @alone

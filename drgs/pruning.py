@@ -1,9 +1,8 @@
 """Fewer Gaussians for nearly the same images: those without which given views change least are removed, in rounds.
 
-A round takes the error that the scene makes without each one of its Gaussians (`drgs.fisher.removal_error`), exactly,
-and removes those of the smallest. Errors of several Gaussians do not add up: where two hide each other, each alone can
-go. So a round removes a part, and the next one looks at what is left. Five rounds reach what ten reach, to 0.05 dB
-(docs/prune.md).
+A round takes how much the images change without each one of the Gaussians (`drgs.fisher.removal_error`), exactly, and
+removes those of the least. What one says holds while all others are there: where two stand for each other, each alone
+can go. So a round removes a part, and the next one looks at what is left.
 
 What changes no given view has error 0, and is another matter than what changes them little: it may be what other views
 show. It is kept, unless the caller says otherwise.
@@ -39,12 +38,15 @@ if TYPE_CHECKING:
     from drgs.information.inputs import Masks
     from drgs.information.semantics import SemanticMetric
 
-__all__ = ["ROUNDS", "Pruned", "Round", "Unseen", "check_amount", "fit_on", "prune"]
+__all__ = ["POWER", "ROUNDS", "Pruned", "Round", "Unseen", "check_amount", "fit_on", "prune"]
 
 Unseen = Literal["keep", "remove"]
 
 ROUNDS = 5
-"""Rounds of `prune`: on `banana` half of the Gaussians cost 5.9 dB by one round, 2.7 dB by five, 2.6 dB by ten."""
+"""Rounds of `prune`; docs/prune.md has what one, ten and twenty reach."""
+
+POWER = 1.5
+"""Power of `drgs.fisher.removal_error` that `prune` ranks by: of three that were tried near the best on every scene."""
 
 _BISECTIONS = 8  # renderings of all views for a `loss`: as many are removed as it allows, but for 1/256 of them
 
@@ -97,6 +99,7 @@ def prune(
     rounds: int = ROUNDS,
     unseen: Unseen = "keep",
     semantics: SemanticMetric | None = None,
+    power: float = POWER,
 ) -> Pruned:
     """Remove the Gaussians that given views need least.
 
@@ -115,6 +118,7 @@ def prune(
         rounds: In how many rounds; more are better, each takes a traversal of every view.
         unseen: What becomes of Gaussians that change no view: `keep` or `remove`.
         semantics: The metric in which features are a part of the image; None: colors are all of it.
+        power: That of `drgs.fisher.removal_error`.
     Raises:
         ValueError: If a number is out of range, or the views show nothing of the scene.
     """
@@ -130,7 +134,7 @@ def prune(
         )
     settings = settings or RenderSettings.preset("fast")
     with Bar("errors without a Gaussian", rounds * len(cameras)) as bar:
-        views = _Views(cameras, settings, mask_list(where, masks, cameras), images, semantics, bar)
+        views = _Views(cameras, settings, mask_list(where, masks, cameras), images, semantics, power, bar)
         return _pruned(gaussians, views, keep, loss, rounds, unseen)
 
 
@@ -196,13 +200,14 @@ class _Views:
     masks: list[torch.Tensor | None]
     images: Sequence[torch.Tensor] | None
     semantics: SemanticMetric | None
+    power: float
     bar: Bar
 
     def removal_error(self, gaussians: Gaussians) -> torch.Tensor:
         """(N,) summed over the views."""
         total = torch.zeros(len(gaussians), dtype=torch.float64)
         for camera, mask in zip(self.cameras, self.masks, strict=True):
-            total += removal_error(gaussians, camera, self.settings, semantics=self.semantics, masks=[mask])
+            total += removal_error(gaussians, camera, self.settings, self.power, semantics=self.semantics, masks=[mask])
             self.bar.advance()
         return total
 

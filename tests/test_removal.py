@@ -20,7 +20,7 @@ from drgs.settings import RenderSettings
 Preset = RenderSettings.preset
 
 
-def _errors_by_removing(g, cameras, settings, masks=None, metric=None):
+def _errors_by_removing(g, cameras, settings, masks=None, metric=None, power=2):
     """(N,) by rendering the scene without each Gaussian; features in the metric W^T W of (K, D) W."""
     found = torch.zeros(len(g), dtype=torch.float64)
     everyone = torch.arange(len(g))
@@ -29,10 +29,12 @@ def _errors_by_removing(g, cameras, settings, masks=None, metric=None):
             whole = reference.render(g, cam, settings)
             for i in range(len(g)):
                 without = reference.render(g.take(everyone[everyone != i]), cam, settings)
-                weight = 1 if masks is None or masks[k] is None else masks[k].double()[..., None] ** 2
-                found[i] += ((whole.rgb - without.rgb).square() * weight).sum()
+                square = (whole.rgb - without.rgb).square().sum(-1)
                 if metric is not None:
-                    found[i] += (((whole.features - without.features) @ metric.T).square() * weight).sum()
+                    square += ((whole.features - without.features) @ metric.T).square().sum(-1)
+                if masks is not None and masks[k] is not None:
+                    square *= masks[k].double() ** 2
+                found[i] += square.pow(power / 2).sum()
     return found
 
 
@@ -61,11 +63,12 @@ def test_error_without_each_gaussian(preset, alpha):
     rng = np.random.default_rng(len(preset))
     g, cam = _scene(rng, alpha), camera(rng)
     deep = settings.replace(transmittance_min=seen_through(settings).transmittance_min)
-    truth = _errors_by_removing(g, [cam], deep)
-    found = fisher.removal_error(g, cam, settings)
-    assert found.dtype == torch.float64
-    assert float((truth > 1e-3 * truth.max()).double().mean()) > 0.5
-    assert float((found - truth).abs().max() / truth.max()) < 5e-6
+    for power in (2, 1.5, 1):
+        truth = _errors_by_removing(g, [cam], deep, power=power)
+        found = fisher.removal_error(g, cam, settings, power)
+        assert found.dtype == torch.float64
+        assert float((truth > 1e-3 * truth.max()).double().mean()) > 0.5
+        assert float((found - truth).abs().max() / truth.max()) < 5e-6
 
 
 def test_rays_through_bvh():
@@ -151,6 +154,8 @@ def test_refuses_wrong_weights_and_masks():
     """In one line each."""
     rng = np.random.default_rng(12)
     g, cam = _scene(rng), camera(rng)
+    with pytest.raises(ValueError, match=r"fisher.removal_error: power must be 1, 1.5 or 2, got 3"):
+        fisher.removal_error(g, cam, power=3)
     with pytest.raises(ValueError, match=r"fisher.removal_error: channel_weights must be 3"):
         fisher.removal_error(g, cam, channel_weights=(1.0, -1.0, 1.0))
     with pytest.raises(ValueError, match=r"fisher.removal_error: masks\[0\] must be"):

@@ -325,18 +325,20 @@ class BlockSums:
 
 
 class RemovalSums:
-    """Sums of the squared changes of the channels where a Gaussian is left out: of a hit, dC / da a, as C is linear in
-    the opacity a of each hit.
+    """Sums of the changes of the image where a Gaussian is left out: of a hit, dC / da a, as C is linear in the opacity
+    a of each hit.
 
     Args:
-        weights: Weights of the channels: colors first, where they are composited.
+        weights: Weights of the squares of the channels: colors first, where they are composited.
+        power: Of the length over the channels that is summed up: 2, 1.5 or 1.
     """
 
     needs_color = False
 
-    def __init__(self, lib: Lib, count: int, weights: Sequence[float], mode: dr.ReduceMode) -> None:
+    def __init__(self, lib: Lib, count: int, weights: Sequence[float], power: float, mode: dr.ReduceMode) -> None:
         self.buffer = dr.zeros(lib.Float, count)
         self.weights = weights
+        self.power = power
         self.mode = mode
 
     def init(self, k: int) -> dict:
@@ -347,9 +349,10 @@ class RemovalSums:
         """Add a hit's rows."""
         total = lib.Float(0)
         for row in rows:
-            for weight, slope in zip(self.weights, row.g, strict=True):
-                change = slope * row.a
-                total = dr.fma(change * change, weight, total)
+            changes = [slope * row.a for slope in row.g]
+            square = sum((x * x * w for x, w in zip(changes, self.weights, strict=True)), lib.Float(0))
+            length = dr.sqrt(square)
+            total += {2: square, 1.5: length * dr.sqrt(length), 1: length}[self.power]
         add_row(lib, self.buffer, [total], index, 1, 0, hits, self.mode)
         return states
 

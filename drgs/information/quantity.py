@@ -7,7 +7,7 @@ it, and everything that looks at views computes them by it: `drgs.fisher`, the s
     Diagonal            diagonal.py    diagonal of J^T J about Gaussians, or about tensors of a scene
     DenseBlocks         diagonal.py    one block of J^T J a Gaussian
     Coverage            diagonal.py    sum over pixels of squared weights
-    RemovalError        removal.py     squared change of the image without a Gaussian
+    RemovalError        removal.py     change of the image without a Gaussian
     NetworkInformation  network.py     J^T J about the network that moves Gaussians, by random probes
     Backdrop            backdrop.py    about the color behind all Gaussians
     SurfaceDepths       backdrop.py    how far away surfaces are

@@ -300,9 +300,9 @@ class Replay:
         full[:, column, row] = total
         return full.cpu()
 
-    def removal_errors(self, weights: Sequence[float]) -> torch.Tensor:
+    def removal_errors(self, weights: Sequence[float], power: float) -> torch.Tensor:
         """`fisher.removal_error` of one view, on the CPU."""
-        sink_of = lambda walk, mode: RemovalSums(self.lib, self.count, walk.weights, mode)  # noqa: E731
+        sink_of = lambda walk, mode: RemovalSums(self.lib, self.count, walk.weights, power, mode)  # noqa: E731
         return self._summed(sink_of, 1, weights)[:, 0].cpu()
 
     def variance(self, information: Information, weights: Sequence[float]) -> torch.Tensor:
