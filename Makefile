@@ -92,6 +92,7 @@ smoke: setup
 	$(BIN)/drgs convert out/smoke/semantic out/smoke/labelled.ply --labels
 	$(BIN)/drgs convert out/smoke/run out/smoke/run.spz
 	$(BIN)/drgs convert out/smoke/run out/smoke/run.sog
+	$(BIN)/drgs prune out/smoke/run --keep 0.5 --refit 5 -o out/smoke/small.spz
 	$(BIN)/drgs mesh out/smoke/run --limit 4 --info-pixels 3000 --crop 10 -o out/smoke/mesh.glb
 	$(BIN)/drgs scene kitchen -o out/smoke/kitchen --size 64x48 --cameras 3 --times 3 --spp 2
 	rm -rf out/smoke/moving

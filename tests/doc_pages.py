@@ -42,6 +42,7 @@ _SMALLER = {
     "stress": ["--match", "1 Gaussian"],
     "query": ["--limit", "1", "--threshold", "0"],  # six steps have taught nothing
     "demo": ["--quick"],
+    "prune": ["--rounds", "2", "--refit", "2"],
 }
 
 # Why a command of a page is parsed and not run, and what runs it: by the command's name, or by one of its arguments.
