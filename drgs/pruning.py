@@ -251,13 +251,12 @@ def fit_on(gaussians: Gaussians, frames: Sequence[Frame], config: FitConfig, ste
     """
     dc, rest = gaussians.sh.detach()[:, :1], gaussians.sh.detach()[:, 1:]
     parameters = {name: getattr(gaussians, name) for name in ("means", "quats", "log_scales", "logit_opacities")}
-    rows = GaussianRows({**parameters, "sh_dc": dc, "sh_rest": rest})
+    rows = GaussianRows({**parameters, "sh_dc": dc, "sh_rest": rest}, gaussians.origin)
     rows.far = far
     done = round(steps * _BEGUN / (1 - _BEGUN))
     fixed = dataclasses.replace(config.density, refine_start=1.0, refine_stop=1.0)  # as many rows as there are
     config = config.replace(max_steps=done + steps, density=fixed, sh_degree=gaussians.sh_degree)
-    frames = [dataclasses.replace(frame, camera=_about(frame.camera, gaussians.origin)) for frame in frames]
-    trainer = Trainer(config, frames, rows, scene_extent([frame.camera for frame in frames]), components=[])
+    trainer = Trainer(config, list(frames), rows, scene_extent([frame.camera for frame in frames]), components=[])
     trainer.step_index = done
     with fewer_torch_threads(), Bar("fitting on", steps) as bar:
         for step in range(steps):
@@ -265,7 +264,7 @@ def fit_on(gaussians: Gaussians, frames: Sequence[Frame], config: FitConfig, ste
             trainer.config = config.replace(rates=_faded(config.rates, 1 - step / steps))
             trainer.step()
             bar.advance()
-    return trainer.gaussians().replace(features=gaussians.features, origin=gaussians.origin)
+    return trainer.gaussians().replace(features=gaussians.features)
 
 
 def _faded(rates: RateConfig, factor: float) -> RateConfig:
@@ -274,10 +273,3 @@ def _faded(rates: RateConfig, factor: float) -> RateConfig:
     first, last = rates.means_rate
     faded = {name: factor * getattr(rates, name) for name in names}
     return dataclasses.replace(rates, means_rate=(factor * first, factor * last), **faded)
-
-
-def _about(camera: Camera, origin: np.ndarray) -> Camera:
-    """A camera in the world whose zero is at `origin`, where a trainer has the means."""
-    w2c = np.array(camera.w2c, np.float64)
-    w2c[:3, 3] += w2c[:3, :3] @ origin
-    return dataclasses.replace(camera, w2c=w2c)
