@@ -1,4 +1,4 @@
-"""Does the expected error tell where a model is wrong? AUSE, reliability and ranks of views, on held-out views of fits.
+"""Does the expected error say where a model is wrong? AUSE, reliability and ranks of views, on held-out views of fits.
 
     python benchmarks/expected_error.py [RUN ...]
 
@@ -41,7 +41,7 @@ MAPS = {"variance, lambda 1": Prior(1.0), "variance, lambda 1e-2": Prior(1e-2)} 
 ROWS = ROOT / "benchmarks" / "expected_error.jsonl"
 PAGE = ROOT / "docs" / "uncertainty.md"
 VIEWS = 12  # of those held out at most, evenly spaced
-BINS = (0.0, 0.0125, 0.025, 0.05, 0.1, 0.2, 0.4, np.inf)  # told root of the squared error, units of color
+BINS = (0.0, 0.0125, 0.025, 0.05, 0.1, 0.2, 0.4, np.inf)  # expected root of the squared error, units of color
 FEWEST = 0.01  # share of the pixels that a bin must have to be reported
 TIMED = 10  # training views whose record is timed, at most
 ROUNDS = 3
@@ -105,7 +105,7 @@ def _view(scene: drgs.Gaussians, frame: Frame, record: drgs.ErrorRecord) -> tupl
 
 
 def _bins(error: np.ndarray, told: np.ndarray) -> list[list[float]]:
-    """(share of the pixels, told, true mean squared error) of the pixels in each bin of the told error."""
+    """(share of the pixels, told, true mean squared error) of the pixels in each bin of the expected error."""
     bins = np.digitize(np.sqrt(told), BINS) - 1
     own = [(bins == k) for k in range(len(BINS) - 1)]
     return [[x.mean(), told[x].mean() if x.any() else 0, error[x].mean() if x.any() else 0] for x in own]
@@ -134,13 +134,13 @@ def _seconds(scene: drgs.Gaussians, frames: list[Frame], settings: drgs.RenderSe
 
 
 def within(row: dict) -> tuple[int, int]:
-    """How many of the bins that count have a true error within 30 % of what is told, and how many there are."""
+    """How many of the bins that count have a true error within 30 % of what is expected, and how many there are."""
     ratios = [true / told for share, told, true in row["bins"] if share >= FEWEST]
     return sum(0.7 <= x <= 1.3 for x in ratios), len(ratios)
 
 
 def worst_rank(row: dict) -> int:
-    """Rank, 1 the worst, that the view with the largest true error has by what is told."""
+    """Rank, 1 the worst, that the view with the largest true error has by what is expected."""
     order = np.argsort(row["told"])[::-1].tolist()
     return order.index(int(np.argmax(row["true"]))) + 1
 
@@ -148,7 +148,7 @@ def worst_rank(row: dict) -> int:
 def main_table(rows: list[dict]) -> str:
     """A row a run."""
     names = [TOLD, *MAPS, "1 - alpha"]
-    heads = ["run", "held-out PSNR", *names, "true / told", "bins within 30 %", "views: Spearman", "worst view told"]
+    heads = ["run", "held-out PSNR", *names, "true / expected", "bins within 30 %", "views: Spearman", "worst view: rank"]
     lines = []
     for row in rows:
         views = len(row["true"])
@@ -186,10 +186,10 @@ def summary(rows: list[dict]) -> str:
         sentences += [
             f"On {len(some)} {what} that chose nothing, mean AUSE: {', '.join(means)}.",
             f"The expected error is above the best other map on {', '.join(losses) if losses else 'none'}.",
-            f"Spearman's rho of told and true error over their {len(true)} views is "
-            f"{studies.rank_correlation(told, true):.2f}; the worst view of a run is among the three told worst in "
-            f"{sum(worst_rank(row) <= 3 for row in some)} of {len(some)}.",
-            f"{inside} of {bins} bins of the told error have a mean true error within 30 %.",
+            f"Spearman's rho of expected and true error over their {len(true)} views is "
+            f"{studies.rank_correlation(told, true):.2f}; the worst view of a run is among the three that are expected "
+            f"to be worst in {sum(worst_rank(row) <= 3 for row in some)} of {len(some)}.",
+            f"{inside} of {bins} bins of the expected error have a mean true error within 30 %.",
         ]
     ratio = statistics.median(row["seconds"][1] / row["seconds"][0] for row in rows)
     cost = f"A record takes {ratio:.2f} times the CPU time of the same views' diagonal and backdrop (median over runs)."

@@ -53,7 +53,7 @@ PARTS = ("misfit", "direction", "information", "unseen")
 """Where the expected error of a pixel comes from."""
 
 # Chosen on half of the captures and made scenes, and measured on the other half: docs/uncertainty.md.
-ANGLE = 0.1  # radians between directions at which what one tells of the other has fallen to 0.6
+ANGLE = 0.1  # radians between directions at which what one says of the other has fallen to 0.6
 NEW = 2.0  # squared error from a new direction over that from directions that were fitted
 SPREAD = 6.0  # variance of a pixel over what the diagonal of H, without its other entries, says
 HIDDEN = 0.6  # squared error where nothing is, over the mean squared difference of photographs from the background
