@@ -28,6 +28,7 @@ LINES = (
     "eval run",
     "report run",
     "share run",
+    "prune run --keep 0.5 -o b.ply",
     "select run --candidates orbit",
     "fisher run",
     "query run --class wall",
