@@ -375,8 +375,8 @@ def _race(g: Gaussians, camera: Camera, repeats: int) -> dict:
 
 
 def _overview(g: Gaussians, fitted: list[Frame], frames: list[Frame], images: list[torch.Tensor]) -> np.ndarray:
-    """The held-out view that is met worst: photograph, rendering, error, and on the same scale the error that was to be
-    expected without this photograph.
+    """The held-out view that is met worst: photograph, rendering, error, and the error that was to be expected without
+    this photograph.
     """
     import cv2
 
@@ -387,12 +387,12 @@ def _overview(g: Gaussians, fitted: list[Frame], frames: list[Frame], images: li
     record = error_record(g, [x.camera for x in fitted], [x.image() for x in fitted], settings)
     expected = expected_error(g, frame.camera, record).sqrt().numpy()
     error = (image - photo).square().mean(-1).sqrt().numpy()
-    most = max(np.percentile(error, 99.5), 1e-6)
+    # Each on a scale of its own: where an error is largest, its mean over all that may be there is smaller.
+    shown = {"error": error, "expected error": expected}
     panels = {
         "photograph, held out": photo.numpy(),
         "rendering": image.numpy(),
-        "error": pictures.inferno(error / most),
-        "expected error": pictures.inferno(expected / most),
+        **{text: pictures.inferno(x / max(np.percentile(x, 99.5), 1e-6)) for text, x in shown.items()},
     }
     wide = (_PANEL_WIDTH, round(_PANEL_WIDTH * frame.camera.height / frame.camera.width))
     large = {
