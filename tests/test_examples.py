@@ -404,3 +404,17 @@ def test_a_flight(tmp_path):
         assert len(set(names)) == len(names) >= 3
         assert all(math.isfinite(float(re.search(r"([\d.]+) dB", line)[1])) for line in lines)
     assert all("changed" in line for line in planned)
+
+
+def test_uncertainty_in_a_training_script_of_gsplat(capsys):
+    """Of a splat that has seen one side, views of the other are expected to be worse, are so, and one is picked."""
+    from examples import gsplat_uncertainty
+
+    true, expected, pick = gsplat_uncertainty.main(tr.rasterization)
+    near, far = (0, 1, 6, 7), (2, 3, 4, 5)  # views 4, 5, 10, 11 and 6 to 9; photographs are 0 to 3
+    mean = lambda values, some: sum(values[i] for i in some) / len(some)  # noqa: E731
+    assert mean(true, far) > mean(true, near)
+    assert mean(expected, far) > mean(expected, near)
+    assert pick in far
+    assert all(0.5 < b / a < 3 for a, b in zip(true, expected, strict=True))
+    assert f"photograph view {pick + 4} next" in capsys.readouterr().out
