@@ -129,7 +129,7 @@ def captured(photographs, tmp_path_factory):
     with stopped_at_step(STEPS // 2):
         capture_photographs(again, CONFIG)
     assert steps_of(folder) == ["photos", "poses"]
-    with stopped_at("maps of information"):
+    with stopped_at("maps of the expected error"):
         capture_photographs(Capture(paths=(photographs / "first",), resume=True, **options), CONFIG)
     assert steps_of(folder) == ["photos", "poses", "fit"]
     capture_photographs(again, CONFIG)
@@ -158,7 +158,7 @@ def joined(captured, photographs, tmp_path_factory):
     assert (folder / "capture/before.safetensors").is_file()
     with stopped_at_step(5):
         run(again)
-    with stopped_at("maps of information"):
+    with stopped_at("maps of the expected error"):
         run(again)
     run(again)
     return folder, before

@@ -11,7 +11,7 @@ from scenes_random import camera, gaussians
 
 from drgs import fisher, reference
 from drgs.checks.arguments import ArgumentError
-from drgs.gain import information_gain
+from drgs.gain import Prior, information_gain
 from drgs.information.semantics import SemanticMetric
 from drgs.select import Cache, select
 from drgs.settings import RenderSettings
@@ -104,9 +104,10 @@ def test_known_views_tell_less(rng):
     plain, masked = select(g, candidates, known, **ask), select(g, candidates, known, masks=[mask], **ask)
     assert masked.computed == 1
     assert all(a >= b for a, b in zip(masked.scores, plain.scores, strict=True))
-    H = fisher.diagonal(g, known, masks=[mask])
+    H, prior = fisher.diagonal(g, known, masks=[mask]), Prior(1e-6).in_scene(g, cameras)
     for camera_, score in zip(candidates, masked.scores, strict=True):
-        assert score == pytest.approx(information_gain(fisher.diagonal(g, camera_), H, "eig").total, rel=1e-4)
+        gain = information_gain(fisher.diagonal(g, camera_), H, "eig", prior=prior)
+        assert score == pytest.approx(gain.total, rel=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from drgs.files import CONFIG_SCHEMA, Run, load_state, save_ply
 from drgs.fisher import Nuisances
 from drgs.fitting.config import FitConfig, SelectionConfig
 from drgs.fitting.records import fit_record
-from drgs.gain import block_gain
+from drgs.gain import Prior, block_gain
 from drgs.information.complement import Eliminated, remaining
 from drgs.information.scoring import Scoring
 from drgs.information.semantics import SemanticMetric
@@ -336,7 +336,8 @@ def test_select_scores_and_keeps_them_apart(rng):
     assert first.scores == again.scores == fresh.scores != plain.scores
     H = fisher.diagonal(g, cameras[:2], nuisances=freed)
     Hc = fisher.diagonal(g, cameras[2], nuisances=freed)
-    score = sum(float((Hc[name] / (H[name] + 1e-6)).sum()) for name in GROUPS)
+    least = Prior(1e-6).in_scene(g, cameras).per_group(H)
+    score = sum(float((Hc[name] / (H[name] + least[name])).sum()) for name in GROUPS)
     assert sum(first.parts[0][name] for name in GROUPS) == pytest.approx(score, rel=1e-4)
 
 

@@ -103,7 +103,7 @@ def test_loaders_find_the_origin_and_keep_cameras_in_the_world(tmp_path, kind, c
         rows = np.load(tmp_path / "poses_bounds.npy")
         rows[:, [3, 8, 13]] += UTM
         np.save(tmp_path / "poses_bounds.npy", rows)
-    with caplog.at_level(logging.INFO):
+    with caplog.at_level(logging.INFO, logger="drgs"):
         far = load(tmp_path)
     assert f"relative to an origin at {origin_text(far.origin)}" in caplog.text
     centers = np.stack([view.camera.center for view in far.views])
@@ -257,7 +257,7 @@ def test_files_keep_the_origin(tmp_path, suffix, caplog):
     """Positions are as exact as at 0, the origin comes back, and the log names file and offset."""
     g = scene()
     for name, origin in (("near", np.zeros(3)), ("far", np.array([500000.1, -5400000, 120]))):
-        with caplog.at_level(logging.INFO):
+        with caplog.at_level(logging.INFO, logger="drgs"):
             save_gaussians(g.replace(origin=origin), tmp_path / f"{name}.{suffix}")
     near, far = (load_gaussians(tmp_path / f"{name}.{suffix}") for name in ("near", "far"))
     assert torch.equal(near.means, far.means)
@@ -312,7 +312,7 @@ def double_ply(path: Path, g: drgs.Gaussians, kind: str = "double", comment: str
 def test_double_positions_of_a_ply_keep_their_digits(tmp_path, caplog):
     """An origin is found for them; those near 0, or relative to an offset, have none, or that."""
     g = scene().replace(origin=UTM + 0.25)
-    with caplog.at_level(logging.INFO):
+    with caplog.at_level(logging.INFO, logger="drgs"):
         back = load_ply(double_ply(tmp_path / "a.ply", g))
     np.testing.assert_allclose(world(back), world(g), atol=1e-6)
     assert back.means.dtype == torch.float32
@@ -357,7 +357,7 @@ def test_spz_of_a_small_and_of_a_large_world(tmp_path, scale, caplog):
     g = g.replace(means=scale * g.means, log_scales=g.log_scales + np.log(scale))
     if scale > 1:  # standard deviations of 100 mm are within the format
         g = g.replace(log_scales=g.log_scales.clamp(max=5.5))
-    with caplog.at_level(logging.INFO):
+    with caplog.at_level(logging.INFO, logger="drgs"):
         save_gaussians(g, tmp_path / "a.spz")
     back = load_gaussians(tmp_path / "a.spz")
     assert float((back.means - g.means).abs().max()) < 1e-3 * scale

@@ -34,13 +34,15 @@ from drgs.testing import random_scene
 from drgs.train import SelectionConfig, fit
 
 _SOMETIMES = {
-    "config.json": {"begin", "frames", "absent", "semantics", "times", "poses", "exposure", "estimated", "lenses"},
+    "config.json": {
+        *{"begin", "frames", "absent", "semantics", "times", "poses", "exposure", "estimated", "lenses", "origin"},
+    },
     "metrics.json": {"segmentation", "motion", "transients", "poses", "skybox", "scale"},
     "fisher.json": {"nuisances"},
 }
 """Fields of data sets that the tests here do not make, videos, missing images, lenses, a teacher, several times; and of
 what is not asked for: exposure, poses, a skybox, transients, larger pictures, eliminated unknowns;
-of a fit that begins with the Gaussians of another one.
+of a fit that begins with the Gaussians of another one, and of a world far from 0.
 """
 
 
@@ -155,6 +157,7 @@ _WRITERS = {
     "commands/crossval.py": {"crossval.json"},
     "commands/demo.py": {"demo.json"},
     "commands/fisher.py": {"fisher.json"},
+    "commands/prune.py": {"prune.json"},
     "commands/query.py": {"query.json"},
     "commands/render.py": {"render.json"},
     "commands/reproduce.py": {"reproduce.json"},  # and data.json, a map

@@ -152,8 +152,8 @@ def _run_steps(capture: Capture, steps: dict[str, Callable[[], Outcome]]) -> Non
             if name != "share" or is_full(error):
                 raise
             capture.say(f"share: not written, {error}; then drgs share {run}")
-        if name == "fit":
-            capture.photographs.forget()  # pages have pictures of their own
+        if name == "report":  # which looks at what the fit gets wrong in them
+            capture.photographs.forget()
     for finding in capture.batch.findings:
         capture.say(f"at the next shoot: {finding.line()}")
     budget = capture.clock.budget

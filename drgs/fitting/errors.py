@@ -14,6 +14,7 @@ from drgs.fitting.records import fitted_views, load_run
 from drgs.information.expected_error import error_record
 
 if TYPE_CHECKING:
+    from drgs.data import Dataset
     from drgs.fitting.frames import Frame
     from drgs.information.expected_error import ErrorRecord
     from drgs.io.run import Run
@@ -23,7 +24,11 @@ __all__ = ["run_error_record"]
 
 
 def run_error_record(
-    run: Run, settings: RenderSettings, max_pixels: int | None = None, most: int | None = None
+    run: Run,
+    settings: RenderSettings,
+    max_pixels: int | None = None,
+    most: int | None = None,
+    dataset: Dataset | None = None,
 ) -> ErrorRecord:
     """The record of a run's scene and of the photographs that it was fitted to, at the poses that the fit has found.
 
@@ -35,12 +40,14 @@ def run_error_record(
         settings: Settings of the renderer.
         max_pixels: Pixels of a photograph at most; None: those of the fit.
         most: Photographs that are looked at, at most, evenly spaced, which stand for all; None: all of them.
+        dataset: The run's data set, where it has been loaded already.
     Raises:
         FileNotFoundError, ValueError: If photographs are gone or cannot be read.
     """
     loaded = load_run(run)
     config = loaded.record.config
-    dataset = load_dataset(loaded.record.data, config, lazy=True, points=False, semantics=False)
+    if dataset is None:
+        dataset = load_dataset(loaded.record.data, config, lazy=True, points=False, semantics=False)
     views = {view.name: view for view in loaded.record.with_refined_poses(dataset).views}
     names = fitted_views(run, loaded.record)
     if missing := [name for name in names if name not in views]:

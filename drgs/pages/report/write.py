@@ -77,7 +77,7 @@ def _pictures_and_charts(account: Account, dataset: Dataset | None) -> Drawings:
         try:
             if shown:
                 settings = account.record.config.settings
-                record = run_error_record(account.run, settings, most=_MOST_RESIDUALS)
+                record = run_error_record(account.run, settings, most=_MOST_RESIDUALS, dataset=dataset)
                 found = pictures.maps(loaded.scene, shown, record)
         except (OSError, ValueError) as error:
             notes.append(f"No maps of the expected error: {error}.")
