@@ -37,7 +37,6 @@ from drgs.train import fit
 
 FAR = np.array([5e6, -3e6, 120.0])
 UTM = np.array([500000.0, 5400000.0, 120.0])
-DATA = Path("/work/shared/data")
 FORMATS = ("ply", "compressed.ply", "spz", "sog", "splat", "glb")
 
 
@@ -309,6 +308,21 @@ def double_ply(path: Path, g: drgs.Gaussians, kind: str = "double", comment: str
     return path
 
 
+def test_another_file_in_the_place_of_an_offset_is_kept(tmp_path):
+    """A format without room for an offset is not written then; an offset of an earlier file is replaced."""
+    g = drgs.Gaussians.from_arrays(np.zeros((1, 3)), [[1, 0, 0, 0]], np.ones((1, 3)), [0.5], np.zeros((1, 1, 3)))
+    path = tmp_path / "a.splat"
+    save_gaussians(g.replace(origin=UTM), path)
+    save_gaussians(g, path)
+    assert not load_gaussians(path).origin.any()
+    origin_file(path).write_text("my notes")
+    written = path.read_bytes()
+    with pytest.raises(ValueError, match="the offset must be three finite numbers .*, got 'my notes'"):
+        save_gaussians(g.replace(means=g.means + 1), path)
+    assert origin_file(path).read_text() == "my notes"
+    assert path.read_bytes() == written
+
+
 def test_double_positions_of_a_ply_keep_their_digits(tmp_path, caplog):
     """An origin is found for them; those near 0, or relative to an offset, have none, or that."""
     g = scene().replace(origin=UTM + 0.25)
@@ -389,19 +403,18 @@ def test_convert_keeps_the_origin(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not (DATA / "banana").is_dir(), reason="needs the capture banana")
-def test_a_capture_in_utm_coordinates(tmp_path):
+def test_a_capture_in_utm_coordinates(tmp_path, data_dir):
     """`banana` moved to UTM coordinates has its PSNR within 0.05 dB, its views picked, and its files."""
     pycolmap = pytest.importorskip("pycolmap")
-    reconstruction = pycolmap.Reconstruction(DATA / "banana" / "sparse" / "0")
+    reconstruction = pycolmap.Reconstruction(data_dir / "banana" / "sparse" / "0")
     reconstruction.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), UTM))
     (tmp_path / "utm/sparse/0").mkdir(parents=True)
     reconstruction.write_binary(tmp_path / "utm/sparse/0")
-    (tmp_path / "utm/images").symlink_to(DATA / "banana" / "images")
+    (tmp_path / "utm/images").symlink_to(data_dir / "banana" / "images")
     options = config(max_steps=60, max_gaussians=2000, max_pixels=10_000, init_points="all")
     results = [
         fit(load(path), tmp_path / name, options, progress=False)
-        for name, path in (("near", DATA / "banana"), ("far", tmp_path / "utm"))
+        for name, path in (("near", data_dir / "banana"), ("far", tmp_path / "utm"))
     ]
     near, far = (result.metrics["mean"]["psnr"] for result in results)
     assert far == pytest.approx(near, abs=0.05)

@@ -28,7 +28,6 @@ from drgs.ellipsoids import Gaussians
 from drgs.planner import Planner, default_config
 
 SIZE = 40
-BANANA = Path("/work/shared/data/banana")
 UTM = np.array([500_000.0, 5_400_000.0, 120.0])
 STEPS = {".ply": 1e-6, ".splat": 1e-6, ".spz": 2**-12, ".compressed.ply": 1e-3, ".sog": 1e-3, ".glb": 1e-6}
 """Suffix -> error of a position that the format may make, in units of the capture."""
@@ -226,17 +225,17 @@ def test_the_planner(capture, name):
 
 
 @pytest.fixture(scope="module")
-def banana(tmp_path_factory):
+def banana(tmp_path_factory, data_dir):
     """Makes a fit to photographs of a world of `banana`, once each."""
-    pycolmap = pytest.importorskip("pycolmap")
+    pycolmap, capture = pytest.importorskip("pycolmap"), data_dir / "banana"
     made: dict[str, Made] = {}
 
     def of(name: str) -> Made:
         if name not in made:
             folder, world = tmp_path_factory.mktemp(name), WORLDS.get(name, World())
             (folder / "data/sparse/0").mkdir(parents=True)
-            (folder / "data/images").symlink_to(BANANA / "images")
-            model = pycolmap.Reconstruction(str(next(BANANA.glob("sparse/**/cameras.*")).parent))
+            (folder / "data/images").symlink_to(capture / "images")
+            model = pycolmap.Reconstruction(str(next(capture.glob("sparse/**/cameras.*")).parent))
             model.transform(pycolmap.Sim3d(world.scale, pycolmap.Rotation3d(), world.zero))
             model.write(str(folder / "data/sparse/0"))
             words = ("--max-steps", "200", "--max-pixels", "15000", "--max-gaussians", "5000")
@@ -247,7 +246,6 @@ def banana(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not BANANA.exists(), reason=f"needs {BANANA}, photographs of a capture")
 @pytest.mark.parametrize("name", WORLDS)
 def test_a_capture(banana, name):
     """`banana`, 200 steps: PSNR is the same within 0.05 dB."""

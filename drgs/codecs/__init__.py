@@ -140,8 +140,8 @@ def save_gaussians(
             show most come first.
         extra, comments: Columns and lines that only a PLY has room for; see `save_ply`.
     Raises:
-        ValueError: If the suffix is another one, a parameter is not finite (the first index is named), or the format
-            cannot hold it.
+        ValueError: If the suffix is another one, a parameter is not finite (the first index is named), the format
+            cannot hold it, or another file has the place of the offset's (`origin_file`).
     """
     from drgs.ellipsoids import check_gaussians
 
@@ -166,11 +166,13 @@ def save_gaussians(
         _log.warning("%s: left out the %d semantic features, %s has no room", path, g.features.shape[1], suffix)
     codec = next(codec for codec in CODECS.values() if codec.suffix == suffix and codec.encode)
     assert codec.encode is not None  # asked for
+    beside = origin_file(path)
+    if not codec.keeps_origin and beside.is_file():
+        _offset_in(beside)  # what holds no offset is a file of somebody else, and is not overwritten
     plain = _plain(g)
     data = codec.encode(plain if codec.keeps_origin else plain.replace(origin=np.zeros(3)))
     with atomic_write(path) as file:
         file.write(data)
-    beside = origin_file(path)
     # One that is there already must not go on saying where an older file was.
     if not codec.keeps_origin and (plain.origin.any() or beside.is_file()):
         with atomic_write(beside) as file:
@@ -189,11 +191,14 @@ def origin_file(path: Path) -> Path:
 def _with_origin_beside(path: Path, g: Gaussians) -> Gaussians:
     """Gaussians of a file, relative to the offset that stands beside it, if there is one."""
     beside = origin_file(path)
-    if not beside.is_file():
-        return g
+    return g.replace(origin=_offset_in(beside)) if beside.is_file() else g
+
+
+def _offset_in(beside: Path) -> np.ndarray:
+    """(3,) float64 offset in the text beside a file; ValueError if it holds anything else."""
     with beside.open("rb") as file:
         text = file.read(_OFFSET_BYTES).decode("utf-8", "replace").strip()
-    return g.replace(origin=origin_of_text(str(beside), text))
+    return origin_of_text(str(beside), text)
 
 
 def check_suffix(where: str, path: Path) -> str:

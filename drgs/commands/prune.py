@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drgs.codecs import check_suffix, save_gaussians
+from drgs.codecs import check_suffix, origin_file, save_gaussians
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import Source, check_lenses, warn_of_unseen
 from drgs.display import tables
@@ -41,7 +41,7 @@ def run(args: Prune) -> None:
     check_amount("prune", args.keep, loss)
     suffix = check_suffix("prune", args.output)
     report = args.output.name[: -len(suffix)] + ".json"
-    names = [args.output.name, report]
+    names = [args.output.name, origin_file(args.output).name, report]
     with lock_folder(args.output.parent, "prune", names, [args.scene, args.data or ""]):
         with Bar("reading", show=not args.quiet):
             given = SceneInput.of(args)
