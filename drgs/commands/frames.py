@@ -138,7 +138,7 @@ def _data_set(data: Path) -> Dataset | None:
 
 
 def _photographs(dataset: Dataset) -> list[Frame]:
-    """Some photographs, evenly spaced; those that cannot be read are left out."""
+    """Some photographs, evenly spaced; none where one of them cannot be read."""
     try:
         return load_frames(dataset.views[:: -(-len(dataset.views) // _PHOTOGRAPHS) or 1], _PIXELS)
     except (OSError, ValueError):
@@ -146,7 +146,7 @@ def _photographs(dataset: Dataset) -> list[Frame]:
 
 
 def _psnr(g: Gaussians, photographs: list[Frame]) -> float:
-    """PSNR over the pixels of all photographs, in dB: 0 of Gaussians that none of them shows."""
+    """PSNR of the splat over the pixels of all photographs, in dB, rendered by preset `fast`."""
     settings = RenderSettings.preset("fast")
     with torch.no_grad():
         images = [render(g.replace(features=None), frame.camera, settings, outputs=()).rgb for frame in photographs]
