@@ -15,13 +15,30 @@ from typing import Any, Literal
 from drgs.checks.arguments import check_fields, must_be
 from drgs.checks.registry import Registry
 
-__all__ = ["EPS_ALPHA", "PRESETS", "RESPONSES", "Preset", "RenderSettings", "check_settings", "legal"]
+__all__ = [
+    "EPS_ALPHA",
+    "PRESETS",
+    "RESPONSES",
+    "TOLERANCE_OF_END",
+    "TOLERANCE_OF_PICTURES",
+    "Preset",
+    "RenderSettings",
+    "check_settings",
+    "legal",
+]
 
 Preset = Literal["exact", "fast", "inria", "gsplat", "3dgut", "mitsuba"]
 PRESETS: tuple[Preset, ...] = typing.get_args(Preset)
 
 # Depth is divided by max(alpha, EPS_ALPHA): what no ray meets has a finite one.
 EPS_ALPHA = 1e-10
+
+TOLERANCE_OF_PICTURES = 1 / 512
+"""Half a step of 8 bits, which is all that files of pictures and screens hold."""
+TOLERANCE_OF_END = 0.1
+"""Share of `tolerance` that may be behind the place where a ray ends; the rest is that of the tails that are left out.
+A ray ends early on few pixels, and tails are on all.
+"""
 
 RESPONSES: Registry[Any] = Registry(
     "response",
@@ -94,6 +111,7 @@ _RANGES = {
     "alpha_min": (0.0, 1.0),
     "alpha_max": (0.0, 1.0),
     "transmittance_min": (0.0, 1.0),
+    "tolerance": (0.0, 1.0),
     "dilation": (0.0, 1e3),
     "near": (0.0, 1e30),  # float32 holds it
     "max_hits": (1, 1 << 30),
@@ -122,6 +140,9 @@ class RenderSettings:
         transmittance_min: A ray ends once T falls below it; see `stop`.
         stop: `after` composites the hit, then tests T; `before` tests T (1 - a) < transmittance_min and drops the hit
             (INRIA), `before_eq` the same with <= (gsplat).
+        tolerance: Largest error of a color, in units of the range that the view's colors and its background span, that
+            cut-offs may make, from which extents and the T at which a ray ends follow (docs/numerics.md has the proof);
+            with `extent=None` only. None: what derivatives need.
         max_hits: A ray ends behind so many hits, whatever is left of T; None is no limit.
         dilation: Added to the diagonal of the projected covariance, in px^2 (`ewa` only).
         near: Gaussians whose mean has camera z <= near are left out; 0 leaves none out.
@@ -144,6 +165,7 @@ class RenderSettings:
     alpha_max_gradient: Literal["zero", "pass"] = "zero"
     transmittance_min: float = 1e-10
     stop: Literal["after", "before", "before_eq"] = "after"
+    tolerance: float | None = None
     max_hits: int | None = None
     dilation: float = 0.0
     near: float = 0.0
@@ -156,7 +178,7 @@ class RenderSettings:
         if not isinstance(self.response, str) or self.response not in RESPONSES:
             raise ValueError(f"RenderSettings: response must be one of {', '.join(RESPONSES)}, got {self.response!r}")
         check_fields("RenderSettings", self, _RANGES)
-        for name in ("extent", "alpha_max"):
+        for name in ("extent", "alpha_max", "tolerance"):
             if getattr(self, name) == 0:
                 raise ValueError(f"RenderSettings: {name} must be > 0, got 0")
         problem = legal(self)
@@ -171,6 +193,19 @@ class RenderSettings:
         if self.response in _PLANAR:
             return _PLANAR[self.response]
         return bool(RESPONSES[self.response].planar)
+
+    def for_pictures(self) -> RenderSettings:
+        """Settings for files and screens of 8 bits: of preset `exact` with a tolerance of half a step of theirs."""
+        if self != RenderSettings.preset("exact", background=self.background):
+            return self
+        return self.replace(tolerance=TOLERANCE_OF_PICTURES)
+
+    @property
+    def least_transmittance(self) -> float:
+        """The T below which a ray ends: `transmittance_min`, or more where `tolerance` allows it."""
+        if self.tolerance is None:
+            return self.transmittance_min
+        return max(self.transmittance_min, TOLERANCE_OF_END * self.tolerance)
 
     @classmethod
     def preset(cls, name: str, **overrides: Any) -> RenderSettings:
@@ -227,6 +262,8 @@ def legal(s: RenderSettings) -> str | None:
         return f"response={s.response!r} is defined on the image plane, use traversal='tiles' (got 'bvh')"
     if s.planar and s.order != "center":
         return f"response={s.response!r} has one depth per Gaussian, use order='center' (got {s.order!r})"
+    if s.tolerance is not None and s.extent is not None:
+        return f"tolerance decides on the extent, use extent=None (got {s.extent!r}) or tolerance=None"
     if s.order == "entry" and s.traversal == "tiles":
         return "order='entry' is Mitsuba's order of entry points, use traversal='bvh' (got 'tiles')"
     if s.culling == "ut" and (s.planar or s.traversal != "tiles"):

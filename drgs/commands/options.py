@@ -124,6 +124,11 @@ class Settings(Common):
     overrides: tuple[str, ...] = option(
         (), "Replace one render setting, e.g. order=ray.", repeat=True, metavar="KEY=VALUE", flag="set"
     )
+    tolerance: float | None = option(
+        None,
+        "Error of colors that cut-offs may make, e.g. 1e-3, in place of those of --preset exact: faster, with a bound.",
+        rare=True,
+    )
 
     def settings(self) -> RenderSettings:
         """The `RenderSettings` that --preset and --set describe.
@@ -134,12 +139,13 @@ class Settings(Common):
         return RenderSettings.preset(self.preset, **self.replaced())
 
     def replaced(self) -> dict[str, Any]:
-        """The fields that --set replaces.
+        """The fields that --set and --tolerance replace.
 
         Raises:
             ValueError: If one is no KEY=VALUE, names no field or has the wrong type.
         """
-        return parsed(self.overrides)
+        fields = parsed(self.overrides)
+        return fields if self.tolerance is None else {**fields, "tolerance": self.tolerance}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -93,6 +93,7 @@ def run(args: Render) -> None:
     paint = picture_functions(kinds, given, args.scene)
     gaussians = given.gaussians if paint else given.colors
     settings = given.over_background(settings)
+    settings = settings if "exr" in formats else settings.for_pictures()
     cameras, source = _cameras_of(args, views, film, given, settings)
     if single is not None:
         cameras = single.named(cameras)

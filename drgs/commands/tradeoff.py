@@ -64,6 +64,8 @@ def run(args: Tradeoff) -> None:
     """`drgs tradeoff SCENE`."""
     if args.preset != "exact":
         raise ValueError(f"--preset must be exact, which the others are compared with, got {args.preset}; drop it")
+    if args.tolerance is not None:
+        raise ValueError("--tolerance: must not be given, several are among the settings that are compared; drop it")
     if not args.max_error or not all(0 < x < math.inf for x in args.max_error):
         got = " ".join(f"{x:g}" for x in args.max_error) or "none"
         raise ValueError(f"--max-error must be finite numbers > 0, got {got}; correct it")

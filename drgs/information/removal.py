@@ -78,6 +78,5 @@ class RemovalError(Quantity):
 def seen_through(settings: RenderSettings) -> RenderSettings:
     """Settings by which rays end no earlier than they would by these ones without any one of their hits."""
     alpha_max = min(settings.alpha_max, _OPAQUE)
-    return settings.replace(
-        alpha_max=alpha_max, transmittance_min=settings.transmittance_min * (1 - alpha_max), max_hits=None
-    )
+    ends = settings.least_transmittance * (1 - alpha_max)
+    return settings.replace(alpha_max=alpha_max, transmittance_min=ends, max_hits=None, tolerance=None)

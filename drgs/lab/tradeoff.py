@@ -133,6 +133,7 @@ TRADEOFF_VARIANTS = (
     Variant("approximation", fields={"order": "center", "depth_key": "z"}),
     Variant("approximation", fields={"traversal": "bvh"}, by="rays"),
     Variant("approximation", fields={"traversal": "bvh", "order": "entry"}, by="rays"),
+    *_rows("approximation", "exact", "tolerance", 1e-5, 1e-4, 1e-3, 1e-2, 1e-1),
     *_rows("approximation", "exact", "extent", 4.0, 3.33, 3.0, 2.5, 2.0),
     *_rows("approximation", "exact", "alpha_min", 1e-5, 1e-4, 1e-3, 1 / 255),
     *_rows("approximation", "exact", "alpha_max", 0.999, 0.99),
@@ -1121,6 +1122,8 @@ def plot(measured: Measured, budgets: Sequence[float], title: str, path: Path) -
         points.sort(key=lambda p: p[:2])
         front = [p for i, p in enumerate(points) if all(p[1] < q[1] for q in points[:i])]
         axis.plot([p[0] for p in front], [p[1] for p in front], "-", lw=1, color="black", label="front", zorder=0)
+        curve = sorted(p[:2] for p in points if p[2] is measured.truth or p[2].name.startswith("tolerance="))
+        axis.plot(*zip(*curve, strict=True), "--", lw=1, color="black", label="tolerance") if curve else None
         axis.set(xscale="log", yscale="log", ylabel=label, xlabel=f"time, {clock.replace('_', ' + ')} / exact")
         axis.margins(x=0.25, y=0.12)
         for budget in budgets:

@@ -48,7 +48,7 @@ class HitModel:
         # Opaque: another value is no other kernel.
         self.alpha_min = dr.opaque(lib.Float, settings.alpha_min)
         self.alpha_max = dr.opaque(lib.Float, settings.alpha_max)
-        self.stop_at = dr.opaque(lib.Float, settings.transmittance_min)
+        self.stop_at = dr.opaque(lib.Float, settings.least_transmittance)
         self.max_hits = dr.opaque(lib.UInt32, settings.max_hits or 0)
         self.background = [dr.opaque(lib.Float, b) for b in settings.background]
         self.strength = layout.W_ALPHA if world else layout.ALPHA  # places in a record

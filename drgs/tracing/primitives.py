@@ -13,18 +13,23 @@ from typing import Any, NamedTuple, Protocol
 import drjit as dr
 
 from drgs.cameras.lenses import Guide
-from drgs.settings import RenderSettings
+from drgs.settings import TOLERANCE_OF_END, RenderSettings
 from drgs.tracing.arrays import Float, Lib, Mask
 from drgs.tracing.harmonics import sh_basis, sh_color
 from drgs.tracing.records import dot
 
-__all__ = ["LEAST_EXTENT2", "Activated", "Lens", "Patch", "Projected", "Ray", "Screen", "ViewColor"]
+__all__ = ["LEAST_EXTENT2", "TOLERANCE_LISTED", "TOLERANCE_UNLISTED", "Activated", "Lens", "Patch", "Projected", "Ray", "Screen", "ViewColor", "trimmed_extent2"]
 
 _THINNEST = math.log(1e-30)  # of log-scales
 TOLERANCE = 1e-5
 """Of `exact`: the largest error of an image that it claims, and what the tails that it leaves out may add up to in any
 derivative of a ray (`adaptive_extent2`), where 10 times that is claimed. In an image they are 1/30 of it.
 """
+TOLERANCE_UNLISTED = 0.1
+"""Share of `RenderSettings.tolerance` that the tails of Gaussians which a tile does not list may add up to. They are far
+away, mostly: a smaller share makes lists longer by little, and leaves more to those that are listed."""
+TOLERANCE_LISTED = 1 - TOLERANCE_UNLISTED - TOLERANCE_OF_END
+"""The same of those that a tile lists."""
 _STEPS = 4  # of a fixed point, each of which makes the error at least 13 times smaller
 
 
@@ -48,6 +53,15 @@ def adaptive_extent2(log_strength: Float | float, log: Callable = math.log) -> F
 
 LEAST_EXTENT2 = adaptive_extent2(0.0)
 """5.47^2, of strengths up to 1: however faint a Gaussian is, its own derivatives keep all but 5e-6 of themselves."""
+
+
+def trimmed_extent2(settings: RenderSettings, extent2: Float, cut: Float | None) -> Float:
+    """Squared extents on a tile: less by what its tails may be cut; with a tolerance, which asks nothing of derivatives,
+    down to 0.
+    """
+    if cut is None:
+        return extent2
+    return dr.maximum(extent2 - cut, LEAST_EXTENT2 if settings.tolerance is None else 0)
 
 
 @dataclasses.dataclass
@@ -292,6 +306,9 @@ class Activated:
         strength = dr.detach(self.opacity)
         if not self.at_most_alpha:  # but at most the optical depth
             strength = dr.detach(dr.maximum(self.logit, 0) + dr.log(1 + self.e))
+        if self.settings.tolerance is not None:
+            share = dr.opaque(self.lib.Float64, TOLERANCE_UNLISTED * self.settings.tolerance / count)
+            return self.lib.Float64(dr.sqrt(2 * dr.log(dr.maximum(strength / share, 1))))
         # N times: so much are the tails of all N Gaussians together.
         together = dr.maximum(self.lib.Float(strength * dr.opaque(self.lib.Float64, count)), 1)
         return self.lib.Float64(dr.sqrt(adaptive_extent2(dr.log(together), dr.log)))

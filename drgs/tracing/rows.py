@@ -16,7 +16,7 @@ import torch
 
 from drgs import runtime
 from drgs.tracing.arrays import Float, Lib, Mask, UInt32
-from drgs.tracing.primitives import LEAST_EXTENT2, Ray
+from drgs.tracing.primitives import Ray, trimmed_extent2
 from drgs.tracing.records import load_record
 from drgs.tracing.sort_keys import BEYOND, EMPTY, name_of, positive, word_of
 from drgs.tracing.walk import ListStream, Part
@@ -51,7 +51,7 @@ class SortedHits:
         in_lists: Function that makes a part with these pixels, four a lane, along the lists of the tiles.
         index: (entries,) Gaussians of all lists; of the same key the first entry is the nearer hit.
         lengths: (tiles,) of the lists of these tiles.
-        cut: (tiles,) what is taken off the squared extents, down to `LEAST_EXTENT2`, or None.
+        cut: (tiles,) what is taken off the squared extents (`trimmed_extent2`), or None.
         budget: Memory to hold the order in once it is known.
     """
 
@@ -174,8 +174,7 @@ class _Finder:
         lib = self.m.lib
         out = []
         record = load_record(lib, self.records, index, active)
-        if self.cut is not None:
-            record[self.m.extent2] = dr.maximum(record[self.m.extent2] - self.cut, LEAST_EXTENT2)
+        record[self.m.extent2] = trimmed_extent2(self.m.s, record[self.m.extent2], self.cut)
         for start, ray, st, place in zip(self.starts, rays, states, places, strict=True):
             _, key, ok = self.m.hit(record, ray, active & (st["alive"] != 0))
             key = positive(lib, key) if self.m.signed else key

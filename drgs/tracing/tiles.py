@@ -24,7 +24,7 @@ from drgs.tracing.arrays import Float, Int32, Lib, Mask, UInt32, UInt64
 from drgs.tracing.free_rays import FreeRays
 from drgs.tracing.kernels import HitModel
 from drgs.tracing.lens_rays import LensRays
-from drgs.tracing.primitives import LEAST_EXTENT2, Patch, Projected, Ray
+from drgs.tracing.primitives import TOLERANCE_LISTED, TOLERANCE_UNLISTED, Patch, Projected, Ray, trimmed_extent2
 from drgs.tracing.records import load_record
 from drgs.tracing.responses import response_of
 from drgs.tracing.rows import MemoryBudget, SortedHits
@@ -270,7 +270,7 @@ class Lists:
         start, end: (tiles,) range of each tile.
         columns, rows: Tiles in x and y.
         pairs: Number of entries.
-        cut: (tiles,) what is taken off the squared extent of each entry, down to `LEAST_EXTENT2`; None: nothing.
+        cut: (tiles,) what is taken off the squared extent of each entry (`trimmed_extent2`); None: nothing.
     """
 
     index: UInt32
@@ -374,7 +374,8 @@ def _shorter(
         lens: The camera's, if it is no pinhole.
     """
     listed = lib.Float(lists.end - lists.start)
-    cut = 2 * dr.log(dr.opaque(lib.Float, count) / dr.maximum(listed, 1))
+    more = 1 if settings.tolerance is None else TOLERANCE_LISTED / TOLERANCE_UNLISTED
+    cut = 2 * dr.log(dr.opaque(lib.Float, count * more) / dr.maximum(listed, 1))
     loaded = load_record(lib, record, lists.index, lib.Bool(True))
     tiles = _Tiles(lib, settings, loaded, dr.gather(lib.Float, cut, tile), lens)
     x, y = lib.Int32(tile % lists.columns), lib.Int32(tile // lists.columns)
@@ -419,7 +420,7 @@ class _Tiles:
 
     Args:
         loaded: The first entries of each lane's record.
-        cut: What is taken off squared extents, down to `LEAST_EXTENT2`; None: nothing.
+        cut: What is taken off squared extents (`trimmed_extent2`); None: nothing.
         lens: The camera's, if it is no pinhole.
         size: Pixels along the edge of a tile, or of a block of tiles.
     """
@@ -439,9 +440,7 @@ class _Tiles:
         self.r = loaded
         self.response = response_of(settings)
         world = lens is not None and lens.world
-        self.limit = loaded[layout.W_EXT2 if world else layout.EXT2]
-        if cut is not None:
-            self.limit = dr.maximum(self.limit - cut, LEAST_EXTENT2)
+        self.limit = trimmed_extent2(settings, loaded[layout.W_EXT2 if world else layout.EXT2], cut)
         if settings.alpha_min > 0:
             least = dr.opaque(lib.Float, self.response.least_strength(settings.alpha_min))
             needed = 2 * dr.log(loaded[layout.W_ALPHA if world else layout.ALPHA] / least)

@@ -503,7 +503,7 @@ class Session:
     def _picture(self, wanted: int, subject: Subject, whole: Camera, layer: Layer, preset: str) -> Iterator[None]:
         """Job: pictures of what the camera sees, each larger than the one before."""
         began = time.perf_counter()
-        settings = subject.settings(preset)
+        settings = subject.settings(preset).for_pictures()
         rate = 0.0
         before: np.ndarray | None = None
         of = f" of {subject.state}" if subject is not self.subject and subject.state else ""
