@@ -1,7 +1,7 @@
-"""What one number between `fast` and `exact` buys: error and time of `RenderSettings.tolerance` on the scenes of exact.py.
+"""What one number between `fast` and `exact` buys: error and time of `RenderSettings.tolerance` on scenes of exact.py.
 
-    python benchmarks/tolerance.py [--fits FOLDER] [--turns 5]      docs/data/tolerance.csv, the table of docs/tradeoff.md
-    python benchmarks/tolerance.py --page                           from the rows that there are
+    python benchmarks/tolerance.py [--fits FOLDER] [--turns 5]   docs/data/tolerance.csv, a table of docs/tradeoff.md
+    python benchmarks/tolerance.py --page                        from the rows that there are
 
 Settings take turns in one process, one thread; seconds are the processor's, ratios are medians over turns. Errors are
 differences from `exact`: of a color the largest and the root of the mean square, and of the gradient of the image's
@@ -97,7 +97,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--fits", type=Path, default=ROOT / "runs" / "exact")
     parser.add_argument("--turns", type=int, default=5)
-    parser.add_argument("--page", action="store_true", help="measure nothing, write the table of the rows that there are")
+    parser.add_argument(
+        "--page", action="store_true", help="measure nothing, write the table of the rows that there are"
+    )
     args = parser.parse_args()
     done = {row["scene"] for row in read_rows(ROWS)}
     for name in () if args.page else exact.SCENES:

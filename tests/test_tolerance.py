@@ -74,7 +74,7 @@ def wall(count, sigmas, opacity, width=9):
 
 @pytest.mark.parametrize("tolerance", [1e-1, 1e-2, 1e-3])
 def test_the_bound_is_tight_where_tails_add_up(tolerance):
-    """60 tails just beyond the extent add up to more than a fifth of what is allowed, and not to more than all of it."""
+    """60 tails just beyond the extent add up to more than a fifth of what is allowed, and not to more than it."""
     worst = 0.0
     for sigmas in np.arange(2.0, 6.0, 0.05):
         g, cam = wall(60, float(sigmas), 0.9)

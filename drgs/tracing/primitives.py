@@ -18,7 +18,19 @@ from drgs.tracing.arrays import Float, Lib, Mask
 from drgs.tracing.harmonics import sh_basis, sh_color
 from drgs.tracing.records import dot
 
-__all__ = ["LEAST_EXTENT2", "TOLERANCE_LISTED", "TOLERANCE_UNLISTED", "Activated", "Lens", "Patch", "Projected", "Ray", "Screen", "ViewColor", "trimmed_extent2"]
+__all__ = [
+    "LEAST_EXTENT2",
+    "TOLERANCE_LISTED",
+    "TOLERANCE_UNLISTED",
+    "Activated",
+    "Lens",
+    "Patch",
+    "Projected",
+    "Ray",
+    "Screen",
+    "ViewColor",
+    "trimmed_extent2",
+]
 
 _THINNEST = math.log(1e-30)  # of log-scales
 TOLERANCE = 1e-5
@@ -26,8 +38,9 @@ TOLERANCE = 1e-5
 derivative of a ray (`adaptive_extent2`), where 10 times that is claimed. In an image they are 1/30 of it.
 """
 TOLERANCE_UNLISTED = 0.1
-"""Share of `RenderSettings.tolerance` that the tails of Gaussians which a tile does not list may add up to. They are far
-away, mostly: a smaller share makes lists longer by little, and leaves more to those that are listed."""
+"""Share of `RenderSettings.tolerance` that the tails of Gaussians which a tile does not list may add up to. They are
+far away, mostly: a smaller share makes lists longer by little, and leaves more to those that are listed.
+"""
 TOLERANCE_LISTED = 1 - TOLERANCE_UNLISTED - TOLERANCE_OF_END
 """The same of those that a tile lists."""
 _STEPS = 4  # of a fixed point, each of which makes the error at least 13 times smaller
@@ -56,8 +69,8 @@ LEAST_EXTENT2 = adaptive_extent2(0.0)
 
 
 def trimmed_extent2(settings: RenderSettings, extent2: Float, cut: Float | None) -> Float:
-    """Squared extents on a tile: less by what its tails may be cut; with a tolerance, which asks nothing of derivatives,
-    down to 0.
+    """Squared extents on a tile, less by what its tails may be cut, down to what derivatives need; with a tolerance,
+    which bounds colors alone, down to 0.
     """
     if cut is None:
         return extent2
