@@ -34,6 +34,7 @@ from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
+    from drgs.fitting.components.base import Component
     from drgs.fitting.config import FitConfig, RateConfig
     from drgs.information.inputs import Masks
     from drgs.information.semantics import SemanticMetric
@@ -239,7 +240,14 @@ def _without(left: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
     return left[is_left]
 
 
-def fit_on(gaussians: Gaussians, frames: Sequence[Frame], config: FitConfig, steps: int, far: int = 0) -> Gaussians:
+def fit_on(
+    gaussians: Gaussians,
+    frames: Sequence[Frame],
+    config: FitConfig,
+    steps: int,
+    far: int = 0,
+    components: Sequence[Component] = (),
+) -> Gaussians:
     """Fit Gaussians to photographs for some steps more: colors, shapes and places, not how many there are.
 
     Args:
@@ -248,6 +256,7 @@ def fit_on(gaussians: Gaussians, frames: Sequence[Frame], config: FitConfig, ste
         config: Configuration of the fit: its loss, renderers and learning rates, which are those of its second half.
         steps: How many, at least 1.
         far: How many of the first Gaussians are those of a skybox.
+        components: What else renderings go through before they are compared, as the fit has left it: exposures.
     """
     dc, rest = gaussians.sh.detach()[:, :1], gaussians.sh.detach()[:, 1:]
     parameters = {name: getattr(gaussians, name) for name in ("means", "quats", "log_scales", "logit_opacities")}
@@ -256,7 +265,8 @@ def fit_on(gaussians: Gaussians, frames: Sequence[Frame], config: FitConfig, ste
     done = round(steps * _BEGUN / (1 - _BEGUN))
     fixed = dataclasses.replace(config.density, refine_start=1.0, refine_stop=1.0)  # as many rows as there are
     config = config.replace(max_steps=done + steps, density=fixed, sh_degree=gaussians.sh_degree)
-    trainer = Trainer(config, list(frames), rows, scene_extent([frame.camera for frame in frames]), components=[])
+    extent = scene_extent([frame.camera for frame in frames])
+    trainer = Trainer(config, list(frames), rows, extent, list(components))
     trainer.step_index = done
     with fewer_torch_threads(), Bar("fitting on", steps) as bar:
         for step in range(steps):

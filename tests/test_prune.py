@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
+import shutil
 
 import numpy as np
 import pytest
@@ -18,6 +20,8 @@ from drgs.codecs import load_gaussians
 from drgs.data import load
 from drgs.data.camera_lists import save_cameras_json
 from drgs.files import save_ply
+from drgs.fitting.components.base import Checkpoint
+from drgs.fitting.components.exposure import ExposureComponent
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import load_frames
 from drgs.fitting.losses import psnr
@@ -133,6 +137,22 @@ def test_fitting_on_repairs(tmp_path):
     torch.testing.assert_close(there.means, better.means, rtol=1e-3, atol=1e-3)
 
 
+def test_fitting_on_keeps_to_exposures(tmp_path):
+    """Photographs at 0.6 of the light make the scene no darker if their gains say so."""
+    g = write_still(tmp_path)
+    frames = load_frames(load(tmp_path).views, 10_000, mask="ignore")
+    images, cameras = [frame.image() for frame in frames], [frame.camera for frame in frames]
+    dark = [dataclasses.replace(frame, pixels=(0.6 * frame.pixels).to(frame.pixels.dtype)) for frame in frames]
+    gains = {"exposure.parameter.log_gains": torch.full((len(dark), 3), math.log(0.6))}
+    held = ExposureComponent.held(Checkpoint(gains, {"views": [frame.name for frame in dark]}, "state"), (0.0,) * 3)
+    config = FitConfig(renderers=("fast",), settings=FAST)
+    kept = fit_on(g, dark, config, 20, components=[held])
+    assert _psnr(kept, cameras, images) > _psnr(fit_on(g, dark, config, 20), cameras, images) + 5
+    assert not held.module.log_gains.requires_grad
+    with pytest.raises(ValueError, match="log_gains must have shape"):
+        ExposureComponent.held(Checkpoint({}, {"views": ["a"]}, "state"), (0.0,) * 3)
+
+
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
@@ -216,6 +236,22 @@ def test_command_by_cameras_alone(place, monkeypatch, capsys):
     assert "cameras.json has no photographs: what it costs is not measured" in capsys.readouterr().out
     assert len(load_gaussians(place / "half.ply")) == 15
     assert json.loads((place / "half.json").read_text())["psnr"] == {}
+
+
+def test_command_with_exposures(place, monkeypatch, capsys):
+    """A run whose photographs have exposures is fitted on with those, and with no photographs but its own."""
+    monkeypatch.chdir(place)
+    config = FitConfig().replace(max_steps=6, max_gaussians=100, exposure="learned")
+    drgs.fit(load(place / "data"), place / "uneven", config, progress=False)
+    line = ["prune", "uneven", "--keep", "0.5", "--refit", "3", "--quiet", "-o", "even.ply"]
+    assert cli.main(line) == 0
+    assert json.loads((place / "even.json").read_text())["refit"] == 3
+    shutil.copytree(place / "data", place / "other")
+    (place / "other/images/1.png").rename(place / "other/images/strange.png")
+    views = place / "other/transforms.json"
+    views.write_text(views.read_text().replace("images/1.png", "images/strange.png"))
+    assert cli.main([*line, "--data", "other"]) == 2
+    assert "photographs whose exposure uneven has found" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

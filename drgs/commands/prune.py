@@ -12,12 +12,14 @@ from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import Source, check_lenses, warn_of_unseen
 from drgs.display import tables
 from drgs.display.progress import Bar
+from drgs.fitting.components.base import Checkpoint, Component
+from drgs.fitting.components.exposure import ExposureComponent
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.metrics import TRAIN_VIEWS, through_renderers
 from drgs.fitting.records import fitted_views
 from drgs.fitting.renderers import renderers_to_measure
-from drgs.io.checkpoint import state_header
+from drgs.io.checkpoint import load_state, state_header
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import lock_folder, write_json
 from drgs.io.run import Run
@@ -56,6 +58,7 @@ def run(args: Prune) -> None:
             )
         check_lenses("prune", settings, views.cameras)
         warn_of_unseen(given.gaussians, views.cameras)
+        exposures = _exposures(args, given, views)
         with Bar("prune", show=not args.quiet):
             pruned = prune(
                 given.gaussians,
@@ -78,7 +81,7 @@ def run(args: Prune) -> None:
             if args.refit and views.train is not None:
                 far = int(pruned.kept[: _skybox(given)].sum())
                 config = given.record.config if given.record else _config_over(given)
-                stages["refitted"] = fit_on(pruned.gaussians, views.train, config, args.refit, far)
+                stages["refitted"] = fit_on(pruned.gaussians, views.train, config, args.refit, far, exposures)
             costs = views.measured(stages, given, settings, lenses)
             *_, left = stages.values()
             save_gaussians(left, args.output)
@@ -105,10 +108,6 @@ def _check_scene(args: Prune, given: SceneInput) -> None:
     if given.run is None and args.data is None:
         raise ValueError(
             "a file of Gaussians has no record of its views: --data must name a data set, a run or a cameras.json"
-        )
-    if args.refit and "exposure" in given.estimated:
-        raise ValueError(
-            f"--refit must have photographs of one exposure, {args.scene} was fitted with one for each; leave it out"
         )
 
 
@@ -185,6 +184,24 @@ class _Views:
     def measured_split(self) -> str:
         """What is measured: `test`, or `train` where nothing is held out."""
         return "test" if self.held_out else "train"
+
+
+def _exposures(args: Prune, given: SceneInput, views: _Views) -> list[Component]:
+    """The gains by which `--refit` compares photographs, of a run that has found one for each; they stay.
+
+    Raises:
+        ValueError: If a photograph is none of the run's.
+    """
+    if not args.refit or views.train is None or given.run is None or "exposure" not in given.estimated:
+        return []
+    checkpoint = Checkpoint(*load_state(given.run.state), str(given.run.state))
+    known = checkpoint.header["views"]
+    if other := next((frame.name for frame in views.train if frame.name not in known), None):
+        raise ValueError(
+            f"--refit must have photographs whose exposure {args.scene} has found, {other!r} of {views.source} is not "
+            "among these; leave --data or --refit out"
+        )
+    return [ExposureComponent.held(checkpoint, given.background)]
 
 
 def _skybox(given: SceneInput) -> int:

@@ -413,6 +413,19 @@ class ExposureComponent(Component):
         self.module: Exposure | None = None
         self.evidence: dict[str, Any] | None = None
 
+    @classmethod
+    def held(cls, checkpoint: Checkpoint, background: tuple[float, float, float]) -> ExposureComponent:
+        """With the gains of the photographs that a checkpoint names; they stay as they are.
+
+        Raises:
+            ValueError: If the checkpoint has none.
+        """
+        names = checkpoint.header["views"]
+        component = cls()
+        component.module = Exposure(names, np.zeros((len(names), 3)), False, background)
+        Network(NETWORK, component.module, 0.0).restore(dict(checkpoint.tensors), checkpoint.where)
+        return component
+
     def setting(self, setup: Setup) -> str | None:
         """See `Component`."""
         use = setup.config.data.exposure
