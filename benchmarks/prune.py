@@ -8,9 +8,9 @@ Scenes are fits of captures in folders of --runs by the capture's name, each mad
 
 (every 8th view held out), and two splats that others trained, without photographs: their truth is what the whole splat
 shows in views of an orbit, every 4th of them held out. Every method sees the same training views, removes to the same
-number of Gaussians, and is measured in the held-out views; once as it is and, of captures, after 200 steps of
-`drgs.pruning.fit_on`. Appends a row for each to benchmarks/prune.jsonl, leaves out what is there, and writes table,
-picture and data of docs/prune.md. One thread.
+number of Gaussians, and is measured in the held-out views: what is left as it is and, of four methods, after 200 steps
+of `drgs.pruning.fit_on`, which fits a splat as `drgs fit` does by default. Appends a row for each to
+benchmarks/prune.jsonl, leaves out what is there, and writes table, picture and data of docs/prune.md. One thread.
 
 Scores, the larger the more needed:
 
@@ -82,8 +82,8 @@ VARIED = ("banana", "head")
 VARIED_KEEP = 0.5
 KEEP = (0.7, 0.5, 0.3, 0.1)
 STEPS = 200
-REFITTED = {"removal": (0.5, 0.1), "opacity": (0.5,), "lightgaussian": (0.5,), "pup": (0.5,)}
-"""Method -> shares that are fitted on, too."""
+REFITTED = ("removal", "opacity", "lightgaussian", "pup")
+"""Methods whose Gaussians are fitted on, too."""
 RENDERERS = tuple(name for name in PRESETS if name != "mitsuba")
 SHOWN = "fast"
 """The renderer of the page's table; the baselines are measured by it and by `gsplat` alone."""
@@ -99,14 +99,12 @@ class Scene:
         name: Its name.
         gaussians: All of it.
         train, held_out: Photographs, or what stands for them.
-        config: Configuration to fit on with; None where there are no photographs.
-        background: RGB behind it.
+        config: Configuration to fit on with.
     """
 
     def __init__(self, name: str, runs: Path) -> None:
         self.name = name
-        self.config: FitConfig | None = None
-        self.background = (0.0, 0.0, 0.0)
+        self.config = FitConfig()
         if name in SPLATS:
             self.gaussians = load_gaussians(DATA / SPLATS[name])
             frames = [self._frame(camera) for camera in self._orbit()]
@@ -116,7 +114,6 @@ class Scene:
         run = load_run(runs / name)
         self.gaussians = run.gaussians
         self.config = config = run.record.config
-        self.background = config.settings.background
         dataset = load_dataset(DATA / name, config, points=False, semantics=False)
         train, test = run.record.with_refined_poses(dataset).split()
         self.train = frames_for(evenly(train, MOST_VIEWS), config.data)
@@ -140,7 +137,7 @@ class Scene:
 
     def settings(self, preset: str) -> RenderSettings:
         """A preset over the scene's background."""
-        return RenderSettings.preset(preset, background=self.background)
+        return RenderSettings.preset(preset, background=self.config.settings.background)
 
     def views(self) -> Iterator[tuple[Camera, torch.Tensor | None]]:
         """Cameras and masks of the training views."""
@@ -240,10 +237,10 @@ def measure(scene: Scene, done: set[tuple], methods: list[str], shares: list[flo
 
     g = scene.gaussians
 
-    def steps_of(method: str, keep: float) -> list[int]:
-        return [0, STEPS] if is_fitted_on and scene.config and keep in REFITTED.get(method, ()) else [0]
+    def steps_of(method: str) -> list[int]:
+        return [0, STEPS] if is_fitted_on and method in ("whole", *REFITTED) else [0]
 
-    for steps in steps_of("removal", VARIED_KEEP):
+    for steps in steps_of("whole"):
         if (scene.name, "whole", 1.0, steps) not in done:
             add("whole", 1.0, steps, fit_on(g, scene.train, scene.config, steps) if steps else g, 0.0)
     known = [row for row in read_rows(ROWS) if (row["scene"], row["method"]) == (scene.name, "removal")]
@@ -253,7 +250,7 @@ def measure(scene: Scene, done: set[tuple], methods: list[str], shares: list[flo
         if method in VARIANTS and scene.name not in VARIED:
             continue
         for keep in (VARIED_KEEP,) if method in VARIANTS else shares:
-            missing = [x for x in steps_of(method, keep) if (scene.name, method, keep, x) not in done]
+            missing = [x for x in steps_of(method) if (scene.name, method, keep, x) not in done]
             if not missing:
                 continue
             began = time.perf_counter()
@@ -292,7 +289,7 @@ def halves(rows: list[dict]) -> str:
         "whole": 1.0,
         **dict.fromkeys(("removal", "squared", "gaussianpop", "lightgaussian", "opacity", "pup"), 0.5),
     }
-    fitted = {"whole": 1.0, "removal": 0.5, "lightgaussian": 0.5, "opacity": 0.5}
+    fitted = {"whole": 1.0, "removal": 0.5, "lightgaussian": 0.5, "opacity": 0.5, "pup": 0.5}
     lines = []
     for scene in scenes_of(rows):
         keys = [(scene, x, keep, 0) for x, keep in named.items()]
@@ -346,15 +343,11 @@ def plot(rows: list[dict]) -> None:
             label = label.get(method, method)
             keep = KEEP if scene in SPLATS else (1.0, *KEEP)
             panel.plot(keep, curve if scene in SPLATS else [whole, *curve], line, color=color, label=label)
-        fitted = [keep for keep in KEEP if (scene, "removal", keep, STEPS) in values]
-        panel.plot(
-            fitted,
-            [values[scene, "removal", keep, STEPS] for keep in fitted],
-            "o--",
-            color="black",
-            ms=4,
-            label=f"drgs, {STEPS} steps",
-        )
+        for method in REFITTED:
+            fitted = [keep for keep in KEEP if (scene, method, keep, STEPS) in values]
+            curve = [values[scene, method, keep, STEPS] for keep in fitted]
+            label = f"{'drgs' if method == 'removal' else method}, {STEPS} steps"
+            panel.plot(fitted, curve, "o--", color=styles[method][0], ms=4, label=label)
         panel.set_title(scene)
         panel.set_xlabel("share that is kept")
         panel.invert_xaxis()
