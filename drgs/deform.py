@@ -303,6 +303,12 @@ class DynamicGaussians:
         """The same scene with unlimited lifespans: each mean is where it is at its reference time."""
         return DynamicGaussians(self.gaussians, self.field, self.motion)
 
+    def take(self, index: torch.Tensor) -> DynamicGaussians:
+        """The Gaussians at `index`, in that order, with the same field."""
+        motion = None if self.motion is None else self.motion[index]
+        lifespans = None if self.lifespans is None else self.lifespans.take(index)
+        return DynamicGaussians(self.gaussians.take(index), self.field, motion, lifespans)
+
     def parameters(self) -> dict[str, torch.Tensor]:
         """Raw parameters of the Gaussians, `motion` if there is one, those of `lifespans`, and the field's:
         `phi.grid.*`, `phi.mlp.*`.

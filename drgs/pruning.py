@@ -13,15 +13,16 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
 import numpy as np
 import torch
 
 from drgs.cameras import some_cameras
 from drgs.data import scene_extent
+from drgs.deform import DynamicGaussians
 from drgs.display.progress import Bar
-from drgs.ellipsoids import Gaussians, check_gaussians
+from drgs.ellipsoids import Gaussians, check_gaussians, colors_only
 from drgs.fisher import removal_error
 from drgs.fitting.frames import Frame
 from drgs.fitting.losses import psnr
@@ -34,6 +35,7 @@ from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
+    from drgs.ellipsoids import Scene
     from drgs.fitting.components.base import Component
     from drgs.fitting.config import FitConfig, RateConfig
     from drgs.information.inputs import Masks
@@ -42,6 +44,8 @@ if TYPE_CHECKING:
 __all__ = ["POWER", "ROUNDS", "Pruned", "Round", "Unseen", "check_amount", "fit_on", "prune"]
 
 Unseen = Literal["keep", "remove"]
+
+_S = TypeVar("_S", Gaussians, DynamicGaussians)
 
 ROUNDS = 5
 """Rounds of `prune`; docs/prune.md has what one, ten and twenty reach."""
@@ -70,18 +74,18 @@ class Round:
 
 
 @dataclasses.dataclass(frozen=True)
-class Pruned:
+class Pruned(Generic[_S]):
     """Result of `prune`.
 
     Attributes:
-        gaussians: Those that are left, in their order.
+        gaussians: Those that are left, in their order; of a scene that moves, with what moves them.
         kept: (N,) bool, which of the given ones these are.
         unseen: How many of the given ones change no given view.
         rounds: What each round removed.
         psnr: Mean PSNR of the views before, in dB; None where no images were given.
     """
 
-    gaussians: Gaussians = dataclasses.field(repr=False)
+    gaussians: _S = dataclasses.field(repr=False)
     kept: torch.Tensor = dataclasses.field(repr=False)
     unseen: int
     rounds: tuple[Round, ...]
@@ -89,7 +93,7 @@ class Pruned:
 
 
 def prune(
-    gaussians: Gaussians,
+    gaussians: _S,
     cameras: Camera | Sequence[Camera],
     settings: RenderSettings | None = None,
     *,
@@ -101,13 +105,14 @@ def prune(
     unseen: Unseen = "keep",
     semantics: SemanticMetric | None = None,
     power: float = POWER,
-) -> Pruned:
+) -> Pruned[_S]:
     """Remove the Gaussians that given views need least.
 
         smaller = drgs.prune(g, cameras, keep=0.5).gaussians
 
     Args:
-        gaussians: N Gaussians, world frame; they are not changed.
+        gaussians: N Gaussians, world frame, or a `DynamicGaussians`, whose Gaussians each camera sees at its time;
+            they are not changed.
         cameras: The views, which should show all that matters.
         settings: Default `RenderSettings.preset("fast")`: what it removes costs no more in other renderers than what
             `exact` does, which takes six times as long (docs/prune.md).
@@ -124,7 +129,7 @@ def prune(
         ValueError: If a number is out of range, or the views show nothing of the scene.
     """
     where = "prune"
-    check_gaussians(where, gaussians)
+    check_gaussians(where, gaussians.gaussians if isinstance(gaussians, DynamicGaussians) else gaussians)
     cameras = some_cameras(where, cameras)
     check_amount(where, keep, loss, rounds)
     if unseen not in ("keep", "remove"):
@@ -140,8 +145,8 @@ def prune(
 
 
 def _pruned(
-    gaussians: Gaussians, views: _Views, keep: float | None, loss: float | None, rounds: int, unseen: Unseen
-) -> Pruned:
+    gaussians: _S, views: _Views, keep: float | None, loss: float | None, rounds: int, unseen: Unseen
+) -> Pruned[_S]:
     """`prune`, of arguments that have been checked."""
     start = views.psnr(gaussians)
     left = torch.arange(len(gaussians))
@@ -204,7 +209,7 @@ class _Views:
     power: float
     bar: Bar
 
-    def removal_error(self, gaussians: Gaussians) -> torch.Tensor:
+    def removal_error(self, gaussians: Scene) -> torch.Tensor:
         """(N,) summed over the views."""
         total = torch.zeros(len(gaussians), dtype=torch.float64)
         for camera, mask in zip(self.cameras, self.masks, strict=True):
@@ -212,17 +217,19 @@ class _Views:
             self.bar.advance()
         return total
 
-    def psnr(self, gaussians: Gaussians) -> float | None:
+    def psnr(self, gaussians: Scene) -> float | None:
         """Mean PSNR of the views in dB; None without images."""
         if self.images is None:
             return None
-        seen, found = gaussians.detach().replace(features=None), []
+        found = []
         for camera, target, mask in zip(self.cameras, self.images, self.masks, strict=True):
-            image = render(seen, camera, self.settings, outputs=()).rgb.cpu().clamp(0, 1)
+            with torch.no_grad():  # a measure
+                seen = colors_only(gaussians, camera.time)
+                image = render(seen, camera, self.settings, outputs=()).rgb.cpu().clamp(0, 1)
             found.append(psnr(image, target, mask))
         return float(np.mean(found))
 
-    def most_removed(self, gaussians: Gaussians, left: torch.Tensor, order: torch.Tensor, least: float) -> int:
+    def most_removed(self, gaussians: _S, left: torch.Tensor, order: torch.Tensor, least: float) -> int:
         """How many of `left` may go, in an order, so that the PSNR stays at `least` dB or above: by bisection."""
         low, high = 0, len(order)
         for _ in range(_BISECTIONS):

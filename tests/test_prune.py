@@ -19,12 +19,14 @@ from drgs.cameras import orbit
 from drgs.codecs import load_gaussians
 from drgs.data import load
 from drgs.data.camera_lists import save_cameras_json
+from drgs.deform import FieldConfig
 from drgs.files import save_ply
 from drgs.fitting.components.base import Checkpoint
 from drgs.fitting.components.exposure import ExposureComponent
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import load_frames
 from drgs.fitting.losses import psnr
+from drgs.io.checkpoint import load_state, save_state
 from drgs.pruning import fit_on, prune
 from drgs.settings import RenderSettings
 
@@ -212,6 +214,23 @@ def test_command_on_a_run(place, monkeypatch, capsys):
     assert capsys.readouterr().out == ""
 
 
+def test_command_makes_a_run_of_a_run(place, monkeypatch):
+    """With all that its checkpoint has of each Gaussian, e.g. by the 3D filter; it can be measured."""
+    monkeypatch.chdir(place)
+    config = FitConfig().replace(max_steps=4, max_gaussians=60, filter_3d="on")
+    drgs.fit(load(place / "data"), place / "filtered", config, progress=False)
+    assert cli.main(["prune", "filtered", "--keep", "0.5", "--quiet", "-o", "half/run"]) == 0
+    whole, half = drgs.load_run("filtered").gaussians, drgs.load_run("half/run").gaussians
+    rows = {tuple(mean.tolist()): row for row, mean in enumerate(whole.means)}
+    left = whole.take([rows[tuple(mean.tolist())] for mean in half.means])
+    assert 0 < len(half) < len(whole)
+    assert all(torch.equal(x, half.parameters()[name]) for name, x in left.parameters().items())
+    tensors, _ = load_state(place / "half/run/state.safetensors")
+    assert len(tensors["filter_3d"]) == len(tensors["adam.means.exp_avg"]) == len(half)
+    assert not (place / "half/run/metrics.json").exists()
+    assert cli.main(["eval", "half/run", "--quiet"]) == 0
+
+
 def test_command_on_a_file(place, monkeypatch, capsys):
     """By the photographs of a data set, to a loss; the file that it is of is never replaced."""
     monkeypatch.chdir(place)
@@ -252,6 +271,63 @@ def test_command_with_exposures(place, monkeypatch, capsys):
     views.write_text(views.read_text().replace("images/1.png", "images/strange.png"))
     assert cli.main([*line, "--data", "other"]) == 2
     assert "photographs whose exposure uneven has found" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def moving(place):
+    """A run on the photographs of `data` at three times, with a field that has learned something."""
+    shutil.copytree(place / "data", place / "film")
+    views = json.loads((place / "film/transforms.json").read_text())
+    for number, frame in enumerate(views["frames"]):
+        frame["time"] = number % 3 / 2
+    (place / "film/transforms.json").write_text(json.dumps(views))
+    small = FieldConfig(channels=4, resolution=6, time_resolution=3, levels=(1,), width=16)
+    config = FitConfig(renderers=("fast",)).replace(max_steps=6, max_gaussians=40)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(FieldConfig, "preset", classmethod(lambda cls, name, times=None: small))
+        run = drgs.fit(load(place / "film"), place / "moving", config, progress=False).run
+    tensors, header = load_state(run.state)
+    tensors["parameter.motion"] = torch.where(torch.arange(len(tensors["parameter.motion"])) % 2 == 0, 2.0, -2.0)
+    tensors["deformation.mlp.parameter.means.3.bias"] += 0.2
+    save_state(run.state, tensors, header)
+    return run
+
+
+def test_command_on_what_moves(place, moving, monkeypatch, capsys):
+    """A run folder with fewer Gaussians, which move as they did; never over another run, nor into a file."""
+    monkeypatch.chdir(place)
+    line = ["prune", "moving", "--keep", "0.5", "-o"]
+    assert cli.main([*line, "few"]) == 0
+    record = json.loads((place / "few/prune.json").read_text())
+    assert "of 2 held-out views" in (said := capsys.readouterr().out)
+    assert f"{record['gaussians']['after']} of {record['gaussians']['before']} Gaussians: few" in said
+    whole, few = drgs.load_run("moving"), drgs.load_run("few")
+    assert len(few.gaussians) == record["gaussians"]["after"] < len(whole.gaussians)
+    rows = {tuple(mean.tolist()): row for row, mean in enumerate(whole.gaussians.means)}
+    left = whole.moving.take(torch.tensor([rows[tuple(mean.tolist())] for mean in few.gaussians.means]))
+    for time in (0.0, 0.7):
+        moved = few.moving.at(time)
+        assert not torch.equal(moved.means, few.gaussians.means)
+        assert all(torch.equal(x, moved.parameters()[name]) for name, x in left.at(time).parameters().items())
+    assert few.step == whole.step
+    there = {x.name for x in place.iterdir()}
+    for output, options, word in (
+        ("few", (), "holds a run already; choose another"),
+        ("few.ply", (), "what moves must stay a run"),
+        ("fewer", ("--refit", "3"), "--refit must have a file of Gaussians"),
+    ):
+        assert cli.main([*line, output, "--quiet", *options]) == 2
+        assert word in capsys.readouterr().err
+    assert {x.name for x in place.iterdir()} == there
+
+
+def test_command_by_views_that_show_nothing(place, monkeypatch, capsys):
+    """Exit code 2, and what is wrong with the views."""
+    monkeypatch.chdir(place)
+    save_cameras_json(place / "away.json", orbit((100, 0, 0), 3.0, 5, width=24, height=20))
+    assert cli.main(["prune", "scene.ply", "--data", "away.json", "--keep", "0.5", "-o", "no.ply", "--quiet"]) == 2
+    assert "the 5 given ones show nothing; check that they are of this scene" in capsys.readouterr().err
+    assert not (place / "no.ply").exists()
 
 
 @pytest.mark.parametrize(

@@ -674,7 +674,10 @@ class Prune(Settings, Views, Lenses):
     """Remove the Gaussians that the photographs need least, and say what it costs in every renderer."""
 
     scene: Path = _scene()
-    output: Path = option(help="Output file; its suffix is the format (docs/files.md).", short="o")
+    output: Path = option(
+        help="Output file, whose suffix is the format (docs/files.md); of a run also a folder, for a smaller run.",
+        short="o",
+    )
     data: str | None = option(
         None,
         "Photographs of the scene: a data set or a run, or a cameras.json without any; default those of the run.",

@@ -1,4 +1,4 @@
-"""`drgs prune`: the Gaussians that photographs need, in a file of any format, and what leaving out the others costs."""
+"""`drgs prune`: the Gaussians that photographs need, as a file or a run, and what leaving out the others costs."""
 
 from __future__ import annotations
 
@@ -8,46 +8,53 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drgs.codecs import check_suffix, origin_file, save_gaussians
-from drgs.commands.scene_input import SceneInput
+from drgs.commands.scene_input import SELECTION, SceneInput
 from drgs.commands.viewpoints import Source, check_lenses, warn_of_unseen
 from drgs.display import tables
 from drgs.display.progress import Bar
+from drgs.ellipsoids import Gaussians
 from drgs.fitting.components.base import Checkpoint, Component
 from drgs.fitting.components.exposure import ExposureComponent
+from drgs.fitting.components.poses import CAMERAS
+from drgs.fitting.components.semantics import EMBEDDINGS
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.metrics import TRAIN_VIEWS, through_renderers
-from drgs.fitting.records import fitted_views
+from drgs.fitting.records import fitted_views, is_run, of_some
 from drgs.fitting.renderers import renderers_to_measure
-from drgs.io.checkpoint import load_state, state_header
+from drgs.io.checkpoint import load_state, save_state, state_header
 from drgs.io.journal import SCHEMA
-from drgs.io.outputs import lock_folder, write_json
+from drgs.io.outputs import atomic_write, lock_folder, write_json
 from drgs.io.run import Run
-from drgs.pruning import check_amount, fit_on, prune
+from drgs.pruning import ROUNDS, check_amount, fit_on, prune
 
 if TYPE_CHECKING:
+    import torch
+
     from drgs.cameras import Camera
     from drgs.commands.options import Prune
     from drgs.data import View
-    from drgs.ellipsoids import Gaussians
+    from drgs.ellipsoids import Scene
     from drgs.pruning import Pruned
     from drgs.settings import RenderSettings
 
 __all__ = ["run"]
 
+_COPIED = ("config.json", "env.json", "log.jsonl", SELECTION, EMBEDDINGS, CAMERAS)
+"""Files of a run that hold for it with fewer Gaussians, too."""
+
 
 def run(args: Prune) -> None:
-    """`drgs prune SCENE -o FILE`."""
+    """`drgs prune SCENE -o FILE`, or of a run `-o FOLDER`."""
     settings = args.settings()  # refuses what cannot be, before anything is read, as all up to the lock
     loss = None if args.loss is None else _decibels(args.loss)
     check_amount("prune", args.keep, loss)
-    suffix = check_suffix("prune", args.output)
-    report = args.output.name[: -len(suffix)] + ".json"
-    names = [args.output.name, origin_file(args.output).name, report]
-    with lock_folder(args.output.parent, "prune", names, [args.scene, args.data or ""]):
+    output = _Output.of(args)
+    with lock_folder(output.report.parent, "prune", output.names, [args.scene, args.data or ""]):
         with Bar("reading", show=not args.quiet):
             given = SceneInput.of(args)
-            _check_scene(args, given)
+            _check_scene(args, given, output)
+            checkpoint = _checkpoint(args, given, output)
         settings = given.over_background(settings)
         lenses = given.keeps_lenses(args.undistort)
         views = _Views.of(args, given, lenses)
@@ -58,10 +65,10 @@ def run(args: Prune) -> None:
             )
         check_lenses("prune", settings, views.cameras)
         warn_of_unseen(given.gaussians, views.cameras)
-        exposures = _exposures(args, given, views)
+        exposures = _exposures(args, given, views, checkpoint)
         with Bar("prune", show=not args.quiet):
             pruned = prune(
-                given.gaussians,
+                given.scene,
                 views.cameras,
                 settings,
                 keep=args.keep,
@@ -70,24 +77,24 @@ def run(args: Prune) -> None:
                 masks=None if views.train is None else [frame.mask for frame in views.train],
                 semantics=given.semantics(),
                 unseen=args.unseen,
-                **({} if args.rounds is None else {"rounds": args.rounds}),
+                rounds=args.rounds or ROUNDS,
             )
             if bool(pruned.kept.all()):
                 raise ValueError(
                     f"{args.scene}: something must be left out, but none of its {len(pruned.kept)} Gaussians can go; "
                     "allow more --loss, lower --keep, or say --unseen remove"
                 )
-            stages = {"before": given.gaussians, "pruned": pruned.gaussians}
-            if args.refit and views.train is not None:
+            stages = {"before": given.scene, "pruned": pruned.gaussians}
+            if args.refit and views.train is not None and isinstance(pruned.gaussians, Gaussians):
                 far = int(pruned.kept[: _skybox(given)].sum())
                 config = given.record.config if given.record else _config_over(given)
                 stages["refitted"] = fit_on(pruned.gaussians, views.train, config, args.refit, far, exposures)
             costs = views.measured(stages, given, settings, lenses)
             *_, left = stages.values()
-            save_gaussians(left, args.output)
-            write_json(args.output.with_name(report), _record(args, pruned, views, settings, costs))
+            output.write(left, given, checkpoint, pruned.kept)
+            write_json(output.report, _record(args, pruned, views, settings, costs))
     if not args.quiet:
-        _print(args, pruned, views, costs)
+        _print(args, pruned, views, costs, output)
 
 
 def _decibels(text: str) -> float:
@@ -98,12 +105,80 @@ def _decibels(text: str) -> float:
         raise ValueError(f"--loss must be a number of decibels above 0, e.g. 0.1dB, got {text!r}; correct it") from None
 
 
-def _check_scene(args: Prune, given: SceneInput) -> None:
-    """Raise ValueError where a scene cannot be pruned, or not be fitted on."""
-    if given.moving is not None:
+@dataclasses.dataclass(frozen=True)
+class _Output:
+    """What is written.
+
+    Attributes:
+        scene: A file of Gaussians, or a run folder.
+        report: The JSON file about it.
+        names: All files, in the folder of the report.
+    """
+
+    scene: Path
+    report: Path
+    names: list[str]
+
+    @classmethod
+    def of(cls, args: Prune) -> _Output:
+        """What `-o` names: of a run, a name without a suffix is a run folder.
+
+        Raises:
+            ValueError: If a suffix is no format's, or a folder holds a run already.
+        """
+        path = args.output
+        if not path.suffix and is_run(args.scene):
+            if is_run(path):
+                raise ValueError(f"{path}: must be a new run folder, holds a run already; choose another")
+            return cls(path, path / "prune.json", [*_COPIED, "state.safetensors", "point_cloud.ply", "prune.json"])
+        report = path.with_name(path.name[: -len(check_suffix("prune", path))] + ".json")
+        return cls(path, report, [path.name, origin_file(path).name, report.name])
+
+    @property
+    def is_run(self) -> bool:
+        """Whether it is a run folder."""
+        return self.report.parent == self.scene
+
+    @property
+    def gaussians(self) -> Path:
+        """The file that has them."""
+        return Run(self.scene).state if self.is_run else self.scene
+
+    def write(self, scene: Scene, given: SceneInput, checkpoint: Checkpoint | None, kept: torch.Tensor) -> None:
+        """Write what is left; of a run, its checkpoint and what it says of itself, but nothing that was measured."""
+        if not self.is_run or given.run is None or checkpoint is None:
+            save_gaussians(scene.at(None), self.scene)
+            return
+        run, fewer = Run(self.scene), of_some(checkpoint, kept)
+        for name in _COPIED:
+            if (given.run.path / name).is_file():
+                with atomic_write(run.path / name) as file:
+                    file.write((given.run.path / name).read_bytes())
+        save_state(run.state, dict(fewer.tensors), dict(fewer.header))
+        save_gaussians(given.gaussians.take(kept).replace(features=None), run.point_cloud)
+
+
+def _checkpoint(args: Prune, given: SceneInput, output: _Output) -> Checkpoint | None:
+    """The run's, where something of it beside its Gaussians is needed.
+
+    Raises:
+        FileNotFoundError, ValueError: If it is missing or damaged.
+    """
+    if given.run is None or not (output.is_run or args.refit and "exposure" in given.estimated):
+        return None
+    return Checkpoint(*load_state(given.run.state), str(given.run.state))
+
+
+def _check_scene(args: Prune, given: SceneInput, output: _Output) -> None:
+    """Raise ValueError where a scene cannot be pruned, not be fitted on, or not be written."""
+    if given.moving is not None and not output.is_run:
         raise ValueError(
-            f"{args.scene}: must stand still, as a file holds Gaussians of one time, but moves; "
-            "drgs.fisher.removal_error has the errors, summed over times"
+            f"{args.scene}: what moves must stay a run, since a file holds Gaussians of one time, got -o "
+            f"{args.output}; name a folder, and make files of it by drgs convert --time"
+        )
+    if output.is_run and args.refit:
+        raise ValueError(
+            f"--refit must have a file of Gaussians to write, got the run folder -o {args.output}; leave it out"
         )
     if given.run is None and args.data is None:
         raise ValueError(
@@ -162,7 +237,7 @@ class _Views:
         return cls([frame.camera for frame in seen], seen, held_out, text)
 
     def measured(
-        self, stages: dict[str, Gaussians], given: SceneInput, settings: RenderSettings, lenses: bool
+        self, stages: dict[str, Scene], given: SceneInput, settings: RenderSettings, lenses: bool
     ) -> dict[str, dict[str, float]]:
         """Renderer -> stage -> mean PSNR in dB: of held-out views, or else of some of those that decide; of the object
         where masks or alpha say where it is. Nothing without photographs.
@@ -172,9 +247,9 @@ class _Views:
             return {}
         renderers = renderers_to_measure(("fast",), given.settings("fast"), "all", lenses)
         found: dict[str, dict[str, float]] = {name: {} for name in renderers}
-        for stage, gaussians in stages.items():
+        for stage, scene in stages.items():
             measured: Any = through_renderers(
-                gaussians, frames, renderers, self.measured_split, None if self.held_out else TRAIN_VIEWS
+                scene, frames, renderers, self.measured_split, None if self.held_out else TRAIN_VIEWS
             )
             for row in measured["rows"]:
                 found[row["name"]][stage] = row["mean"].get("psnr_object", row["mean"]["psnr"])
@@ -186,15 +261,14 @@ class _Views:
         return "test" if self.held_out else "train"
 
 
-def _exposures(args: Prune, given: SceneInput, views: _Views) -> list[Component]:
+def _exposures(args: Prune, given: SceneInput, views: _Views, checkpoint: Checkpoint | None) -> list[Component]:
     """The gains by which `--refit` compares photographs, of a run that has found one for each; they stay.
 
     Raises:
         ValueError: If a photograph is none of the run's.
     """
-    if not args.refit or views.train is None or given.run is None or "exposure" not in given.estimated:
+    if not args.refit or views.train is None or checkpoint is None:
         return []
-    checkpoint = Checkpoint(*load_state(given.run.state), str(given.run.state))
     known = checkpoint.header["views"]
     if other := next((frame.name for frame in views.train if frame.name not in known), None):
         raise ValueError(
@@ -238,7 +312,7 @@ def _record(
     }
 
 
-def _print(args: Prune, pruned: Pruned, views: _Views, costs: dict[str, dict[str, float]]) -> None:
+def _print(args: Prune, pruned: Pruned, views: _Views, costs: dict[str, dict[str, float]], output: _Output) -> None:
     """Print what it cost, what no view shows, and where the Gaussians are."""
     stages: Sequence[str] = list(next(iter(costs.values()), {}))
     if costs:
@@ -254,5 +328,5 @@ def _print(args: Prune, pruned: Pruned, views: _Views, costs: dict[str, dict[str
     if pruned.unseen:
         what = "were removed" if args.unseen == "remove" else "are kept (--unseen remove removes them)"
         print(f"{pruned.unseen:,} Gaussians are shown by none of the {len(views.cameras)} training views: they {what}")
-    size = args.output.stat().st_size / 1e6
+    size = output.gaussians.stat().st_size / 1e6
     print(f"{len(pruned.gaussians):,} of {len(pruned.kept):,} Gaussians: {args.output} ({size:.2f} MB)")

@@ -54,6 +54,7 @@ __all__ = [
     "is_fit_config",
     "is_run",
     "load_run",
+    "of_some",
     "pick_seconds",
     "seconds_of",
 ]
@@ -458,6 +459,20 @@ def check_checkpoint(path: Path, tensors: dict[str, torch.Tensor], header: dict)
                 torch.Generator().set_state(tensors[name])
         except RuntimeError:
             raise ValueError(f"{path}: {name} must be a state of torch's generator, is damaged; {advice}") from None
+
+
+def of_some(checkpoint: Checkpoint, kept: torch.Tensor) -> Checkpoint:
+    """A checkpoint with some of its Gaussians; what has no row a Gaussian stays as it is.
+
+    Args:
+        kept: (N,) bool, which these are.
+    """
+    far = int(kept[: checkpoint.header.get("skybox", 0)].sum())
+    header = {name: x for name, x in checkpoint.header.items() if name != "skybox"} | ({"skybox": far} if far else {})
+    kinds = _expected(checkpoint)
+    has_rows = lambda name: name in kinds and kinds[name][0].is_floating_point and kinds[name][1][:1] == kept.shape  # noqa: E731
+    tensors = {name: x[kept] if has_rows(name) else x for name, x in checkpoint.tensors.items()}
+    return dataclasses.replace(checkpoint, tensors=tensors, header=header)
 
 
 def _expected(checkpoint: Checkpoint) -> dict[str, tuple[torch.dtype, tuple[int, ...]]]:
