@@ -64,7 +64,8 @@ class Round:
 
     Attributes:
         removed: How many Gaussians it removed.
-        error: Sum of their errors, each as if it alone were removed: squared color, summed over pixels and channels.
+        error: Sum of their errors (`drgs.fisher.removal_error` of the power that was asked for), each as if it alone
+            were removed.
         psnr: Mean PSNR of the views behind it, in dB; None where no images were given.
     """
 

@@ -42,7 +42,7 @@ _SMALLER = {
     "stress": ["--match", "1 Gaussian"],
     "query": ["--limit", "1", "--threshold", "0"],  # six steps have taught nothing
     "demo": ["--quick"],
-    "prune": ["--rounds", "2", "--refit", "2"],
+    "prune": ["--rounds", "2"],
 }
 
 # Why a command of a page is parsed and not run, and what runs it: by the command's name, or by one of its arguments.
@@ -134,7 +134,9 @@ def smaller(command: list[str]) -> list[str]:
         command = command[:at] + command[at + 2 :]
     if "--panorama" in command:
         return [*command, "--frames", "2", "--width", "24", "--height", "12"]
-    return [*command, *_SMALLER.get(command[0], []), *(["--add", "2", "--every", "2"] if "active" in command else [])]
+    few = ["--add", "2", "--every", "2"] if "active" in command else []
+    few += ["--refit", "2"] if "--refit" in command else []
+    return [*command, *_SMALLER.get(command[0], []), *few]
 
 
 def figures(page: Path) -> list[tuple[str, str]]:
