@@ -1,0 +1,282 @@
+"""Units of the optimizer's steps: held-out PSNR of fits whose tensors are moved by other rules, and of averaged ones.
+
+    python benchmarks/steps.py [--scenes banana ...] [--rules size ...] [--units 3] [--trained fast] [--page]
+
+Appends one row a fit to benchmarks/steps.jsonl as it ends and leaves out what is there, then writes the table of
+docs/real-data.md and docs/data/steps.csv. Rules were tried on CHOOSING, and the one that was best there was then
+measured on SHOWING; fits of a scene take turns, one thread. Rules multiply the steps that Adam has made; `drgs fit` has
+none of them. Seconds are those that the process computed in its steps, whatever ran beside it. Averages over the last
+steps are of the same fits. Made scenes are folders of `--made` (docs/real-data.md has their commands).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+os.environ.setdefault("DRGS_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
+
+import torch  # noqa: E402
+from fits import psnr_by_renderer, split_of  # noqa: E402
+from studies import PAGE_DATA, write_csv  # noqa: E402
+from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
+
+from drgs.data import load  # noqa: E402
+from drgs.ellipsoids import semi_axes  # noqa: E402
+from drgs.fitting.config import FitConfig  # noqa: E402
+from drgs.fitting.frames import frames_for  # noqa: E402
+from drgs.fitting.start import start_plain  # noqa: E402
+from drgs.fitting.trainer import Trainer  # noqa: E402
+from drgs.settings import RenderSettings  # noqa: E402
+from drgs.studies.statistics import Unit, estimate  # noqa: E402
+from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
+
+ROWS = ROOT / "benchmarks" / "steps.jsonl"
+PAGE = ROOT / "docs" / "real-data.md"
+CHOOSING = ("banana", "fern", "office", "still0")
+SHOWING = ("head", "statue", "lego", "bonsai", "street", "room22")
+MADE = ("still0", "room22")
+PATHS = {"street": "street/sparse_dev/0"}
+SIZE = {"max_steps": 300, "max_pixels": 12_000, "max_gaussians": 8_000}
+SEEN = ("fast", "exact", "gsplat")
+WINDOWS = (0.05, 0.1, 0.2)  # shares of the steps, the last ones, that averages are of; density control ends at 0.8
+KEY = ("scene", "rule", "trained", "seed", "offset", *SIZE)
+
+Factors = dict[str, torch.Tensor | float]
+Rule = Callable[[Trainer], Factors]
+"""Tensor -> factor of the step that Adam makes, before the step; tensors that are left out keep Adam's."""
+
+
+def sizes(trainer: Trainer) -> torch.Tensor:
+    """(N,) geometric means of the scales, over their median."""
+    log_sizes = trainer.rows.tensors["log_scales"].detach().mean(1)
+    return (log_sizes - log_sizes[trainer.rows.far :].median()).exp()
+
+
+def means(power: float) -> Rule:
+    """The means, by a power of the size of their Gaussian."""
+    return lambda trainer: {"means": (sizes(trainer) ** power).clamp(1 / 8, 8)[:, None]}
+
+
+def scales(power: float) -> Rule:
+    """Log-scales, likewise."""
+    return lambda trainer: {"log_scales": (sizes(trainer) ** power).clamp(1 / 8, 8)[:, None]}
+
+
+def axes(trainer: Trainer) -> Factors:
+    """The means, along each axis of the Gaussian by its scale: (N, 3, 3) factors."""
+    t = {name: x.detach() for name, x in trainer.rows.tensors.items()}
+    median = t["log_scales"][trainer.rows.far :].mean(1).median()
+    scale = (t["log_scales"] - median).exp().clamp(1 / 8, 8)
+    rotation = semi_axes(t["quats"], torch.ones_like(scale))
+    return {"means": rotation @ (scale[:, :, None] * rotation.transpose(1, 2))}
+
+
+class BySeen:
+    """SH above degree 0, by the share of the photographs that show the mean, over its median."""
+
+    def __init__(self) -> None:
+        self.count, self.factor = 0, torch.ones(0)
+
+    def __call__(self, trainer: Trainer) -> Factors:
+        if self.count != len(trainer.rows):
+            self.count = len(trainer.rows)
+            places = trainer.rows.places().numpy()
+            seen = torch.zeros(self.count)
+            for frame in trainer.frames:
+                pixels, depth = frame.camera.project(places)
+                seen += torch.from_numpy(frame.camera.contains(pixels, depth))
+            self.factor = (seen / seen.median().clamp(min=1)).clamp(1 / 8, 8)
+        return {"sh_rest": self.factor[:, None, None]}
+
+
+def opacity(trainer: Trainer) -> Factors:
+    """Logits, so that opacities move alike: by 0.25 / (o (1 - o)), at most 8."""
+    o = trainer.rows.tensors["logit_opacities"].detach().sigmoid()
+    return {"logit_opacities": (0.25 / (o * (1 - o))).clamp(max=8)}
+
+
+def falling(last: float, *names: str) -> Rule:
+    """Rates that fall to a part `last`, log-linear."""
+    return lambda trainer: {name: last**trainer.part for name in names}
+
+
+def cooled(share: float, *names: str) -> Rule:
+    """Rates that fall to 0 over the last `share` of the steps, linear."""
+    return lambda trainer: {name: min(1.0, (1 - trainer.part) / share) for name in names}
+
+
+REST = ("quats", "log_scales", "logit_opacities", "sh_dc", "sh_rest")
+RULES: dict[str, Callable[[], Rule]] = {
+    "Adam": lambda: lambda trainer: {},
+    "size": lambda: means(1.0),
+    "size^0.5": lambda: means(0.5),
+    "axes": lambda: axes,
+    "scales by size^0.5": lambda: scales(0.5),
+    "scales by size^-0.5": lambda: scales(-0.5),
+    "SH by photographs": BySeen,
+    "opacity": lambda: opacity,
+    "all but means fall to 0.1": lambda: falling(0.1, *REST),
+    "all fall to 0 in the last 0.2": lambda: cooled(0.2, "means", *REST),
+    "all fall to 0 in the last 0.4": lambda: cooled(0.4, "means", *REST),
+}
+
+
+def hooked(trainer: Trainer, rule: Rule) -> None:
+    """Let every step of the optimizer be changed by a rule."""
+    before: dict[str, torch.Tensor] = {}
+    factors: Factors = {}
+
+    def note(*_: object) -> None:
+        factors.clear()
+        factors.update(rule(trainer))
+        before.update({name: trainer.rows.tensors[name].detach().clone() for name in factors})
+
+    def change(*_: object) -> None:
+        with torch.no_grad():
+            for name, factor in factors.items():
+                x = trainer.rows.tensors[name]
+                step = x - before[name]
+                whole = isinstance(factor, torch.Tensor) and factor.dim() == step.dim() + 1
+                x.copy_(before[name] + ((factor @ step[..., None])[..., 0] if whole else factor * step))
+
+    trainer.rows.optimizer.register_step_pre_hook(note)
+    trainer.rows.optimizer.register_step_post_hook(change)
+
+
+def fit(scene: str, rule: str, trained: str, seed: int, offset: int, made: Path) -> list[dict]:
+    """The rows of one fit and of its averages; `made` is the folder of the made scenes."""
+    dataset = load(made / scene if scene in MADE else DATA / PATHS.get(scene, scene))
+    config = FitConfig().replace(
+        renderers=(trained,),
+        seed=seed,
+        test_offset=offset,
+        skybox="off",
+        semantics="ignore",
+        **SIZE,
+    )
+    train, test = split_of(dataset, config)
+    frames = frames_for(train, config.data)
+    trainer = start_plain(dataset, train, frames, config)
+    hooked(trainer, RULES[rule]())
+    sums: dict[float, dict[str, torch.Tensor]] = {}
+    began = time.process_time()
+    for step in range(config.max_steps):
+        trainer.step()
+        for window in WINDOWS:
+            if step >= config.max_steps - round(window * config.max_steps):
+                old = sums.setdefault(window, {})
+                for name, x in trainer.rows.tensors.items():
+                    old[name] = x.detach().double() + old.get(name, 0.0)
+    seconds = time.process_time() - began
+    held_out = frames_for(test, config.data)
+    renderers = {name: RenderSettings.preset(name) for name in SEEN}
+    rows = []
+    for window in (0.0, *WINDOWS):
+        for name, x in sums.get(window, {}).items():
+            trainer.rows.tensors[name].data.copy_(x / round(window * config.max_steps))
+        key = (scene, f"{rule}{f', mean of the last {window:g}' if window else ''}", trained, seed, offset)
+        psnr = psnr_by_renderer(trainer.gaussians(), held_out, renderers if not window else {"fast": renderers["fast"]})
+        rows.append({**dict(zip(KEY, (*key, *SIZE.values()), strict=True)), "psnr": psnr, "seconds": seconds, **ran()})
+    return rows
+
+
+Gains = dict[Unit, float]
+"""Unit -> what a rule adds to Adam, dB."""
+
+
+def gains(rows: list[dict], rule: str, trained: str, scenes: Sequence[str], seen: str) -> tuple[Gains, Gains]:
+    """Of the mean, and of the worst held-out view, where both were fitted."""
+    found: tuple[Gains, Gains] = ({}, {})
+    for row in rows:
+        other = next((x for x in rows if all(x[k] == (row | {"rule": "Adam"})[k] for k in KEY)), None)
+        if (row["rule"], row["trained"]) != (rule, trained) or row["scene"] not in scenes or other is None:
+            continue
+        if seen not in row["psnr"]:
+            continue
+        unit = (row["scene"], (8, row["offset"]), (str(row["seed"]),))
+        now, before = row["psnr"][seen], other["psnr"][seen]
+        found[0][unit] = statistics.mean(now) - statistics.mean(before)
+        found[1][unit] = min(now) - min(before)
+    return found
+
+
+def lines(rows: list[dict], rule: str, trained: str, scenes: Sequence[str]) -> list[str]:
+    """Cells of a line: units, and what a rule adds in each renderer, with the interval over several scenes."""
+    cells: list[str] = []
+    for seen in SEEN:
+        mean, worst = gains(rows, rule, trained, scenes, seen)
+        if not mean:
+            cells.append("")
+            continue
+        effect = estimate(mean)
+        cells.append(f"{effect.mean:+.2f} / {estimate(worst).mean:+.2f}")
+        if effect.scenes > 1:
+            cells[-1] += f" [{effect.low:+.2f}, {effect.high:+.2f}]"
+        if seen == SEEN[0]:
+            cells.insert(0, str(effect.units))
+    return cells
+
+
+def took_of(rows: list[dict], rule: str, trained: str, scene: str) -> float:
+    """Seconds of a fit, the mean."""
+    same = [row for row in rows if (row["rule"], row["trained"], row["scene"]) == (rule, trained, scene)]
+    return statistics.mean(row["seconds"] for row in same)
+
+
+def write_page(rows: list[dict]) -> None:
+    """The page's table of the rule that was best, and the data file of all."""
+    table = []
+    for trained, told in (("fast", "`fast`"), ("any", "all")):
+        for half, scenes in (("tried on", CHOOSING), ("shown on", SHOWING)):
+            own = [scene for scene in scenes if gains(rows, "size", trained, [scene], "fast")[0]]
+            table += [[told, scene, *lines(rows, "size", trained, [scene])] for scene in own]
+            if len(own) > 1:
+                table.append([told, f"**{half} these {len(own)}**", *lines(rows, "size", trained, own)])
+    heads = ["fitted for", "capture", "fits", *(f"`{seen}`" for seen in SEEN)]
+    fill_between(PAGE, "steps", markdown_table(heads, table))
+    everything = [["rule", "trained", "scene", "fits", *(f"{seen}: mean / worst, dB" for seen in SEEN), "time"]]
+    for trained in sorted({row["trained"] for row in rows}, reverse=True):
+        for rule in dict.fromkeys(row["rule"] for row in rows if row["rule"] != "Adam"):
+            for scene in (*CHOOSING, *SHOWING):
+                if gains(rows, rule, trained, [scene], "fast")[0]:
+                    took = f"{took_of(rows, rule, trained, scene) / took_of(rows, 'Adam', trained, scene):.2f}"
+                    everything.append([rule, trained, scene, *lines(rows, rule, trained, [scene]), took])
+    write_csv(PAGE_DATA / "steps.csv", everything)
+
+
+def main() -> None:
+    """The program."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", default=list(CHOOSING), help="names of captures")
+    parser.add_argument("--rules", nargs="+", choices=RULES, default=list(RULES))
+    parser.add_argument("--units", type=int, default=1, help="seeds, each with other views held out")
+    parser.add_argument("--trained", default="fast", help="as `drgs fit --for` takes it")
+    parser.add_argument("--made", type=Path, default=ROOT / "runs" / "made", help="folder of the made scenes")
+    parser.add_argument("--page", action="store_true", help="fit nothing, write the table of the rows that there are")
+    args = parser.parse_args()
+    for unit, (seed, offset) in enumerate(UNITS[: args.units]):
+        for scene in [] if args.page else args.scenes:
+            for rule in args.rules if unit % 2 == 0 else args.rules[::-1]:
+                done = {tuple(row[name] for name in KEY) for row in read_rows(ROWS)}
+                if (scene, rule, args.trained, seed, offset, *SIZE.values()) in done:
+                    continue
+                rows = fit(scene, rule, args.trained, seed, offset, args.made)
+                for row in rows:
+                    add_row(ROWS, row)
+                mean = [sum(row["psnr"]["fast"]) / len(row["psnr"]["fast"]) for row in rows]
+                print(scene, seed, rule, *(f"{x:.2f}" for x in mean), f"{rows[0]['seconds']:.1f} s", flush=True)
+    write_page(read_rows(ROWS))
+
+
+if __name__ == "__main__":
+    main()
