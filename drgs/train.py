@@ -38,6 +38,7 @@ from drgs.fitting.config import (
     SavingConfig,
     SelectionConfig,
 )
+from drgs.fitting.errors import fit_errors, is_cheap
 from drgs.fitting.frames import Frame, frames_for, warn_of_late_cameras
 from drgs.fitting.records import config_record, pick_seconds, seconds_of
 from drgs.fitting.renderers import renderers_to_measure
@@ -263,6 +264,7 @@ def _result_of(loop: _Loop) -> FitResult:
         **chosen,
         **reported,
     )
+    loop.record_errors()
     # `drgs eval` writes other metrics.json, without what only the fit can say.
     memory = peak_memory()
     run.log("done", step=trainer.step_index, seconds=loop.seconds, mean=written["mean"], peak_memory=memory, **reported)
@@ -341,6 +343,7 @@ class _Loop:
         self._psnr: float | None = None  # of the last steps
         self._saved: tuple[int, int] | None = None  # steps and views of the last checkpoint
         self._saved_at = time.monotonic()
+        self._recorded = trainer.step_index  # steps at the last record of errors
 
     def measured(self, pictures: Path | None = None) -> dict:
         """Metrics of the held-out views as things are now; `pictures` as of `drgs.fitting.metrics.evaluate`."""
@@ -406,6 +409,9 @@ class _Loop:
                 is_due = late or done % config.saving.save_every == 0
                 if done >= trainer.config.max_steps or is_due and trainer.is_sound:
                     self.save()
+                    if done < trainer.config.max_steps and is_cheap(trainer, done - self._recorded):
+                        with interrupts.at_once():
+                            self.record_errors()
                 if done % preview_every == 0:
                     self._preview(bar, is_interrupted)
             self.save()  # of a fit that went on from its last step
@@ -430,6 +436,14 @@ class _Loop:
         save_ply(self.trainer.gaussians(), self.run_folder.point_cloud)
         self._saved = now
         self._saved_at = time.monotonic()
+
+    def record_errors(self) -> None:
+        """What the photographs say about the errors of the scene as it is now, for those who look at the run."""
+        began = time.perf_counter()
+        done = self.trainer.step_index
+        found = fit_errors(self.run_folder, self.trainer, done - self._recorded)
+        self._recorded = done
+        self.run_folder.log("errors", step=done, **found, seconds=time.perf_counter() - began)
 
     def _pick(self, plan: ActiveViews, bar: Bar) -> None:
         """Choose one more view, and add its photograph and points to the fit."""

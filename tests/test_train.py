@@ -85,7 +85,7 @@ def test_fit_improves_and_leaves_a_complete_run(dataset, tmp_path):
     names = {p.name for p in run.path.iterdir()}
     assert names == {
         "config.json", "env.json", "log.jsonl", "metrics.json", "state.safetensors", "state.previous.safetensors",
-        "point_cloud.ply", "renders", ".drgs.jsonl",
+        "point_cloud.ply", "errors.safetensors", "renders", ".drgs.jsonl",
     }  # fmt: skip
     events = run.events()
     train = [e for e in events if e["event"] == "train"]

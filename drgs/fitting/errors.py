@@ -1,7 +1,14 @@
-"""What the photographs of a run say about the errors of its scene."""
+"""What the photographs of a run say about the errors of its scene, and the file of the run folder that keeps it.
+
+A fit writes the record beside its checkpoint, of photographs that it has decoded anyway, so that maps of the expected
+error need none of them. It belongs to one scene: the file has a hash of every parameter, and one of other Gaussians,
+settings or fewer photographs than are asked for is not taken, but made anew.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import logging
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,16 +18,27 @@ from drgs.display.progress import Bar
 from drgs.fitting.components.exposure import NETWORK
 from drgs.fitting.frames import frames_for, load_dataset
 from drgs.fitting.records import fitted_views, load_run
-from drgs.information.expected_error import error_record
+from drgs.fitting.resume import lock_run
+from drgs.information.expected_error import ErrorRecord, error_record
+from drgs.io.checkpoint import load_state, save_state
+from drgs.io.json_files import check_json
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from drgs.data import Dataset
+    from drgs.ellipsoids import Scene
     from drgs.fitting.frames import Frame
-    from drgs.information.expected_error import ErrorRecord
+    from drgs.fitting.trainer import Trainer
     from drgs.io.run import Run
     from drgs.settings import RenderSettings
 
-__all__ = ["run_error_record"]
+__all__ = ["fit_errors", "is_cheap", "run_error_record", "saved_error_record"]
+
+_HEADER = {"scene": str, "photographs": int, "pixels": int, "views": int, "settings": dict, "length": float}
+_STEPS_A_PHOTOGRAPH = 40  # steps of a fit for which a record may look at one photograph more: its time is that of two
+_FEWEST = 24  # photographs of any record, or all there are: as many as a report looks at
+_log = logging.getLogger(__name__)
 
 
 def run_error_record(
@@ -31,6 +49,9 @@ def run_error_record(
     dataset: Dataset | None = None,
 ) -> ErrorRecord:
     """The record of a run's scene and of the photographs that it was fitted to, at the poses that the fit has found.
+
+    It is read from the run folder. Where there is none of this scene with these settings it is made of the photographs,
+    and kept there, unless another process writes into the folder.
 
     Where the fit has estimated exposure, photographs are as all of them would be with the mean exposure, in which the
     scene is shown.
@@ -46,22 +67,120 @@ def run_error_record(
     """
     loaded = load_run(run)
     config = loaded.record.config
+    pixels = max_pixels or config.data.max_pixels
+    names = fitted_views(run, loaded.record)
+    rows = _evenly(len(names), most)
+    if (saved := saved_error_record(run, loaded.scene, settings, pixels, len(rows))) is not None:
+        return saved
     if dataset is None:
         dataset = load_dataset(loaded.record.data, config, lazy=True, points=False, semantics=False)
     views = {view.name: view for view in loaded.record.with_refined_poses(dataset).views}
-    names = fitted_views(run, loaded.record)
     if missing := [name for name in names if name not in views]:
         raise ValueError(f"{loaded.record.data}: must still hold photograph {missing[0]!r}, it is gone; restore it")
-    count = len(names) if most is None else min(most, len(names))
-    rows = np.linspace(0, len(names) - 1, count).round().astype(int).tolist()
-    frames = frames_for([views[names[row]] for row in rows], config.data, max_pixels)
+    frames = frames_for([views[names[row]] for row in rows], config.data, pixels)
     gains = loaded.networks.get(NETWORK, {}).get("log_gains")
-    images = [_as_shown(frame, None if gains is None else gains[row]) for row, frame in zip(rows, frames, strict=True)]
-    masks = [frame.mask for frame in frames]
-    cameras = [frame.camera for frame in frames]
+    record = _record_of(loaded.scene, frames, rows, len(names), settings, gains)
+    try:
+        with lock_run(run, "errors"):
+            _save(run, loaded.scene, record, len(rows), pixels)
+    except (OSError, ValueError) as error:
+        _log.info("%s; the record of the errors is not kept", str(error).partition(";")[0])
+    return record
+
+
+def saved_error_record(
+    run: Run, scene: Scene, settings: RenderSettings, max_pixels: int, photographs: int
+) -> ErrorRecord | None:
+    """The record that a run folder holds, if it is of this scene; None where there is none.
+
+    Args:
+        run: The run folder.
+        scene: The scene that it must be of.
+        settings, max_pixels: Settings of the renderer, and pixels of a photograph at most, that it must be of.
+        photographs: How many it must be of at least.
+    """
+    try:
+        tensors, header = load_state(run.errors)
+        check_json(str(run.errors), header, _HEADER, "it is made anew")
+        if header["photographs"] < photographs or header["pixels"] != max_pixels or header["scene"] != _digest(scene):
+            return None
+        record = ErrorRecord.from_state(tensors, header)
+    except FileNotFoundError:
+        return None
+    except (ValueError, KeyError, TypeError) as error:
+        _log.warning("%s: must be a record of errors, is damaged (%s); it is made anew", run.errors, error)
+        return None
+    return record if record.settings == settings else None
+
+
+def fit_errors(run: Run, trainer: Trainer, steps: int) -> dict[str, float]:
+    """Write the record of a fit's scene as it is now; what the log says of it.
+
+    Args:
+        run: The run folder, which the fit has locked.
+        trainer: The fit.
+        steps: How many steps have passed since the last record: as these grow, more photographs are looked at.
+    """
+    frames, scene, config = trainer.photographs(), trainer.scene(), trainer.config
+    rows = _evenly(len(frames), max(_FEWEST, steps // _STEPS_A_PHOTOGRAPH))
+    exposure = trainer.network(NETWORK)
+    gains = None if exposure is None else exposure.state_dict()["log_gains"]
+    record = _record_of(scene, [frames[row] for row in rows], rows, len(frames), config.settings, gains)
+    _save(run, scene, record, len(rows), config.data.max_pixels)
+    return {"photographs": len(rows), "misfit": record.mean_misfit**0.5}
+
+
+def is_cheap(trainer: Trainer, steps: int) -> bool:
+    """Whether a record on the way, so many steps after the last one, takes little time beside these."""
+    return steps >= _STEPS_A_PHOTOGRAPH * min(_FEWEST, len(trainer.frames))
+
+
+def _evenly(count: int, most: int | None) -> list[int]:
+    """Numbers of at most so many of `count` photographs, evenly spaced."""
+    return np.linspace(0, count - 1, count if most is None else min(most, count)).round().astype(int).tolist()
+
+
+def _record_of(
+    scene: Scene,
+    frames: Sequence[Frame],
+    rows: Sequence[int],
+    count: int,
+    settings: RenderSettings,
+    log_gains: torch.Tensor | None,
+) -> ErrorRecord:
+    """The record of some photographs of a fit, which stand for all.
+
+    Args:
+        scene: The scene.
+        frames: The photographs.
+        rows: Number of each among all.
+        count: How many there are.
+        settings: Settings of the renderer.
+        log_gains: (count, 3) log gains that the fit has estimated; None: it has estimated none.
+    """
+    images = [_as_shown(x, None if log_gains is None else log_gains[i]) for i, x in zip(rows, frames, strict=True)]
+    masks, cameras = [frame.mask for frame in frames], [frame.camera for frame in frames]
     with Bar("residuals", len(frames)) as bar:
-        record = error_record(loaded.scene, cameras, images, settings, masks=masks, advance=bar.advance)
-    return record if count == len(names) else record.times(len(names) / count)
+        record = error_record(scene, cameras, images, settings, masks=masks, advance=bar.advance)
+    return record if count == len(frames) else record.times(count / len(frames))
+
+
+def _save(run: Run, scene: Scene, record: ErrorRecord, photographs: int, max_pixels: int) -> None:
+    """Write a record into its run folder; information in float32, as it was computed of each view."""
+    tensors, header = record.to_state()
+    tensors = {name: x.float() if name.startswith("information.") else x for name, x in tensors.items()}
+    header |= {"scene": _digest(scene), "photographs": photographs, "pixels": max_pixels}
+    save_state(run.errors, tensors, header)
+
+
+def _digest(scene: Scene) -> str:
+    """A hash of all parameters of a scene."""
+    digest = hashlib.blake2b(digest_size=16)
+    for name, x in sorted(scene.parameters().items()):
+        values = x.detach().cpu().contiguous().numpy()
+        digest.update(f"{name} {values.dtype.str} {values.shape}".encode())
+        digest.update(values.data if values.size else b"")
+    return digest.hexdigest()
 
 
 def _as_shown(frame: Frame, log_gain: torch.Tensor | None) -> torch.Tensor:

@@ -33,6 +33,7 @@ FILES = (
     EMBEDDINGS,
     CAMERAS,
     "point_cloud.ply",
+    "errors.safetensors",
     "report.html",
     *_CHECKPOINTS,
 )

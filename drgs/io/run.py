@@ -19,7 +19,8 @@ selection under `active`; of version 2 they are nested by subject."""
 
 
 class Run:
-    """A run folder: `config.json`, `env.json`, `log.jsonl`, `metrics.json`, the checkpoint, the PLY and `renders/`.
+    """A run folder: `config.json`, `env.json`, `log.jsonl`, `metrics.json`, the checkpoint, the PLY, the
+    record of its errors and `renders/`.
 
     Attributes:
         path: The folder; made by `start`.
@@ -37,6 +38,11 @@ class Run:
     def point_cloud(self) -> Path:
         """The Gaussians, as a 3DGS PLY."""
         return self.path / "point_cloud.ply"
+
+    @property
+    def errors(self) -> Path:
+        """What the photographs say about the errors of the scene (`drgs.fitting.errors`)."""
+        return self.path / "errors.safetensors"
 
     @property
     def renders(self) -> Path:
