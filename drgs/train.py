@@ -264,7 +264,7 @@ def _result_of(loop: _Loop) -> FitResult:
         **chosen,
         **reported,
     )
-    loop.record_errors()
+    loop.record_errors(trainer.step_index)
     # `drgs eval` writes other metrics.json, without what only the fit can say.
     memory = peak_memory()
     run.log("done", step=trainer.step_index, seconds=loop.seconds, mean=written["mean"], peak_memory=memory, **reported)
@@ -411,7 +411,7 @@ class _Loop:
                     self.save()
                     if done < trainer.config.max_steps and is_cheap(trainer, done - self._recorded):
                         with interrupts.at_once():
-                            self.record_errors()
+                            self.record_errors(done - self._recorded)
                 if done % preview_every == 0:
                     self._preview(bar, is_interrupted)
             self.save()  # of a fit that went on from its last step
@@ -437,13 +437,14 @@ class _Loop:
         self._saved = now
         self._saved_at = time.monotonic()
 
-    def record_errors(self) -> None:
-        """What the photographs say about the errors of the scene as it is now, for those who look at the run."""
+    def record_errors(self, steps: int) -> None:
+        """What photographs say about the errors of the scene as it is now, for those who look at the run; `steps` as
+        of `fit_errors`.
+        """
         began = time.perf_counter()
-        done = self.trainer.step_index
-        found = fit_errors(self.run_folder, self.trainer, done - self._recorded)
-        self._recorded = done
-        self.run_folder.log("errors", step=done, **found, seconds=time.perf_counter() - began)
+        found = fit_errors(self.run_folder, self.trainer, steps)
+        self._recorded = self.trainer.step_index
+        self.run_folder.log("errors", step=self._recorded, **found, seconds=time.perf_counter() - began)
 
     def _pick(self, plan: ActiveViews, bar: Bar) -> None:
         """Choose one more view, and add its photograph and points to the fit."""

@@ -15,6 +15,7 @@ from test_active import SIZE, config, lazily, plan, write_still
 
 from drgs import cli, fisher
 from drgs.cameras import Camera, look_at, orbit
+from drgs.cameras.sizes import at_most
 from drgs.commands.fisher import map_weights
 from drgs.commands.frames import _moved, in_frame_of_data
 from drgs.data import load
@@ -22,10 +23,10 @@ from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.display.pictures import map_picture
 from drgs.files import load_ply, load_state, save_ply
 from drgs.fitting.errors import _as_shown, run_error_record
-from drgs.fitting.frames import Frame
+from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.records import load_run
 from drgs.gain import Prior, unit_length
-from drgs.information.expected_error import expected_error
+from drgs.information.expected_error import error_record, expected_error
 from drgs.integrator import render
 from drgs.io.run import Run
 from drgs.settings import RenderSettings
@@ -70,7 +71,7 @@ def test_information_of_a_run(place, monkeypatch, capsys):
     assert "pose" not in text
 
 
-def test_expected_error_of_a_run(place, monkeypatch, capsys):
+def test_expected_error_of_a_run(place, monkeypatch, capsys, caplog):
     """Of a run, the first map of a view is its expected error, told first; without photographs it is left out."""
     report, text = run("run --limit 2 --preset fast --blocks geometry", place, monkeypatch, capsys)
     record = run_error_record(Run(place / "run"), RenderSettings.preset("fast"), report["pixels"])
@@ -88,6 +89,27 @@ def test_expected_error_of_a_run(place, monkeypatch, capsys):
     assert report["misfit"] is None
     assert "error" not in report["views"][0]
     assert "expected error" not in text
+    assert caplog.text.count("cameras.json: has cameras without photographs, so that information alone is told") == 1
+
+
+def test_expected_error_of_a_splat(place, monkeypatch, capsys, caplog):
+    """Of a file of Gaussians with the photographs of a data set, or those of a run, as of the run itself."""
+    settings = "--limit 2 --preset fast --blocks geometry --info-pixels 300"
+    splat = "scene.ply --cameras cameras.json --train"
+    g, views = load_ply(place / "scene.ply"), load(place / "data").views
+    for train in ("data", "run"):
+        report, text = run(f"{splat} {train} {settings}", place, monkeypatch, capsys)
+        known = [view for view in views if view.name in report["known"]["names"]]
+        frames = load_frames(known, 300)
+        images, masks = [x.image() for x in frames], [x.mask for x in frames]
+        record = error_record(g, [x.camera for x in frames], images, RenderSettings.preset("fast"), masks=masks)
+        assert report["misfit"] == pytest.approx(record.mean_misfit**0.5, rel=1e-4)
+        camera = at_most(load_cameras_json(place / "cameras.json")[0], 300)
+        told = float(expected_error(g, camera, record).mean().sqrt())
+        assert report["views"][0]["error"]["rmse"] == pytest.approx(told, rel=1e-3)
+        assert text.startswith("expected error")
+    assert len(known) < len(views)  # a run has not seen all
+    assert "without photographs" not in caplog.text
 
 
 def test_photographs_without_their_exposure():

@@ -104,12 +104,12 @@ def test_what_is_not_of_this_scene_is_made_anew(run, fitted, decoded, caplog, ch
 
 
 def test_other_settings_and_sizes_are_made_anew(run, decoded):
-    """The record of the fit is not theirs; theirs is kept then."""
+    """The record of the fit is not theirs, and stays."""
     settings = FAST.replace(background=(1.0, 0.0, 0.0))
     assert run_error_record(run, settings).settings == settings
     run_error_record(run, FAST, max_pixels=100)
     assert decoded == [6, 6]
-    run_error_record(run, FAST, max_pixels=100)
+    assert run_error_record(run, FAST).settings == FAST
     assert decoded == [6, 6]
 
 

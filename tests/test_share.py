@@ -26,9 +26,12 @@ from drgs.codecs.clustering import morton_order
 from drgs.codecs.sog import load_sog
 from drgs.commands.options import Share
 from drgs.commands.share import shared_of
+from drgs.fitting.errors import run_error_record
+from drgs.fitting.records import load_run
+from drgs.io.run import Run
 from drgs.pages.sharing import npm
 from drgs.pages.sharing.gaussians import archive_of
-from drgs.pages.sharing.layers import uncertainty_layer
+from drgs.pages.sharing.layers import GaussianScale, scale_layer
 from drgs.pages.sharing.placing import upright_matrix
 
 
@@ -198,9 +201,32 @@ def test_the_page_is_told_of_a_run(viewer, place, tmp_path):  # noqa: F811
     assert kinds[scene["first"]] == "fitted"
     turn = np.array(scene["upright"]).reshape(4, 4).T[:3, :3]
     np.testing.assert_allclose(turn @ shared.up, [0, 1, 0], atol=1e-6)
-    assert len(part(path, "part", "uncertainty")) == len(shared.gaussians)
-    assert 0 < scene["uncertainty"]["low"] < scene["uncertainty"]["high"]
+    levels = np.frombuffer(part(path, "part", "scale"), np.uint8)
+    assert scene["scale"]["name"] == "error"
+    record = run_error_record(Run(place / "run"), load_run(place / "run").record.config.settings)
+    values = record.of_gaussians.sqrt().numpy()[morton_order(shared.gaussians.means.numpy())]
+    assert (np.diff(levels[np.argsort(values)].astype(int)) >= 0).all()
+    assert values.min() * 0.999 < scene["scale"]["low"] < scene["scale"]["high"] < values.max() * 1.001
     path.unlink()
+
+
+def test_without_photographs_a_page_has_what_cameras_leave_uncertain(viewer, place, tmp_path, caplog):  # noqa: F811
+    """Of a splat with the photographs of a data set, the expected error; with cameras alone, the uncertainty; and a run
+    whose photographs are gone has its record."""
+    named = {}
+    for train in ("data", "cameras.json"):
+        path = tmp_path / f"{train}.html"
+        words = [str(place / "scene.ply"), "--train", str(place / train), "-o", str(path), "--quiet"]
+        assert cli.main(["share", *words]) == 0
+        named[train] = told(path)["scale"]["name"]
+    assert named == {"data": "error", "cameras.json": "uncertainty"}
+    shutil.copytree(place / "run", tmp_path / "run")
+    config = json.loads((tmp_path / "run/config.json").read_text())
+    (tmp_path / "run/config.json").write_text(json.dumps(config | {"data": str(tmp_path / "gone")}))
+    assert shared_of(Share(scene=tmp_path / "run")).scale.name == "error"
+    (tmp_path / "run/errors.safetensors").unlink()
+    assert shared_of(Share(scene=tmp_path / "run")).scale is None
+    assert "the page goes without the expected error" in caplog.text
 
 
 def test_photographs_to_take_next(viewer, place, tmp_path):  # noqa: F811
@@ -215,7 +241,7 @@ def test_photographs_to_take_next(viewer, place, tmp_path):  # noqa: F811
     following = [photo["name"] for photo in scene["photos"] if photo["kind"] == "next"]
     assert following == [f"{k}. {name}" for k, name in enumerate(names, 1)]
     assert scene["photos"][scene["first"]]["kind"] == "fitted"
-    assert "uncertainty" not in scene
+    assert "scale" not in scene
 
 
 def test_what_does_not_carry_over_is_said(viewer, labelled_run, tmp_path, caplog):  # noqa: F811
@@ -241,17 +267,17 @@ def test_classes_of_a_run(viewer, labelled_run, tmp_path):  # noqa: F811
     np.testing.assert_array_equal(np.frombuffer(part(path, "part", "classes"), "<u2"), labels[order])
 
 
-def test_scale_of_uncertainty():
+def test_scale_of_a_layer():
     """Levels rise with the value, over three decades at most; one value alone has a scale, too."""
     values = np.geomspace(1e-6, 1.0, 1000)
-    known, levels = uncertainty_layer(values)
+    known, levels = scale_layer(GaussianScale("error", "", values), np.arange(1000))
     levels = np.frombuffer(levels, np.uint8)
     assert (np.diff(levels.astype(int)) >= 0).all()
     assert levels[0] == 0
     assert levels[-1] == 255
     assert known["high"] / known["low"] == pytest.approx(1e3)
     assert len(known["colors"]) == 256
-    assert uncertainty_layer(np.full(5, 0.1))[0]["low"] < 0.11
+    assert scale_layer(GaussianScale("error", "", np.full(5, 0.1)), np.arange(5))[0]["low"] < 0.11
 
 
 @pytest.mark.parametrize("up", [(0, -1, 0), (0, 0, 1), (0, 1, 0), (0.6, 0, 0.8)])

@@ -18,6 +18,7 @@ from drgs.codecs import load_gaussians
 from drgs.codecs.sog import encode_sog
 from drgs.integrator import render
 from drgs.pages.sharing import npm
+from drgs.pages.sharing.layers import GaussianScale
 from drgs.pages.sharing.write import Shared, write_page
 from drgs.settings import RenderSettings
 
@@ -123,8 +124,8 @@ def test_classes_and_layers(shown, tmp_path):
     g = blobs(400, 1)
     labels = np.where(g.means[:, 0].numpy() < 0, 1, 2)
     classes = {"names": ["left", "right"], "colors": [[0, 0, 0], [255, 0, 0], [0, 0, 255]]}, labels
-    uncertainty = np.geomspace(1e-3, 1e-1, len(g))
-    write_page(shared(g, classes=classes, uncertainty=uncertainty), tmp_path / "x.html")
+    scale = GaussianScale("error", "a number of 1", np.geomspace(1e-3, 1e-1, len(g)))
+    write_page(shared(g, classes=classes, scale=scale), tmp_path / "x.html")
     page = shown(tmp_path / "x.html", "photo=a", 1200, 400)
     clip = {"x": 500, "y": 0, "width": 600, "height": 400}  # beside the panel
 
@@ -147,8 +148,8 @@ def test_classes_and_layers(shown, tmp_path):
     assert (blue[drawn][:, 0] < 0.25).all()  # nothing of the red class
     box.check()
     assert (seen()[..., 0] > 0.6).any()
-    layer.select_option("uncertainty")
-    assert page.get_by_text("in scene units").is_visible()
+    layer.select_option("error")
+    assert page.get_by_text("a number of 1").is_visible()
     layer.select_option("colors")
     np.testing.assert_array_equal(seen(), everything)
 

@@ -1,6 +1,6 @@
-"""`drgs fisher`: where a run is wrong, information of known views about every Gaussian, and maps of both.
+"""`drgs fisher`: where a scene is wrong, information of known views about every Gaussian, and maps of both.
 
-Of a run whose photographs are there, the first map of a view is the error that is expected of each pixel, in units of
+Where the known views have photographs, the first map of a view is the error that is expected of each pixel, in units of
 color (`drgs.expected_error`). Two more are sums over the parameters k of squared derivatives J_pk of a pixel p, with H
 the information of the known views and Hc that of the view itself:
 
@@ -18,6 +18,7 @@ there is a map of each beside that of all, whose sum it is a part of.
 from __future__ import annotations
 
 import dataclasses
+import logging
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,7 +33,8 @@ from drgs.commands.viewpoints import check_lenses, evenly, known_views, views_to
 from drgs.data.camera_lists import camera_to_json
 from drgs.display import pictures, tables
 from drgs.display.progress import Bar
-from drgs.fitting.errors import run_error_record
+from drgs.fitting.config import FitConfig
+from drgs.fitting.errors import error_record_of_views, run_error_record
 from drgs.gain import Information, Prior, check, information_gain, variances
 from drgs.information.blocks import MAP_PRIOR, SceneBlocks
 from drgs.information.expected_error import PARTS, error_parts
@@ -60,6 +62,7 @@ __all__ = ["InformationMaps", "KINDS", "map_weights", "run"]
 
 
 KINDS = ("variance", "share")  # of maps
+_log = logging.getLogger(__name__)
 
 
 def run(args: Fisher) -> None:
@@ -88,12 +91,27 @@ def run(args: Fisher) -> None:
     check_lenses("fisher", settings, [*known.cameras, *views])
     scoring = given.scoring(args.scoring, settings)
     with Bar("information", len(known.cameras) + len(views), not args.quiet) as bar:
-        is_photographed = args.train is None and given.run is not None
-        errors = run_error_record(given.run, settings, known.pixels) if is_photographed else None
+        errors = _errors(args, given, known, settings)
         maps = InformationMaps(args.scene, given, scoring, prior, known, views, source, args.pose, args.maps, errors)
         groups, rows = maps.write(output, bar.advance)
     if not args.quiet:
         _print(args, known, groups, rows, source)
+
+
+def _errors(args: Fisher, given: SceneInput, known: Known, settings: RenderSettings) -> ErrorRecord | None:
+    """What the photographs of the known views say about errors; None, with a line, where there are none."""
+    if args.train is None and given.run is not None:
+        return run_error_record(given.run, settings, known.pixels)
+    if not known.views:
+        _log.warning(
+            "%s: has cameras without photographs, so that information alone is told, and no expected error, whose "
+            "misfit they show; name a data set by --train",
+            known.source,
+        )
+        return None
+    config = FitConfig() if given.record is None else given.record.config
+    data = config.data.replace(undistort="off" if known.lenses else "on")
+    return error_record_of_views(given.scene, list(known.views), settings, data, known.pixels)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -537,7 +537,7 @@ class Share(Views, Common):
     )
     train: str | None = option(
         None,
-        "Training views of a file of Gaussians, for the page's cameras and uncertainty: a data set, a run, a "
+        "Training views of a file of Gaussians, for the page's cameras and expected error: a data set, a run, a "
         "cameras.json.",
         heading="Views",
     )
@@ -547,7 +547,7 @@ class Share(Views, Common):
         heading="Views",
     )
     uncertainty: bool = option(
-        True, "Add a layer of the uncertainty that the photographs leave, unless --no-uncertainty is given."
+        True, "Add a layer of the expected error (docs/uncertainty.md), unless --no-uncertainty is given."
     )
     moments: int = option(
         12, "Dynamic scenes: number of times to store; the page interpolates linearly between them.", within=(2, 200)
@@ -592,7 +592,7 @@ class Select(ComparedViews, Workers):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Fisher(ComparedViews):
-    """Write where a run is wrong, the Fisher information of training views about every Gaussian, and maps of both."""
+    """Write where a scene is wrong, the Fisher information of training views about every Gaussian, and maps of both."""
 
     cameras: str | None = option(
         None,

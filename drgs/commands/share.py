@@ -89,14 +89,15 @@ def shared_of(args: Share) -> Shared:
             raise ValueError(
                 f"{args.scene}: there must be at least one Gaussian, got none; fit longer, or name another"
             )
-        photographs = [] if args.train is None else known_views(args.train, args, given).cameras
+        known = None if args.train is None else known_views(args.train, args, given)
         return scene_of_file(
             given.gaussians,
             args.scene.stem,
             _overview_camera,
             ranking,
             given.background,
-            photographs=photographs,
+            photographs=known.cameras if known else (),
+            views=known.views if known else (),
             uncertainty=args.uncertainty,
         )
     if args.train is not None:

@@ -34,7 +34,7 @@ from drgs.io.run import Run
 from drgs.meshing.depths import seen_distance
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from drgs.cameras import Camera
     from drgs.commands.options import Crossval, Fisher, Query, Render, Select, Tradeoff, Views
@@ -277,6 +277,7 @@ class Known:
         data: The data set that they are of, or None.
         sizes: Stated size -> size of the image file, as far as known.
         lenses: Cameras that are compared with them keep their lenses as these do.
+        views: Views of a data set that the cameras are of, in their order; none of a list of cameras.
     """
 
     cameras: list[Camera]
@@ -285,6 +286,7 @@ class Known:
     data: Path | None = None
     sizes: dict[tuple[int, int], tuple[int, int]] = dataclasses.field(default_factory=dict)
     lenses: bool = False
+    views: Sequence[View] = ()
 
 
 def known_views(
@@ -323,7 +325,7 @@ def _known_views(text: str | None, args: Views, given: SceneInput, lenses: bool,
     views = source.dataset(args, given).views
     if source.kind == "data":
         cameras = [_camera(view, {}, pixels, lenses) for view in views]
-        return Known(cameras, where, pixels, Path(source.text).resolve(), lenses=lenses)
+        return Known(cameras, where, pixels, Path(source.text).resolve(), lenses=lenses, views=views)
     place = source.record.data
     names = fitted_views(Run(Path(source.text)), source.record)
     named = {view.name: view for view in views}
@@ -336,7 +338,7 @@ def _known_views(text: str | None, args: Views, given: SceneInput, lenses: bool,
     size = lambda view: (view.camera.width, view.camera.height)  # noqa: E731
     sizes = {size(a): size(b) for a, b in zip(stated, checked, strict=True)}
     cameras = [_camera(view, {}, pixels, lenses) for view in checked]
-    return Known(cameras, where, pixels, place.resolve(), sizes, lenses)
+    return Known(cameras, where, pixels, place.resolve(), sizes, lenses, checked)
 
 
 def held_out_views(args: Views, given: SceneInput, known: Known) -> list[Camera]:

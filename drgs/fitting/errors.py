@@ -26,18 +26,19 @@ from drgs.io.json_files import check_json
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from drgs.data import Dataset
+    from drgs.data import Dataset, View
     from drgs.ellipsoids import Scene
+    from drgs.fitting.config import DataConfig
     from drgs.fitting.frames import Frame
     from drgs.fitting.trainer import Trainer
     from drgs.io.run import Run
     from drgs.settings import RenderSettings
 
-__all__ = ["fit_errors", "is_cheap", "run_error_record", "saved_error_record"]
+__all__ = ["error_record_of_views", "fit_errors", "is_cheap", "run_error_record", "saved_error_record"]
 
 _HEADER = {"scene": str, "photographs": int, "pixels": int, "views": int, "settings": dict, "length": float}
-_STEPS_A_PHOTOGRAPH = 40  # steps of a fit for which a record may look at one photograph more: its time is that of two
-_FEWEST = 24  # photographs of any record, or all there are: as many as a report looks at
+_STEPS_A_PHOTOGRAPH = 100  # steps of a fit for which a record looks at one photograph more: it takes a few steps' time
+_FEWEST = 8  # photographs of any record, or all there are
 _log = logging.getLogger(__name__)
 
 
@@ -50,8 +51,8 @@ def run_error_record(
 ) -> ErrorRecord:
     """The record of a run's scene and of the photographs that it was fitted to, at the poses that the fit has found.
 
-    It is read from the run folder. Where there is none of this scene with these settings it is made of the photographs,
-    and kept there, unless another process writes into the folder.
+    It is read from the run folder. Where there is none of this scene with these settings it is made of the photographs.
+    With the settings and at the size of the fit it is kept then, unless another process writes into the folder.
 
     Where the fit has estimated exposure, photographs are as all of them would be with the mean exposure, in which the
     scene is shown.
@@ -80,11 +81,12 @@ def run_error_record(
     frames = frames_for([views[names[row]] for row in rows], config.data, pixels)
     gains = loaded.networks.get(NETWORK, {}).get("log_gains")
     record = _record_of(loaded.scene, frames, rows, len(names), settings, gains)
-    try:
-        with lock_run(run, "errors"):
-            _save(run, loaded.scene, record, len(rows), pixels)
-    except (OSError, ValueError) as error:
-        _log.info("%s; the record of the errors is not kept", str(error).partition(";")[0])
+    if settings == config.settings and pixels == config.data.max_pixels:
+        try:
+            with lock_run(run, "errors"):
+                _save(run, loaded.scene, record, len(rows), pixels)
+        except (OSError, ValueError) as error:
+            _log.info("%s; the record of the errors is not kept", str(error).partition(";")[0])
     return record
 
 
@@ -113,13 +115,31 @@ def saved_error_record(
     return record if record.settings == settings else None
 
 
+def error_record_of_views(
+    scene: Scene, views: list[View], settings: RenderSettings, data: DataConfig, max_pixels: int
+) -> ErrorRecord:
+    """The record of a scene that anybody may have fitted, and of the photographs of these views.
+
+    Args:
+        scene: The scene, in the frame of the views.
+        views: Views of a data set.
+        settings: Settings of the renderer.
+        data: What of photographs is used, and how.
+        max_pixels: Pixels of a photograph at most.
+    Raises:
+        FileNotFoundError, ValueError: If a photograph cannot be read.
+    """
+    frames = frames_for(views, data, max_pixels)
+    return _record_of(scene, frames, range(len(frames)), len(frames), settings, None)
+
+
 def fit_errors(run: Run, trainer: Trainer, steps: int) -> dict[str, float]:
     """Write the record of a fit's scene as it is now; what the log says of it.
 
     Args:
         run: The run folder, which the fit has locked.
         trainer: The fit.
-        steps: How many steps have passed since the last record: as these grow, more photographs are looked at.
+        steps: How many steps it is the record of: the more, the more photographs are looked at.
     """
     frames, scene, config = trainer.photographs(), trainer.scene(), trainer.config
     rows = _evenly(len(frames), max(_FEWEST, steps // _STEPS_A_PHOTOGRAPH))

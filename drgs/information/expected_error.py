@@ -109,6 +109,15 @@ class ErrorRecord:
         """The same of what lies behind everything."""
         return float((self.behind[1] + self.mean_misfit) / (self.behind[0] + 1))
 
+    @property
+    def of_gaussians(self) -> torch.Tensor:
+        """(N,) float64 squared error that is expected of a pixel which shows one Gaussian alone, from where the
+        photographs do: `misfit` and `direction` of all views as from one direction. Where many pixels show it, it is
+        their mean squared residual, and where none does, that of a new direction.
+        """
+        pixels = self.weights.double().sum(1)
+        return (self.residuals.double().sum(1) + NEW * self.misfit) / (pixels + 1)
+
     def times(self, factor: float) -> ErrorRecord:
         """The record of as many views again and again: of some that stand for all."""
         scaled = {name: getattr(self, name) * factor for name in ("weights", "residuals", "behind", "contrast")}

@@ -1,4 +1,4 @@
-// The Gaussians as gsplat draws them, and what is known of each: classes, uncertainty, where it is at other times.
+// The Gaussians as gsplat draws them, and what is known of each: classes, errors, where it is at other times.
 import * as THREE from "three";
 import { ExtSplats, RgbaArray, SparkRenderer, SplatFileType, SplatMesh } from "@sparkjsdev/spark";
 

@@ -1,7 +1,8 @@
-"""Layers of a page, a value for each Gaussian: its class, its uncertainty, its place at other times."""
+"""Layers of a page, a value for each Gaussian: its class, its expected error, its place at other times."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -21,13 +22,15 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians, Scene
     from drgs.features.decoder import Decoder
     from drgs.features.segmentation import Classes
+    from drgs.information.expected_error import ErrorRecord
     from drgs.information.nuisances import Nuisances
     from drgs.settings import RenderSettings
 
-__all__ = ["classes_layer", "motion_layer", "uncertainty_layer", "uncertainty_of"]
+__all__ = ["GaussianScale", "classes_layer", "error_of", "motion_layer", "scale_layer", "uncertainty_of"]
 
 _NUM_COLORS = 256  # entries of the table of colors: a Gaussian's is one byte
-_MOST_DECADES = 3.0  # range of the scale of uncertainty, at most, as in the report's maps; chosen
+_MOST_DECADES = 3.0  # range of a scale, at most, as in the report's maps; chosen
+_LEAST = 1e-12  # stands for 0 on a logarithmic scale, far below all that is measured
 _STILL_CHANGE = 1e-3  # least change that is stored, of the scene's extent, a quaternion or a log scale; chosen
 
 
@@ -49,12 +52,33 @@ def classes_layer(
     return known, labels
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class GaussianScale:
+    """A number for each Gaussian, which a layer shows on a logarithmic scale.
+
+    Attributes:
+        name: Name of the layer.
+        text: What the number is, and its unit.
+        values: (N,) >= 0.
+    """
+
+    name: str
+    text: str
+    values: np.ndarray
+
+
+def error_of(record: ErrorRecord) -> GaussianScale:
+    """How wrong the color of each Gaussian is expected to be, from where photographs show it."""
+    text = "expected error of its color, of 1, from where the photographs were taken"
+    return GaussianScale("error", text, record.of_gaussians.sqrt().cpu().numpy())
+
+
 def uncertainty_of(
     scene: Scene, cameras: Sequence[Camera], settings: RenderSettings, nuisances: Nuisances
-) -> np.ndarray:
-    """(N,) standard deviation of each Gaussian's position given the photographs.
+) -> GaussianScale:
+    """The standard deviation of each Gaussian's position given the cameras of photographs that are not there.
 
-    The standard deviation of its center for unit noise of the photographs' colors, in scene units: the square root of
+    That of its center for unit noise of the photographs' colors, in scene units: the square root of
     the sum over its three coordinates of 1 / (H + lambda), as `drgs convert --uncertainty` writes it.
 
     Args:
@@ -70,19 +94,21 @@ def uncertainty_of(
         for camera in cameras:
             add(total, together(blocks.information(camera)))
             bar.advance()
-    return variances(total, MAP_PRIOR.in_scene(scene, cameras))["means"].sum(1).sqrt().cpu().numpy()
+    values = variances(total, MAP_PRIOR.in_scene(scene, cameras))["means"].sum(1).sqrt().cpu().numpy()
+    return GaussianScale("uncertainty", "standard deviation of a center for noise of 1, in scene units", values)
 
 
-def uncertainty_layer(values: np.ndarray) -> tuple[dict[str, Any], bytes]:
-    """Ends, colors and meaning of a logarithmic scale, and the level of each Gaussian on it: uint8.
+def scale_layer(shown: GaussianScale, order: np.ndarray) -> tuple[dict[str, Any], bytes]:
+    """Name, ends, colors and meaning of a logarithmic scale, and the level of each Gaussian on it: uint8.
 
     The scale covers the values between the 1st and the 99th percentile, at most three decades; what is beyond has the
     color of its end.
 
     Args:
-        values: (N,) > 0.
+        shown: The numbers.
+        order: (N,) the archive's order of the Gaussians.
     """
-    values = np.log10(values)
+    values = np.log10(np.maximum(shown.values[order], _LEAST))
     least, high = np.percentile(values, [1, 99])
     low = max(least, high - _MOST_DECADES)
     high = max(high, low + 1e-3)  # of one value, too, the scale has a length to divide by
@@ -90,7 +116,8 @@ def uncertainty_layer(values: np.ndarray) -> tuple[dict[str, Any], bytes]:
     known = {
         "low": float(10.0**low),
         "high": float(10.0**high),
-        "text": "standard deviation of a center for noise of 1, in scene units",
+        "name": shown.name,
+        "text": shown.text,
         "colors": inferno(np.linspace(0, 1, _NUM_COLORS)[None])[0].tolist(),
     }
     return known, np.rint((_NUM_COLORS - 1) * shares).astype(np.uint8).tobytes()

@@ -43,7 +43,7 @@ class Picture {
 
 export async function show(scene, bytesOfPart) {
   THREE.ColorManagement.enabled = false; // colors are the numbers of the photographs
-  const asked = new URLSearchParams(location.hash.slice(1)); // #photo=NAME&time=0.5&layer=uncertainty&cameras&bare
+  const asked = new URLSearchParams(location.hash.slice(1)); // #photo=NAME&time=0.5&layer=error&cameras&bare
   document.body.classList.toggle("bare", asked.has("bare"));
   const canvas = document.getElementById("canvas");
   const picture = new Picture(canvas);

@@ -2,7 +2,6 @@
 const A_ROUND = 6; // seconds in which all times are played
 
 const COLORS = "colors";
-const UNCERTAINTY = "uncertainty";
 const CLASSES = "classes";
 
 function element(tag, fields = {}, ...children) {
@@ -71,14 +70,14 @@ export async function buildPanel({
   return { choose, update: () => updates.forEach((update) => update()) };
 }
 
-// Colors of their own, of what is uncertain, of classes; and which classes are drawn.
+// Colors of their own, of how wrong they are expected to be, of classes; and which classes are drawn.
 async function layers({ scene, gaussians, controls, changed, bytesOfPart, asked }) {
   const tints = { [COLORS]: null };
   const legends = {};
-  if (scene.uncertainty) {
-    const levels = await bytesOfPart(UNCERTAINTY);
-    tints[UNCERTAINTY] = lookedUp(levels, scene.uncertainty.colors);
-    legends[UNCERTAINTY] = scaleOf(scene.uncertainty);
+  if (scene.scale) {
+    const levels = await bytesOfPart("scale");
+    tints[scene.scale.name] = lookedUp(levels, scene.scale.colors);
+    legends[scene.scale.name] = scaleOf(scene.scale);
   }
   if (scene.classes) {
     const labels = new Uint16Array((await bytesOfPart(CLASSES)).buffer);

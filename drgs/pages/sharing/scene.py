@@ -1,4 +1,4 @@
-"""Contents of the page of a scene: Gaussians, cameras of photographs, uncertainty and classes."""
+"""Contents of the page of a scene: Gaussians, cameras of photographs, expected errors and classes."""
 
 from __future__ import annotations
 
@@ -12,22 +12,25 @@ import numpy as np
 from drgs.cameras.origins import origin_text
 from drgs.cameras.sizes import at_most
 from drgs.data.camera_layout import Focus, upright
+from drgs.fitting.config import DataConfig
+from drgs.fitting.errors import error_record_of_views, run_error_record
 from drgs.fitting.records import fitted_views, load_run
 from drgs.fitting.renderers import VIEWERS, planar_of
 from drgs.information.nuisances import Nuisances
 from drgs.meshing.depths import seen_distance
 from drgs.pages.report.pictures import spread
-from drgs.pages.sharing.layers import classes_layer, uncertainty_of
+from drgs.pages.sharing.layers import classes_layer, error_of, uncertainty_of
 from drgs.pages.sharing.write import Shared
 from drgs.settings import RenderSettings
 from drgs.viewing.placed_views import NEXT, Ranking, placed_views_of, read_ranking
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
-    from drgs.data import Dataset
+    from drgs.data import Dataset, View
     from drgs.ellipsoids import Gaussians
     from drgs.fitting.records import LoadedRun
     from drgs.io.run import Run
+    from drgs.pages.sharing.layers import GaussianScale
     from drgs.pages.sharing.placing import PhotoKind
 
 __all__ = ["FILE", "STORED_TIMES", "scene_of_file", "scene_of_run"]
@@ -54,6 +57,7 @@ def scene_of_file(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     *,
     photographs: Sequence[Camera] = (),
+    views: Sequence[View] = (),
     uncertainty: bool = True,
 ) -> Shared:
     """Contents of the page of Gaussians of a file.
@@ -65,7 +69,8 @@ def scene_of_file(
         ranking: Photographs to take next.
         background: RGB in [0, 1].
         photographs: Cameras of the photographs that they were fitted to, if they are known.
-        uncertainty: Whether to add what these leave uncertain.
+        views: These photographs; none where only their cameras are there.
+        uncertainty: Whether to add the errors that are expected, or, without photographs, what cameras leave uncertain.
     """
     shown = gaussians.replace(features=None).detach()
     lines = [f"{len(gaussians):,} Gaussians{f', with {len(photographs):,} photographs' if photographs else ''}."]
@@ -74,9 +79,13 @@ def scene_of_file(
     page = _with_photographs(shown, title, lines, cameras, around, background)
     if not (photographs and uncertainty):
         return page
-    settings = RenderSettings.preset("exact", background=background)
-    some = spread([at_most(camera, _INFORMATION_PIXELS) for camera in photographs], _MOST_PHOTOGRAPHS)
-    return dataclasses.replace(page, uncertainty=uncertainty_of(shown, some, settings, Nuisances()))
+    settings = RenderSettings.preset("fast", background=background)
+    if views:
+        some = spread(views, _MOST_PHOTOGRAPHS)
+        record = error_record_of_views(shown, some, settings, DataConfig(), _INFORMATION_PIXELS)
+        return dataclasses.replace(page, scale=error_of(record.times(len(views) / len(some))))
+    cameras = spread([at_most(camera, _INFORMATION_PIXELS) for camera in photographs], _MOST_PHOTOGRAPHS)
+    return dataclasses.replace(page, scale=uncertainty_of(shown, cameras, settings, Nuisances()))
 
 
 def scene_of_run(
@@ -98,7 +107,8 @@ def scene_of_run(
         ranking: Photographs to take next; default those of the run.
         around: A camera that sees all of it, where there are no others.
         moments: Number of times at which what moves is stored, at most.
-        uncertainty: Whether to add what the photographs leave uncertain.
+        uncertainty: Whether to add the errors that are expected, or, where photographs are gone but their cameras are
+            not, what these leave uncertain.
     Raises:
         FileNotFoundError, ValueError: If the run is none, damaged, or has no Gaussians.
     """
@@ -122,7 +132,7 @@ def scene_of_run(
             around,
             record.config.settings.background,
         ),
-        uncertainty=_uncertainty(loaded, fitted) if uncertainty else None,
+        scale=_scale(run, loaded, dataset, fitted) if uncertainty else None,
         classes=_classes(loaded),
         moving=moving,
         times=times,
@@ -209,13 +219,17 @@ def _times(loaded: LoadedRun, count: int) -> tuple[float, ...]:
     return tuple(float(x) for x in np.linspace(low, high, count))
 
 
-def _uncertainty(loaded: LoadedRun, fitted: list[Camera]) -> np.ndarray | None:
-    """(N,) standard deviation of each Gaussian's position given the photographs, scene units."""
+def _scale(run: Run, loaded: LoadedRun, dataset: Dataset | None, fitted: list[Camera]) -> GaussianScale | None:
+    """The errors that are expected; where the photographs cannot be read, what their cameras leave uncertain."""
+    config = loaded.record.config
+    try:
+        return error_of(run_error_record(run, config.settings, most=_MOST_PHOTOGRAPHS, dataset=dataset))
+    except (OSError, ValueError) as error:
+        _log.warning("%s; the page goes without the expected error", str(error).partition(";")[0])
     if loaded.moving is not None:
         fitted = [camera for camera in fitted if camera.time is not None]
     if not fitted:
         return None
-    config = loaded.record.config
     cameras = [at_most(camera, min(_INFORMATION_PIXELS, config.data.max_pixels)) for camera in fitted]
     scene = loaded.gaussians.replace(features=None) if loaded.moving is None else loaded.moving
     nuisances = Nuisances(eliminate=loaded.record.estimated)

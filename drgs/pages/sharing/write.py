@@ -14,7 +14,7 @@ from drgs.data.camera_layout import middle_camera
 from drgs.display.progress import Bar
 from drgs.io.outputs import atomic_write
 from drgs.pages.sharing.gaussians import archive_of
-from drgs.pages.sharing.layers import motion_layer, uncertainty_layer
+from drgs.pages.sharing.layers import motion_layer, scale_layer
 from drgs.pages.sharing.npm import viewer_files
 from drgs.pages.sharing.page import scene_html
 from drgs.pages.sharing.placing import PhotoKind, columns, photo, upright_matrix
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.deform import DynamicGaussians
     from drgs.ellipsoids import Gaussians
+    from drgs.pages.sharing.layers import GaussianScale
 
 __all__ = ["Shared", "write_page"]
 
@@ -42,7 +43,7 @@ class Shared:
         target: (3,) point of the world that the first camera looks at.
         up: (3,) direction of the world that is up, of length 1.
         background: RGB in [0, 1].
-        uncertainty: (N,) standard deviation of each Gaussian's center; None: no such layer.
+        scale: How wrong each Gaussian is expected to be, or how uncertain; None: no such layer.
         classes: Names and colors of classes, and the class of each Gaussian (`layers.classes_layer`); None: none.
         moving: The Gaussians and what moves them; None where nothing does.
         times: Times at which it is written, ascending.
@@ -55,7 +56,7 @@ class Shared:
     target: np.ndarray
     up: np.ndarray
     background: tuple[float, float, float]
-    uncertainty: np.ndarray | None = None
+    scale: GaussianScale | None = None
     classes: tuple[dict[str, Any], np.ndarray] | None = None
     moving: DynamicGaussians | None = None
     times: Sequence[float] = ()
@@ -97,8 +98,8 @@ def write_page(shared: Shared, path: str | os.PathLike) -> dict[str, int]:
         "harmonics": harmonics,
     }
     parts = {"gaussians": archive}
-    if shared.uncertainty is not None:
-        scene["uncertainty"], parts["uncertainty"] = uncertainty_layer(shared.uncertainty[order])
+    if shared.scale is not None:
+        scene["scale"], parts["scale"] = scale_layer(shared.scale, order)
     if shared.classes is not None:
         scene["classes"], labels = shared.classes
         parts["classes"] = labels[order].astype("<u2").tobytes()
