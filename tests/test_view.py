@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import gc
 import json
 import re
@@ -36,9 +37,12 @@ from drgs.data import load
 from drgs.data.camera_path import read_camera_path
 from drgs.display.pictures import map_colors
 from drgs.files import load_state, save_state
+from drgs.fitting import errors
+from drgs.fitting.errors import run_error_record
+from drgs.io.run import Run
 from drgs.viewing import panel
 from drgs.viewing.client import ClientGaussians, Pose, camera_of, looking, pose_of
-from drgs.viewing.layers import Uncertainty, bands, layers_of, rendered_in_bands, stages, tinted
+from drgs.viewing.layers import ExpectedError, Uncertainty, bands, layers_of, rendered_in_bands, stages, tinted
 from drgs.viewing.placed_views import PlacedView, Ranking, Score, Sight, placed_views_of, read_ranking, score_colors
 from drgs.viewing.server import Viewer
 from drgs.viewing.session import Session
@@ -69,10 +73,10 @@ def subject(means, **fields) -> Subject:
         "origin": np.zeros(3),
         "times": (),
         "settings": drgs.RenderSettings.preset,
-        "layers": layers_of({}, None, 10_000),
+        "layers": layers_of({}, (), 10_000),
         "placed_views": (),
         "ranking": None,
-        "uncertainty": None,
+        "maps": {},
         "first": FirstView(pose_of(camera, np.zeros(3)), np.zeros(3), np.array([0.0, -1.0, 0.0])),
         "background": (0.0, 0.0, 0.0),
     }
@@ -213,7 +217,7 @@ def test_a_small_picture_comes_first():
 def test_layers_are_what_there_is(run):  # noqa: F811
     """Bare Gaussians have colors, depth and what is missing; features and labels come with a run that has some, in the
     colors of `drgs render`, and paint the client's Gaussians, too."""
-    plain = layers_of({}, None, 10_000)
+    plain = layers_of({}, (), 10_000)
     assert [layer.name for layer in plain] == ["rgb", "depth", "missing"]
     given = SceneInput.of(View(scene=run.run.path))
     looked = subject_of(View(scene=run.run.path), given)
@@ -292,6 +296,37 @@ def test_uncertainty_has_map_first():
     assert len(list(Uncertainty(cameras, said, mapped, gain.Prior(1.0)).add_views(lambda: None, sketch=False))) == 30
 
 
+def test_expected_error_is_read_or_made():
+    """The record that there is serves at once; else a sketch of few pixels comes before that of the photographs, unless
+    a fit has written one meanwhile."""
+    g = blobs(torch.randn(12, 3) * 0.4)
+    *cameras, other = orbit((0, 0, 0), 3.0, 4, width=24, height=20)
+    gray = [torch.full((20, 24, 3), 0.5)] * 3
+    record = drgs.error_record(g, cameras, gray, FAST)
+    for there, asked, told in (
+        ([record], [], [3]),
+        ([None, None], [2400, None], [0, 3]),
+        ([None, record], [2400], [0, 3]),
+    ):
+        made, said = [], []
+        shown = ExpectedError(g, 3, iter(there).__next__, functools.partial(_made, record, made))
+        with pytest.raises(RuntimeError, match="3 photographs must be looked at first"):
+            shown.map(other)
+        for _ in shown.add_views(functools.partial(_said, shown, said)):
+            assert shown.has_map
+        assert (made, said, shown.is_complete) == (asked, told, True)
+        np.testing.assert_array_equal(shown.map(other), drgs.expected_error(g, other, record).sqrt().numpy())
+
+
+def _made(record, made, pixels):
+    made.append(pixels)
+    return record
+
+
+def _said(shown, said):
+    said.append(shown.done)
+
+
 # ------------------------------------------------------------------------------------------------- worker
 
 
@@ -356,7 +391,7 @@ def test_placed_views_of_a_run(place):  # noqa: F811
     photograph = by_name["3"].best.photograph(12)
     view = next(view for view in load(place / "data").views if view.name == "3")
     np.testing.assert_allclose(photograph, view.checked().image(12, 12), atol=1e-6)
-    assert {layer.name for layer in looked.layers} == {"rgb", "depth", "missing", "uncertainty"}
+    assert {layer.name for layer in looked.layers} == {"rgb", "depth", "missing", "expected error", "uncertainty"}
     assert looked.state == "step 12 of 12"
     # It looks at what the photographs look at: the middle, from their distance, with their up.
     assert np.linalg.norm(looked.first.target) < 0.1
@@ -561,9 +596,9 @@ def test_uncertainty_is_added_up_once_and_shown(place, viewers, told):  # noqa: 
         picture = client.picture(after=at)
         counts = [text for text in told if text.endswith(" of 4 photographs added")]
         assert counts == [f"uncertainty of step 12 of 12: {done} of 4 photographs added" for done in range(5)]
-        assert looked.uncertainty.is_complete
+        assert looked.maps["uncertainty"].is_complete
         camera = camera_of(Pose(pose.wxyz, pose.position, 0.8, 4 / 3), *picture.shape[1::-1], looked.origin)
-        wanted, (low, high) = map_colors(looked.uncertainty.map(camera))
+        wanted, (low, high) = map_colors(looked.maps["uncertainty"].map(camera))
         html(client, f"{low:.3g} ", after=at)
         html(
             client,
@@ -571,6 +606,36 @@ def test_uncertainty_is_added_up_once_and_shown(place, viewers, told):  # noqa: 
             after=at,
         )
         assert np.abs(picture.astype(int) - wanted).mean() < 1.0
+
+
+def test_expected_error_of_a_run_is_shown(place, viewers, told):  # noqa: F811
+    """The record of the fit is read, no photograph is; of a splat with its data set, the photographs are."""
+    args = View(scene=place / "run", preset="fast")
+    looked = subject_of(args, SceneInput.of(args))
+    viewer = viewers(looked)
+    pose = looked.first.pose
+    with Client(viewer.port) as client, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(errors, "frames_for", None)
+        client.look(pose.wxyz, pose.position)
+        client.picture()
+        at = len(client.heard)
+        client.choose("show", "expected error")
+        picture = client.picture(after=at)
+        counts = [text for text in told if text.endswith(" of 4 photographs added")]
+        assert counts == [f"expected error of step 12 of 12: {done} of 4 photographs added" for done in (0, 4)]
+        camera = camera_of(Pose(pose.wxyz, pose.position, 0.8, 4 / 3), *picture.shape[1::-1], looked.origin)
+        record = run_error_record(Run(place / "run"), looked.settings("fast"))
+        wanted, (_, high) = map_colors(drgs.expected_error(looked.scene, camera, record).sqrt().numpy())
+        html(client, f" {high:.3g} error of the color, of 1, logarithmic", after=at)
+        assert np.abs(picture.astype(int) - wanted).mean() < 1.0
+    args = View(scene=place / "scene.ply", train=str(place / "data"), info_pixels=200)
+    shown = subject_of(args, SceneInput.of(args)).maps["expected error"]
+    for _ in shown.add_views(lambda: None, sketch=False):
+        pass
+    assert shown.count == 9
+    assert shown.map(camera).shape == (camera.height, camera.width)
+    args = View(scene=place / "scene.ply", train=str(place / "cameras.json"))
+    assert [*subject_of(args, SceneInput.of(args)).maps] == ["uncertainty"]
 
 
 def uncertain(seed: int, hold, calls: list[int]) -> Subject:
@@ -588,8 +653,8 @@ def uncertain(seed: int, hold, calls: list[int]) -> Subject:
         return fisher.variance_map(g, camera, weights, FAST).numpy()
 
     known = Uncertainty(cameras, said, mapped, gain.Prior(1.0))
-    layers = layers_of({}, known, 2_000)
-    return subject(torch.zeros(12, 3), scene=g, state=f"step {seed}", uncertainty=known, layers=layers)
+    layers = layers_of({}, [known], 2_000)
+    return subject(torch.zeros(12, 3), scene=g, state=f"step {seed}", maps={known.name: known}, layers=layers)
 
 
 def test_a_map_that_was_begun_is_finished(viewers, told):
@@ -626,7 +691,7 @@ def test_a_map_that_was_begun_is_finished(viewers, told):
         assert maps == ["uncertainty of step 1, fast: 51x38", "uncertainty, fast: 51x38"]
         picture = decoded([m for m in client.heard if m["type"] == "BackgroundImageMessage"][-1])
         camera = camera_of(Pose(pose.wxyz, pose.position, 0.8, 4 / 3), *picture.shape[1::-1], np.zeros(3))
-        wanted, _ = map_colors(subjects[2].uncertainty.map(camera))
+        wanted, _ = map_colors(subjects[2].maps["uncertainty"].map(camera))
         assert np.abs(picture.astype(int) - wanted).mean() < 1.0
     assert calls == [1, 1, 1, 3, 3, 3]
 

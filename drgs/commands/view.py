@@ -16,11 +16,13 @@ from drgs.commands.orbits import OrbitShape, capture_orbit, scene_orbit
 from drgs.commands.scene_input import SELECTION, SceneInput, ranking_of
 from drgs.commands.semantic_pictures import PICTURE_KINDS, picture_functions
 from drgs.commands.values import UP
-from drgs.commands.viewpoints import Known, Source, known_views
+from drgs.commands.viewpoints import Known, Source, evenly, known_views
 from drgs.data import View as DataView
 from drgs.data.camera_layout import Focus, upright
 from drgs.display.progress import Bar, quietly
 from drgs.ellipsoids import Gaussians
+from drgs.fitting.config import DataConfig
+from drgs.fitting.errors import error_record_of_views, run_error_record, saved_error_record
 from drgs.fitting.records import fitted_views
 from drgs.information.blocks import MAP_PRIOR, SceneBlocks
 from drgs.information.sums import together
@@ -29,7 +31,7 @@ from drgs.io.checkpoint import state_header
 from drgs.io.run import Run
 from drgs.meshing.depths import seen_distance
 from drgs.viewing.client import pose_of
-from drgs.viewing.layers import Uncertainty, layers_of
+from drgs.viewing.layers import SKETCH_VIEWS, ExpectedError, Uncertainty, layers_of
 from drgs.viewing.placed_views import NEXT, PlacedView, Ranking, placed_views_of
 from drgs.viewing.subject import FirstView, Subject
 
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.commands.options import View
     from drgs.commands.semantic_pictures import PictureFunction
+    from drgs.information.expected_error import ErrorRecord
     from drgs.viewing.server import Viewer
 
 __all__ = ["run", "subject_of", "watched_files"]
@@ -129,7 +132,8 @@ def subject_of(args: View, given: SceneInput, before: Subject | None = None) -> 
     known = _known_views(args, given, notes)
     ranking = ranking_of(args.selection, given)
     placed_views = _placed_views(args, given, ranking, notes)
-    uncertainty = _uncertainty(args, given, known)
+    found = [shown for shown in (_expected_error(args, given, known), _uncertainty(args, given, known)) if shown]
+    maps = {shown.name: shown for shown in found}
     origin = np.array(given.gaussians.origin, np.float64)
     if before is not None and np.array_equal(before.origin, origin):  # the client's frame is what it was
         first = before.first
@@ -147,10 +151,10 @@ def subject_of(args: View, given: SceneInput, before: Subject | None = None) -> 
         origin=origin,
         times=_times(given),
         settings=given.settings,
-        layers=layers_of(_picture_functions(args, given), uncertainty, pixels),
+        layers=layers_of(_picture_functions(args, given), maps.values(), pixels),
         placed_views=placed_views,
         ranking=ranking,
-        uncertainty=uncertainty,
+        maps=maps,
         first=first,
         background=given.background,
         notes=tuple(notes),
@@ -221,6 +225,34 @@ def _placed_views(args: View, given: SceneInput, ranking: Ranking | None, notes:
             raise
         return placed_views_of([], (), ranking)  # `_known_views` has said why
     return placed_views_of(views, fitted, ranking)
+
+
+def _expected_error(args: View, given: SceneInput, known: Known | None) -> ExpectedError | None:
+    """The expected error by the photographs, with the fast settings; of many, 24 stand for all."""
+    settings = given.settings("fast")
+    if args.train is None and given.run is not None and given.record is not None:
+        run, pixels = given.run, args.info_pixels or given.record.config.data.max_pixels
+        count = min(SKETCH_VIEWS, len(fitted_views(run, given.record)))
+
+        def saved() -> ErrorRecord | None:
+            return saved_error_record(run, given.scene, settings, pixels, 1)  # of as many as the fit has looked at
+
+        if known is None and saved() is None:  # no photographs, as `_known_views` has said
+            return None
+        return ExpectedError(
+            given.scene, count, saved, lambda most: run_error_record(run, settings, most or pixels, SKETCH_VIEWS)
+        )
+    if known is None or not known.views:
+        return None
+    views, pixels = evenly(list(known.views), SKETCH_VIEWS), known.pixels
+    data = DataConfig(undistort="off" if known.lenses else "on")
+
+    def made(most: int | None) -> ErrorRecord:
+        return error_record_of_views(given.scene, views, settings, data, most or pixels).times(
+            len(known.views) / len(views)
+        )
+
+    return ExpectedError(given.scene, len(views), lambda: None, made)
 
 
 def _uncertainty(args: View, given: SceneInput, known: Known | None) -> Uncertainty | None:

@@ -4,15 +4,15 @@ What a scene does not have is not offered. A small picture comes first, then one
 of rows at a time. Between two steps the worker may turn to something else, so that a browser whose camera has moved
 waits for one band of the picture that is no longer wanted, not for all of it.
 
-What the photographs leave uncertain is added up once, view by view, when it is first wanted. A sketch comes before, of
-few photographs and few of their pixels: within seconds it shows about the same map.
+What photographs say, where the scene is wrong and what they leave uncertain, is found once, when it is first wanted. A
+sketch comes before, of few photographs and few of their pixels: within seconds it shows about the same map.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from drgs.cameras.sizes import at_most, cropped
 from drgs.display import pictures
 from drgs.ellipsoids import colors_only
 from drgs.gain import Information, Prior, check, variances
+from drgs.information.expected_error import expected_error
 from drgs.information.sums import add
 from drgs.integrator import Output, render
 
@@ -29,15 +30,18 @@ if TYPE_CHECKING:
 
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians, Scene
+    from drgs.information.expected_error import ErrorRecord
     from drgs.integrator import Output
     from drgs.settings import RenderSettings
 
 __all__ = [
-    "UNCERTAINTY",
+    "SKETCH_VIEWS",
     "ColorScale",
     "DrawingProgress",
     "Drawing",
+    "ExpectedError",
     "Layer",
+    "PhotographMap",
     "Steps",
     "Uncertainty",
     "bands",
@@ -138,9 +142,7 @@ def over(before: np.ndarray, rows: np.ndarray, height: int) -> np.ndarray:
     return picture
 
 
-UNCERTAINTY = "uncertainty"
 _FEATURE_PIXELS = 200_000  # pixels of a picture of features: 100 MB of 128 channels
-_VARIANCE = "variance of the color, as a multiple of the photographs' noise, logarithmic"
 _GAUSSIANS_AT_ONCE = 4096  # Gaussians that are colored at once: bounds the memory of their features
 
 
@@ -193,14 +195,14 @@ class Layer:
 
 
 def layers_of(
-    semantic: Mapping[str, Callable[[Output], np.ndarray]], uncertainty: Uncertainty | None, pixels: int | None
+    semantic: Mapping[str, Callable[[Output], np.ndarray]], maps: Iterable[PhotographMap], pixels: int | None
 ) -> tuple[Layer, ...]:
     """Layers that a scene has.
 
     Args:
         semantic: Kind (`features`, `labels`, `overlay`) -> function that colors a rendering with features.
-        uncertainty: What the photographs leave uncertain, where there are any.
-        pixels: Largest number of pixels of its map; None: as many as of other pictures.
+        maps: Maps of what photographs say, where there are any.
+        pixels: Largest number of pixels of these; None: as many as of other pictures.
     """
     layers = [
         Layer("rgb", "colors", _rgb),
@@ -215,9 +217,7 @@ def layers_of(
     for kind, colors_of in semantic.items():
         tint = None if kind == "overlay" else _tint_of(colors_of)
         layers.append(Layer(kind, hints.get(kind, kind), _semantic(colors_of), _FEATURE_PIXELS, tint))
-    if uncertainty is not None:
-        hint = "variance that the photographs leave to each pixel's color: bright is uncertain, dark is well known"
-        layers.append(Layer(UNCERTAINTY, hint, _mapped(uncertainty), pixels))
+    layers += [Layer(shown.name, shown.hint, _mapped(shown), pixels) for shown in maps]
     return tuple(layers)
 
 
@@ -254,12 +254,12 @@ def _semantic(colors_of: Callable[[Output], np.ndarray]) -> Draw:
     return draw
 
 
-def _mapped(uncertainty: Uncertainty) -> Draw:
+def _mapped(shown: PhotographMap) -> Draw:
     def draw(scene: Scene, camera: Camera, settings: RenderSettings) -> Drawings:
-        variance = uncertainty.map(camera)
+        values = shown.map(camera)
         yield DrawingProgress(1.0)
-        picture, (low, high) = pictures.map_colors(variance)
-        return Drawing(picture, ColorScale(low, high, _VARIANCE))
+        picture, (low, high) = pictures.map_colors(values)
+        return Drawing(picture, ColorScale(low, high, shown.unit))
 
     return draw
 
@@ -282,8 +282,109 @@ def _tint_of(colors_of: Callable[[Output], np.ndarray]) -> Callable[[Gaussians],
     return tint
 
 
-_SKETCH_VIEWS = 24  # training views that a sketch of the uncertainty uses, at most: it takes seconds. Chosen
-_SKETCH_PIXELS = 2400  # pixels of each of these views, at most; chosen
+SKETCH_VIEWS = 24
+"""Training views that a sketch of a map uses, at most: it takes seconds. Chosen."""
+SKETCH_PIXELS = 2400
+"""Pixels of each of these views, at most; chosen."""
+
+
+class PhotographMap(Protocol):
+    """A map that the viewer draws of any view, once it has looked at the photographs that a scene was fitted to.
+
+    Attributes:
+        name: Name of the layer.
+        hint: What it shows, in a few words.
+        unit: What its numbers are.
+        count: Number of photographs that are looked at.
+        done: How many have been.
+    """
+
+    name: str
+    hint: str
+    unit: str
+    count: int
+    done: int
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all have been looked at."""
+
+    @property
+    def has_map(self) -> bool:
+        """Whether there is a map, if only a sketch."""
+
+    def add_views(self, progress: Callable[[], None], sketch: bool = True) -> Iterator[None]:
+        """Sketch the map, if there is none, then look at the photographs.
+
+        Args:
+            progress: Called whenever `done` has changed, and after the sketch.
+            sketch: Whether somebody waits for a sketch.
+        """
+
+    def map(self, camera: Camera) -> np.ndarray:
+        """(H, W) of a view.
+
+        Raises:
+            RuntimeError: Before there is a map.
+        """
+
+
+class ExpectedError:
+    """Maps of the expected error (`drgs.expected_error`), in units of color.
+
+    Args:
+        scene: The scene.
+        count: Number of photographs of its record.
+        saved: The record that there is already; None where there is none.
+        made: The record of the photographs, each of at most so many pixels; None: of as many as the fit has seen.
+    """
+
+    name = "expected error"
+    hint = "how wrong each pixel's color is expected to be, by the photographs: bright is wrong, dark is right"
+    unit = "error of the color, of 1, logarithmic"
+
+    def __init__(
+        self,
+        scene: Scene,
+        count: int,
+        saved: Callable[[], ErrorRecord | None],
+        made: Callable[[int | None], ErrorRecord],
+    ) -> None:
+        self.count = count
+        self.done = 0
+        self._scene = scene
+        self._saved = saved
+        self._made = made
+        self._record: ErrorRecord | None = None
+
+    @property
+    def is_complete(self) -> bool:
+        """See `PhotographMap`."""
+        return self.done == self.count
+
+    @property
+    def has_map(self) -> bool:
+        """See `PhotographMap`."""
+        return self._record is not None
+
+    def add_views(self, progress: Callable[[], None], sketch: bool = True) -> Iterator[None]:
+        """See `PhotographMap`: all photographs are one step."""
+        found = self._saved()
+        if found is None and sketch and not self.has_map:
+            self._record = self._made(SKETCH_PIXELS)
+            progress()
+            yield
+            found = self._saved()  # a fit that still runs may have written one meanwhile
+        self._record = found or self._made(None)
+        self.done = self.count
+        progress()
+        yield
+
+    def map(self, camera: Camera) -> np.ndarray:
+        """See `PhotographMap`."""
+        if self._record is None:
+            raise RuntimeError(f"view: {self.count} photographs must be looked at first, none are")
+        return expected_error(self._scene, camera, self._record).sqrt().numpy()
 
 
 class Uncertainty:
@@ -296,6 +397,10 @@ class Uncertainty:
         prior: lambda.
     """
 
+    name = "uncertainty"
+    hint = "variance that the photographs leave to each pixel's color: bright is uncertain, dark is well known"
+    unit = "variance of the color, as a multiple of the photographs' noise, logarithmic"
+
     def __init__(
         self,
         cameras: Sequence[Camera],
@@ -304,6 +409,7 @@ class Uncertainty:
         prior: Prior,
     ) -> None:
         self.cameras = tuple(cameras)
+        self.count = len(self.cameras)
         self._information_of = information_of
         self._variance_of = variance_of
         self._prior = prior
@@ -314,7 +420,7 @@ class Uncertainty:
     @property
     def is_complete(self) -> bool:
         """Whether all views have been added."""
-        return self.done == len(self.cameras)
+        return self.done == self.count
 
     @property
     def has_map(self) -> bool:
@@ -322,13 +428,8 @@ class Uncertainty:
         return self._weights is not None
 
     def add_views(self, progress: Callable[[], None], sketch: bool = True) -> Iterator[None]:
-        """Sketch the map, if there is none, then add the views that are not added yet, one a step.
-
-        Args:
-            progress: Called after the sketch and each view.
-            sketch: Whether somebody waits for a sketch; of few small views there is none.
-        """
-        few = len(self.cameras) <= _SKETCH_VIEWS and max(x.width * x.height for x in self.cameras) <= _SKETCH_PIXELS
+        """See `PhotographMap`: each view is a step; of few small views there is no sketch."""
+        few = len(self.cameras) <= SKETCH_VIEWS and max(x.width * x.height for x in self.cameras) <= SKETCH_PIXELS
         if sketch and not few and not self.has_map:
             yield from self._sketch()
             progress()
@@ -346,10 +447,10 @@ class Uncertainty:
     def _sketch(self) -> Iterator[None]:
         """Add up few pixels of few views, evenly spaced, each for those of all that it stands for."""
         total: dict[str, torch.Tensor] = {}
-        count = min(len(self.cameras), _SKETCH_VIEWS)
+        count = min(len(self.cameras), SKETCH_VIEWS)
         for k in range(count):
             camera = self.cameras[k * len(self.cameras) // count]
-            small = at_most(camera, _SKETCH_PIXELS)
+            small = at_most(camera, SKETCH_PIXELS)
             stands_for = len(self.cameras) / count * (camera.width * camera.height) / (small.width * small.height)
             add(total, {name: x * stands_for for name, x in self._of(small).items()})
             yield

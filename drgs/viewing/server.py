@@ -12,7 +12,7 @@ from typing import Any
 
 from drgs.viewing.gate import Gate
 from drgs.viewing.gated_viser import bound_socket, gated_server, in_a_line
-from drgs.viewing.layers import UNCERTAINTY, Uncertainty
+from drgs.viewing.layers import PhotographMap
 from drgs.viewing.session import Session
 from drgs.viewing.subject import Subject
 from drgs.viewing.worker import Worker
@@ -25,8 +25,8 @@ _NEAR = 1e-3  # times the distance to the orbit center: where the client's pictu
 # Times that distance: where they end. A skybox is up to 200 extents of the cameras away, of which the orbit distance
 # may be a small part. What is near is resolved by the nearer number alone.
 _FAR = 1e5
-# Keys of jobs that can wait.
-_UNCERTAINTY_JOB = "uncertainty"
+# Keys of jobs that can wait; that of a map has the layer's name, too.
+_MAP_JOB = "map of photographs"
 _FREEING_JOB = "memory of closed browsers"
 
 
@@ -62,7 +62,7 @@ class Viewer:
             self._preset = preset
             self._pixels = pixels
             self.sessions: dict[int, Session] = {}
-            self._latest_complete: Subject | None = None  # the last one whose uncertainty is known
+            self._latest_complete: dict[str, Subject] = {}  # layer -> the last one whose map is complete
             self._server = gated_server(self.gate, listening, host)
         except BaseException:
             listening.close()
@@ -113,8 +113,8 @@ class Viewer:
             self.worker,
             self._preset,
             self._pixels,
-            self._need_uncertainty,
-            lambda: self._latest_complete,
+            self._need_map,
+            self._latest_complete.get,
         )
 
     async def _disconnected(self, client: Any) -> None:
@@ -130,52 +130,50 @@ class Viewer:
         gc.collect()
         yield
 
-    def _need_uncertainty(self) -> None:
-        """Begin to add up the information of the photographs, unless that is done or under way."""
-        uncertainty = self.subject.uncertainty
-        if uncertainty is not None and not uncertainty.is_complete and not self.worker.has(_UNCERTAINTY_JOB):
-            self.worker.put(_UNCERTAINTY_JOB, self._adding_up(), can_wait=True)
+    def _need_map(self, name: str) -> None:
+        """Begin to look at the photographs for a layer, unless that is done or under way."""
+        shown = self.subject.maps.get(name)
+        if shown is not None and not shown.is_complete and not self.worker.has((_MAP_JOB, name)):
+            self.worker.put((_MAP_JOB, name), self._looking(name), can_wait=True)
 
-    def _adding_up(self) -> Iterator[None]:
-        """Job: the information of the photographs; panels that show the layer say how far it is.
+    def _looking(self, name: str) -> Iterator[None]:
+        """Job: what photographs say for a layer; panels that show it say how far it is.
 
         What was begun of a checkpoint is finished though a fit has gone on since, and its map shown; then it is the
         newest one's turn. A fit that saves faster than this would else never have a map.
         """
         while True:
             subject = self.subject
-            if (uncertainty := subject.uncertainty) is None or uncertainty.is_complete:
+            if (looked := subject.maps.get(name)) is None or looked.is_complete:
                 return
-            say_progress = functools.partial(self._say_progress, subject, uncertainty)
+            say_progress = functools.partial(self._say_progress, subject, looked)
             say_progress()
             yield
-            shown = uncertainty.has_map
-            for _ in uncertainty.add_views(say_progress, sketch=self._latest_complete is None):
-                if uncertainty.has_map and not uncertainty.is_complete and not shown:
+            shown = looked.has_map
+            for _ in looked.add_views(say_progress, sketch=name not in self._latest_complete):
+                if looked.has_map and not looked.is_complete and not shown:
                     shown = True
-                    self._redraw()
+                    self._redraw(name)
                 yield
-            self._latest_complete = subject
-            self._redraw()
-            if not self._waiting():
+            self._latest_complete[name] = subject
+            self._redraw(name)
+            if not self._waiting(name):
                 return
 
-    def _redraw(self) -> None:
+    def _redraw(self, name: str) -> None:
         """Draw the map once more in each browser that shows it."""
-        self._each(lambda session: session.redraw() if session.layer.name == UNCERTAINTY else None)
+        self._each(lambda session: session.redraw() if session.layer.name == name else None)
 
-    def _say_progress(self, subject: Subject, uncertainty: Uncertainty) -> None:
+    def _say_progress(self, subject: Subject, looked: PhotographMap) -> None:
         """Say in the panels of those who wait for it how many photographs have been added."""
         of = f" of {subject.state}" if subject.state else ""
-        if uncertainty.has_map and not uncertainty.is_complete:
+        if looked.has_map and not looked.is_complete:
             of += ", a sketch of few pixels"
-        for session in self._waiting():
-            session.say(
-                f"uncertainty{of}: {uncertainty.done} of {len(uncertainty.cameras)} photographs added", session.scale
-            )
+        for session in self._waiting(looked.name):
+            session.say(f"{looked.name}{of}: {looked.done} of {looked.count} photographs added", session.scale)
 
-    def _waiting(self) -> list[Session]:
-        return [session for session in list(self.sessions.values()) if session.layer.name == UNCERTAINTY]
+    def _waiting(self, name: str) -> list[Session]:
+        return [session for session in list(self.sessions.values()) if session.layer.name == name]
 
     def _each(self, call: Any) -> None:
         """Call a function with each session, on viser's event loop."""

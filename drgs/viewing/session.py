@@ -25,7 +25,7 @@ from drgs.display.progress import duration
 from drgs.viewing import panel
 from drgs.viewing.client import ClientGaussians, Pose, camera_of, looking, pose_of
 from drgs.viewing.keyframes import KeyframeFolder
-from drgs.viewing.layers import UNCERTAINTY, Layer, over, stages, tinted
+from drgs.viewing.layers import Layer, over, stages, tinted
 from drgs.viewing.placed_views import PlacedView, score_colors
 
 if TYPE_CHECKING:
@@ -64,8 +64,9 @@ class Session:
         worker: The thread that computes.
         preset: Preset that our pictures are drawn by at first.
         pixels: Largest number of pixels of a picture.
-        need_uncertainty: Function that is called when the layer needs a map that is not complete.
-        latest_complete: Function that returns the last subject whose uncertainty is known; None before there is one.
+        need_map: Function that is called with the name of a layer which needs a map that is not complete.
+        latest_complete: Function that returns the last subject whose map of a layer is complete; None before there is
+            one.
     """
 
     def __init__(
@@ -75,14 +76,14 @@ class Session:
         worker: Worker,
         preset: str,
         pixels: int,
-        need_uncertainty: Callable[[], None],
-        latest_complete: Callable[[], Subject | None],
+        need_map: Callable[[str], None],
+        latest_complete: Callable[[str], Subject | None],
     ) -> None:
         self.client = client
         self.subject = subject
         self._worker = worker
         self._pixels = pixels
-        self._need_uncertainty = need_uncertainty
+        self._need_map = need_map
         self._latest_complete = latest_complete
         self._loop = asyncio.get_running_loop()
         self._lock = threading.Lock()  # of what follows: the worker's thread reads whether its picture is still wanted
@@ -178,9 +179,9 @@ class Session:
         names = tuple(layer.name for layer in subject.layers)
         if names != tuple(self._layer.options):
             self._layer.options = names
-        if keeps := self._lacks_uncertainty() and self._latest_complete() is not None:
+        if keeps := self._lacks_map() and self._latest_complete(self.layer.name) is not None:
             # An earlier checkpoint's map, and what is half drawn of it, stays until there is another.
-            self._need_uncertainty()
+            self._need_map(self.layer.name)
         else:
             self._hide()
         self.time = subject.nearest_time(self.time)
@@ -484,12 +485,13 @@ class Session:
             self.say("")
             return
         subject = self.subject
-        if self._lacks_uncertainty():
-            self._need_uncertainty()
-            earlier = self._latest_complete()
-            if earlier is not None and earlier.layer(UNCERTAINTY).name == UNCERTAINTY:
+        if self._lacks_map():
+            name = self.layer.name
+            self._need_map(name)
+            earlier = self._latest_complete(name)
+            if earlier is not None and name in earlier.maps:
                 subject = earlier
-            elif subject.uncertainty is None or not subject.uncertainty.has_map:
+            elif not subject.maps[name].has_map:
                 return
         with self._lock:
             self._wanted += 1
@@ -570,10 +572,10 @@ class Session:
                 self.say(f"{text}: {share:.0%}, about {duration(max(left, 1))} left ...")
             yield
 
-    def _lacks_uncertainty(self) -> bool:
-        """Whether the uncertainty that is to be shown is still being computed."""
-        uncertainty = self.subject.uncertainty
-        return self.layer.name == UNCERTAINTY and uncertainty is not None and not uncertainty.is_complete
+    def _lacks_map(self) -> bool:
+        """Whether the layer shows what photographs say, and some have not been looked at."""
+        shown = self.subject.maps.get(self.layer.name)
+        return shown is not None and not shown.is_complete
 
     def _client_pose(self) -> tuple[Pose, tuple[int, int]] | None:
         """Pose of the client's camera and pixels of its window; None where it has reported no valid one."""

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drgs.viewing.client import Pose
-from drgs.viewing.layers import Layer, Uncertainty
+from drgs.viewing.layers import Layer, PhotographMap
 from drgs.viewing.placed_views import PlacedView, Ranking
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ class Subject:
         layers: Pictures that there are of it.
         placed_views: Places where photographs were taken or could be.
         ranking: Selection that scored these; None where there is none.
-        uncertainty: What the layer of that name shows; None where there is none.
+        maps: What photographs say, by the name of the layer that shows it.
         first: View at which a browser begins.
         background: RGB in [0, 1].
         notes: Lines that say what is not there, and why.
@@ -71,7 +71,7 @@ class Subject:
     layers: tuple[Layer, ...]
     placed_views: tuple[PlacedView, ...]
     ranking: Ranking | None
-    uncertainty: Uncertainty | None
+    maps: Mapping[str, PhotographMap]
     first: FirstView
     background: tuple[float, float, float]
     notes: tuple[str, ...] = ()

@@ -84,8 +84,8 @@ def scene_of_file(
         some = spread(views, _MOST_PHOTOGRAPHS)
         record = error_record_of_views(shown, some, settings, DataConfig(), _INFORMATION_PIXELS)
         return dataclasses.replace(page, scale=error_of(record.times(len(views) / len(some))))
-    cameras = spread([at_most(camera, _INFORMATION_PIXELS) for camera in photographs], _MOST_PHOTOGRAPHS)
-    return dataclasses.replace(page, scale=uncertainty_of(shown, cameras, settings, Nuisances()))
+    small = spread([at_most(camera, _INFORMATION_PIXELS) for camera in photographs], _MOST_PHOTOGRAPHS)
+    return dataclasses.replace(page, scale=uncertainty_of(shown, small, settings, Nuisances()))
 
 
 def scene_of_run(
