@@ -626,7 +626,7 @@ def test_expected_error_of_a_run_is_shown(place, viewers, told):  # noqa: F811
         camera = camera_of(Pose(pose.wxyz, pose.position, 0.8, 4 / 3), *picture.shape[1::-1], looked.origin)
         record = run_error_record(Run(place / "run"), looked.settings("fast"))
         wanted, (_, high) = map_colors(drgs.expected_error(looked.scene, camera, record).sqrt().numpy())
-        html(client, f" {high:.3g} error of the color, of 1, logarithmic", after=at)
+        html(client, f" {high:.3g} error of a color between 0 and 1, logarithmic", after=at)
         assert np.abs(picture.astype(int) - wanted).mean() < 1.0
     args = View(scene=place / "scene.ply", train=str(place / "data"), info_pixels=200)
     shown = subject_of(args, SceneInput.of(args)).maps["expected error"]

@@ -341,7 +341,7 @@ class ExpectedError:
 
     name = "expected error"
     hint = "how wrong each pixel's color is expected to be, by the photographs: bright is wrong, dark is right"
-    unit = "error of the color, of 1, logarithmic"
+    unit = "error of a color between 0 and 1, logarithmic"
 
     def __init__(
         self,

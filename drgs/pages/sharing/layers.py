@@ -69,7 +69,7 @@ class GaussianScale:
 
 def error_of(record: ErrorRecord) -> GaussianScale:
     """How wrong the color of each Gaussian is expected to be, from where photographs show it."""
-    text = "expected error of its color, of 1, from where the photographs were taken"
+    text = "expected error of a color between 0 and 1, seen from where the photographs were taken"
     return GaussianScale("error", text, record.of_gaussians.sqrt().cpu().numpy())
 
 
