@@ -216,12 +216,16 @@ def test_a_small_picture_comes_first():
 
 def test_layers_are_what_there_is(run):  # noqa: F811
     """Bare Gaussians have colors, depth and what is missing; features and labels come with a run that has some, in the
-    colors of `drgs render`, and paint the client's Gaussians, too."""
+    colors of `drgs render`, and paint the client's Gaussians, too; of a run whose data set has gone there is still what
+    its photographs said about errors."""
     plain = layers_of({}, (), 10_000)
     assert [layer.name for layer in plain] == ["rgb", "depth", "missing"]
     given = SceneInput.of(View(scene=run.run.path))
     looked = subject_of(View(scene=run.run.path), given)
-    assert [layer.name for layer in looked.layers] == ["rgb", "depth", "missing", "features", "labels", "overlay"]
+    semantic = ["features", "labels", "overlay"]
+    assert [layer.name for layer in looked.layers] == ["rgb", "depth", "missing", *semantic, "expected error"]
+    for _ in looked.maps["expected error"].add_views(lambda: None):  # the record that the fit has left
+        pass
     camera = camera_of(looked.first.pose, 40, 30, looked.origin)
     pictures = {layer.name: finished(layer.draw(looked.scene, camera, FAST)).picture for layer in looked.layers}
     assert all(x.shape == (30, 40, 3) and x.dtype == np.uint8 for x in pictures.values())
