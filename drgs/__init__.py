@@ -44,6 +44,7 @@ _NAMES = {
     "Gaussians": "ellipsoids",
     "Planner": "planner",
     "Prior": "gain",
+    "Region": "information.region",
     "RenderSettings": "settings",
     "Scoring": "select",
     "Selection": "select",
@@ -122,6 +123,7 @@ __all__ = [
     "Gaussians",
     "Planner",
     "Prior",
+    "Region",
     "RenderSettings",
     "Scoring",
     "Selection",
@@ -197,6 +199,7 @@ if TYPE_CHECKING:
     from drgs.fitting.records import load_run
     from drgs.gain import Prior
     from drgs.information.expected_error import ErrorRecord, error_record, expected_error
+    from drgs.information.region import Region
     from drgs.integrator import render, render_jvp
     from drgs.lab import crossval as crossval
     from drgs.lab import ladder as ladder

@@ -30,6 +30,7 @@ from drgs.ellipsoids import Scene, check_any_scene
 from drgs.information.choices import METHODS, POLICIES
 from drgs.information.criteria import CRITERIA
 from drgs.information.inputs import Masks, mask_list
+from drgs.information.region import Region
 from drgs.information.scoring import Scoring
 from drgs.information.sums import Information
 from drgs.selection.cache import Cache
@@ -45,6 +46,7 @@ __all__ = [
     "Pick",
     "Pool",
     "Refine",
+    "Region",
     "Scoring",
     "Selection",
     "policy_named",
@@ -72,6 +74,7 @@ def select(
     information: Callable[[Camera], Information] | None = None,
     workers: Workers | None = None,
     refine: Refine | None = None,
+    region: Region | None = None,
     **fields: Any,
 ) -> Selection:
     """Pick k cameras. No image of a candidate is needed.
@@ -108,11 +111,14 @@ def select(
             (`drgs.cluster.connect.opened`); scores and picks are made here, of the same bits.
         refine: Move each pick to where its view scores higher; of `fisher`, `fisherrf` and `coverage`, whose scores add
             up (no z-scores). `Pick.camera` is where to.
+        region: The part of the scene that counts (`drgs.Region`), of `fisher`, `fisherrf` and `coverage`: what is left
+            unknown of pixels that show it. Every view that shows some of it is computed twice.
         **fields: Fields of `Scoring`, in place of `scoring`: `criterion`, `settings`, `method`, `prior`, `weights`,
             `groups`, `blocks`, `semantics`, `network`, `combine`, `probes`; None is the default.
     Raises:
         ValueError: If there are no candidates or fewer than k, an argument is unknown, information is negative, NaN
-            or infinite, or a policy returns something else than a choice of k candidates.
+            or infinite, no view shows anything of the region, or a policy returns something else than a choice of k
+            candidates.
     """
     started = time.perf_counter()
     check_any_scene("select", gaussians)
@@ -132,6 +138,7 @@ def select(
         information=information,
         workers=workers,
         refine=refine,
+        region=region,
     )
     if masks is not None and information is not None:
         raise ValueError(

@@ -191,6 +191,7 @@ def _setup_of(
     check_conflicts(setup)  # again, as what `auto` means is known now
     if plan:
         plan.check_blocks(dict(x.block for x in setup.components if x.block and x.setting(setup) is None))
+        plan.check_region(None if config.features.semantics == "ignore" else dataset.semantics)
         setup.picked_points, setup.reserved = plan.compared_points, plan.reserved
     return setup, plan
 
@@ -453,7 +454,8 @@ class _Loop:
         for component in trainer.components:
             scoring = component.scoring(scoring)
         scoring = scoring.over(trainer.nuisances)
-        frame, record = plan.pick(trainer.scene(), trainer.photographs(), trainer.step_index, scoring)
+        labels = next((x for component in trainer.components if (x := component.labels())[0]), (None, None))
+        frame, record = plan.pick(trainer.scene(), trainer.photographs(), trainer.step_index, scoring, labels)
         self._join(frame)
         if again := plan.new_start():
             trainer.restart(*again)
@@ -473,6 +475,8 @@ class _Loop:
             f"step {trainer.step_index}: added view {frame.name} ({record['number']} of {plan.timetable.add}, chosen "
             f"by {plan.active.policy} among {len(record['candidates'])} in {record['seconds']:.1f} s)"
         )
+        for note in record["notes"] if plan.active.region is not None else ():
+            bar.note(f"step {trainer.step_index}: {note}")
 
     def _join(self, frame: Frame) -> None:
         """Let components begin with a photograph that was picked, and record what they found."""

@@ -564,6 +564,7 @@ class Select(ComparedViews, Workers):
         heading="Views",
     )
     k: int = option(1, "Number of views to pick, one after the other.", short="k", heading="Views")
+    region: str | None = same_option(SelectionConfig, "region", heading="Views")
     refine: int = option(
         0,
         "Move each pick to a better pose near it, by scoring at most this many further cameras; 0: keep it.",

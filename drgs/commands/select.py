@@ -9,15 +9,18 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from drgs.commands.orbits import OrbitShape
+from drgs.commands.regions import region_of
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import check_lenses, known_views, views_to_compare, with_times
 from drgs.data.camera_lists import camera_to_json
 from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.information.criteria import criterion_named
+from drgs.information.region import RegionText
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import check_file, write_json
 from drgs.select import Refine, Selection, policy_named, select
+from drgs.selection.policies import check_region
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
@@ -40,6 +43,9 @@ def run(args: Select) -> None:
     OrbitShape.of(args)  # refuses what cannot be, before anything is read, as settings do
     settings = args.settings()
     refine = _refine(args)
+    check_region(args.region, args.policy)
+    if args.region is not None:
+        RegionText.of(args.region)  # before the scene is read
     check_file(args.output, "select", [args.scene, args.train or "", args.candidates])
     policy_named(args.policy)
     criterion_named(args.scoring.criterion, "--criterion")
@@ -51,6 +57,7 @@ def run(args: Select) -> None:
     candidates = with_times(candidates, args, given)
     train = with_times(known.cameras, args, given)
     check_lenses("select", settings, [*train, *candidates])
+    region = region_of("select", args, given, dataclasses.replace(known, cameras=train), settings)
     views = len(known.cameras) + len(candidates)
     with args.cluster() as workers, Bar("information", views, not args.quiet) as bar:
         selection = select(
@@ -64,6 +71,7 @@ def run(args: Select) -> None:
             progress=bar.update,
             workers=workers,
             refine=refine,
+            region=region,
         )
     report = _report(args, given, scoring, selection, known, candidates, source)
     write_json(args.output, report)
@@ -97,6 +105,7 @@ def _report(
         "criterion": args.scoring.criterion if args.policy == "fisher" else None,
         "method": args.scoring.method,
         "prior": selection.prior_json(scoring, args.policy),
+        "region": args.region,
         **selection.blocks_json(),
         **(scoring.nuisances.if_any() if args.policy == "fisher" else {}),
         "seed": args.seed,

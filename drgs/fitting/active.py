@@ -15,9 +15,11 @@ Reference:
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,6 +32,7 @@ from drgs.ellipsoids import colors_only
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import Frame, frames_for
 from drgs.fitting.timetable import Timetable
+from drgs.information.region import NothingOfRegion, RegionText, check_masks, masked_photographs
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import write_json
 from drgs.io.run import Run
@@ -39,12 +42,14 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from drgs.cameras import Camera
-    from drgs.data import View
+    from drgs.data import Semantics, View
     from drgs.ellipsoids import Scene
+    from drgs.features.decoder import Decoder
+    from drgs.features.segmentation import Classes
     from drgs.fitting.config import FitConfig
     from drgs.information.choices import Block
     from drgs.information.scoring import Scoring
-    from drgs.selection.pool import Workers
+    from drgs.selection.pool import Pool, Selection, Workers
 
 __all__ = ["SELECTION", "ActiveViews"]
 
@@ -134,6 +139,34 @@ class ActiveViews:
                 raise ValueError(
                     f"active: blocks must be of what is fitted, got {name} for {lacking[name]}; use geometry"
                 )
+
+    def check_region(self, semantics: Semantics | None) -> None:
+        """Raise ValueError for a region that there is not, before the first step and not at the first pick.
+
+        Args:
+            semantics: Those of the data set; None where it has none, or they are not fitted.
+        """
+        from drgs.selection.policies import check_region
+
+        if self.active.region is None:
+            return
+        check_region(self.active.region, self.active.policy)
+        text = RegionText.of(self.active.region, "active")
+        if text.kind == "masks":  # those of the start are read now, to say before the fit what is wrong with them
+            check_masks(Path(text.name), self.views, "active")
+            with contextlib.suppress(NothingOfRegion):
+                start = [self.views[i] for i in self.timetable.start]
+                masked_photographs(Path(text.name), start, [view.camera for view in start], "active")
+            return
+        # Without a file of classes they would be the numbers in label images of all views.
+        is_named = semantics is not None and (semantics.class_file or semantics.embedding_file)
+        classes = semantics.classes if semantics is not None and is_named and text.kind == "class" else None
+        region = text.region(lambda folder: ([], []), lambda: (classes, None), where="active")
+        if not region.is_crossed([self._camera(i) for i in range(len(self.views))]):
+            raise ValueError(
+                f"active: region {text} must be in sight of a photograph, no camera of {len(self.views)} looks at it; "
+                "give it in the world coordinates of the data set"
+            )
 
     @property
     def scoring(self) -> Scoring:
@@ -300,6 +333,7 @@ class ActiveViews:
         frames: list[Frame],
         step: int,
         scoring: Scoring | None = None,
+        labels: tuple[Classes | None, Decoder | None] = (None, None),
     ) -> tuple[Frame, dict]:
         """Choose one more view, then read it.
 
@@ -308,11 +342,11 @@ class ActiveViews:
             frames: The photographs seen so far; of these, too, only the cameras matter, and the masks.
             step: Steps done.
             scoring: How candidates are scored, as components of the fit have completed it; default `scoring`.
+            labels: Classes and decoder of the scene's features, where it has some.
         Returns:
             The photograph, and the record that was appended to `picks`.
         """
         from drgs.information.inputs import mask_list
-        from drgs.selection.policies import choose
         from drgs.selection.pool import Pool
 
         began = time.perf_counter()
@@ -335,7 +369,7 @@ class ActiveViews:
                 progress=bar.update,
                 workers=self._workers,
             )
-            selection = choose(active.policy, pool)
+            selection = self._chosen(pool, labels)
         index = left[selection.picks[0].index]
         views = [{"index": i, "name": self.views[i].name, **self._where(i)} for i in left]
         record = {
@@ -356,6 +390,27 @@ class ActiveViews:
         self.chosen.append(index)
         self.picks.append(record)
         return self._read(index), record
+
+    def _chosen(self, pool: Pool, labels: tuple[Classes | None, Decoder | None]) -> Selection:
+        """The choice of the policy, by the region as far as something is known of it yet."""
+        from drgs.selection.policies import choose
+
+        if self.active.region is None:
+            return choose(self.active.policy, pool)
+
+        def photographs(folder: Path) -> tuple[list[torch.Tensor], list[Camera]]:
+            lenses = self._config.data.undistort == "off"
+            seen = [dataclasses.replace(self.views[i], keeps_lens=lenses) for i in self.chosen]
+            return masked_photographs(folder, seen, list(pool.train), "active")
+
+        text = RegionText.of(self.active.region, "active")
+        try:
+            region = text.region(photographs, lambda: labels, pool.scoring.settings, "active")
+            return choose(self.active.policy, dataclasses.replace(pool, region=region))
+        except NothingOfRegion:
+            selection = choose(self.active.policy, pool)
+            selection.notes.append(f"region {text}: nothing of it is known yet; at this pick the whole scene counts")
+            return selection
 
     def to_json(self) -> dict:
         """Contents of selection.json."""

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from drgs.checks.records import Record, first_difference, one_of, option, part
 from drgs.fitting.renderers import AUTO, check_renderers, named_renderers, planar_of
 from drgs.information.choices import POLICIES, POLICY_NAMES, check_named
+from drgs.information.region import REGION_FORMS, RegionText
 from drgs.information.scoring import Scoring
 from drgs.settings import RenderSettings
 
@@ -450,6 +451,10 @@ class SelectionConfig(Record):
     schedules, networks and photographs go on. `auto`: until 1,000 were triangulated at a start; `always`, as FisherRF's
     code; `never`, as arXiv 2512.22771. Not where `pick_points` brings none, with points of depth maps, and where next
     to none can be triangulated.
+
+    `region`: what is left unknown of pixels that show a part of the scene decides, by the Gaussians that there are at
+    each pick. Of `masks` only those of photographs that have been picked are read, as of everything else of them. At a
+    pick at which no view shows anything of it yet the whole scene counts.
     """
 
     policy: str = option(
@@ -458,6 +463,12 @@ class SelectionConfig(Record):
         metavar=one_of(POLICY_NAMES),
     )
     scoring: Scoring = part(Scoring(), rare=True)
+    region: str | None = option(
+        None,
+        "Part of the scene that counts: a box or a sphere (world coordinates), what masks of some photographs show, or"
+        " a class of a scene with labels; default all.",
+        metavar="|".join(REGION_FORMS),
+    )
     schedule: Schedule = option(
         "auto",
         "Pick view by view (views), one camera at each later time (times), or any camera at any time (pairs); "
@@ -515,6 +526,8 @@ class SelectionConfig(Record):
 
     def __post_init__(self) -> None:
         check_named("active", POLICIES, self.policy)
+        if self.region is not None:
+            RegionText.of(self.region, "active")
         if self.add == 0:
             raise ValueError("active: add must be >= 1, got 0; without --views active all views are used")
         self.check()

@@ -252,6 +252,10 @@ class Backdrop(Quantity):
         """Without the sphere, and what is known outside of masks."""
         return dataclasses.replace(self, sphere=None, empty_outside=False), settings
 
+    def of_part(self) -> Backdrop:
+        """Where pixels outside of masks are left out, although they are known to be empty."""
+        return dataclasses.replace(self, empty_outside=False)
+
     def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
         """The view's opacity, (H, W), and what its unknowns take."""
         computed = {_OPACITY: view.opacity}

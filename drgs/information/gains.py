@@ -38,6 +38,7 @@ __all__ = [
     "dense",
     "information_gain",
     "scorer",
+    "shares_of",
     "variances",
 ]
 
@@ -123,10 +124,15 @@ def scorer(
     prior: Prior | None = None,
     weights: Mapping[str, float] | None = None,
     pool: Information | None = None,
+    shares: Information | None = None,
 ) -> Callable[[Information], Gain]:
     """`information_gain` against a fixed H: what does not depend on the candidate is done once.
 
     Candidates are not searched for negative entries, see `check`; NaN or inf in them raises as the score is not finite.
+
+    Args:
+        train, criterion, prior, weights, pool: The same as for `information_gain`.
+        shares: Factors in [0, 1] of what each parameter adds to the score, as `shares_of` makes them; None: 1.
     """
     rule = criterion_named(criterion, "information_gain")
     prior = prior or Prior()
@@ -140,8 +146,23 @@ def scorer(
             raise ValueError(
                 f"information_gain: weights must be None for {criterion}, got {dict(weights)}; a block has no parts"
             )
-        return _Blocks(train[DENSE], prior, BLOCK_LAYOUT)
-    return _Diagonal(train, criterion, rule.term, prior, dict(weights or {}), pool)
+        return _Blocks(train[DENSE], prior, BLOCK_LAYOUT, shares=None if shares is None else shares[DENSE])
+    return _Diagonal(train, criterion, rule.term, prior, dict(weights or {}), pool, shares)
+
+
+def shares_of(part: Information, whole: Information) -> dict[str, torch.Tensor]:
+    """The share of each parameter's information that is of a part of it, float64 in [0, 1]; 0 where there is none.
+
+    Args:
+        part, whole: Group -> information, of the same parameters. Of dense blocks the share is one of each Gaussian,
+            of the sums of the diagonals.
+    """
+    shares = {}
+    for name, x in whole.items():
+        own, all_of_it = (y.diagonal(dim1=1, dim2=2).sum(1) if name == DENSE else y for y in (part[name], x))
+        ratio = own.to(torch.float64) / all_of_it.to(torch.float64)
+        shares[name] = torch.where(all_of_it > 0, ratio, 0.0).clamp(0, 1)  # above 1 by rounding alone
+    return shares
 
 
 def variances(train: Information, prior: Prior | None = None) -> dict[str, torch.Tensor]:
@@ -198,6 +219,7 @@ class _Diagonal:
         prior: Prior,
         weights: dict,
         pool: Information | None = None,
+        shares: Information | None = None,
     ):
         for name, weight in weights.items():
             if name not in train:
@@ -211,6 +233,7 @@ class _Diagonal:
         self.left_out = {name: int((x == 0).sum()) for name, x in self.inverse.items()}
         self.unseen = {name: (H == 0).to(torch.float64) for name, H in train.items()}
         self.wanted = self.inverse
+        self.shares = shares
         if pool is not None:
             _check_alike("pool", pool, self.inverse)
             self.wanted = {name: pool[name].to(torch.float64) * x for name, x in self.inverse.items()}
@@ -225,11 +248,13 @@ class _Diagonal:
             seen_or_not = 0.0
             only_unseen = 0.0
             rows = _informed_rows(candidate[name])
-            each = (candidate[name], variance, self.wanted[name], self.unseen[name])
+            each = [candidate[name], variance, self.wanted[name], self.unseen[name]]
+            each += [] if self.shares is None else [self.shares[name]]
             chunks = (x[rows].flatten().split(_CHUNK) for x in each)
-            for new, known, wanted, is_unseen in zip(*chunks, strict=True):
+            for new, known, wanted, is_unseen, *share in zip(*chunks, strict=True):
                 # float64, as ratios span more than float32 has digits for; a copy, which a term may overwrite.
                 terms = self.term(new.to(torch.float64, copy=True).mul_(known), wanted)
+                terms = terms * share[0] if share else terms
                 seen_or_not += float(terms.sum())
                 only_unseen += float(terms @ is_unseen)
             parts[name] = weight * seen_or_not
@@ -304,7 +329,14 @@ def block_gain(
 class _Blocks:
     """Scores of candidates against one block a Gaussian."""
 
-    def __init__(self, train: torch.Tensor, prior: Prior, layout: Mapping[str, slice], rounding: float = _ROUNDING):
+    def __init__(
+        self,
+        train: torch.Tensor,
+        prior: Prior,
+        layout: Mapping[str, slice],
+        rounding: float = _ROUNDING,
+        shares: torch.Tensor | None = None,
+    ):
         if train.ndim != 3 or train.shape[1] != train.shape[2]:
             raise ValueError(
                 f"block_gain: train must have shape (N, B, B), got {tuple(train.shape)}; use fisher.blocks"
@@ -314,6 +346,7 @@ class _Blocks:
                 f"block_gain: layout must cover 0..{train.shape[1] - 1} once, got {dict(layout)}; correct it"
             )
         self.rounding = rounding
+        self.shares = shares
         self.H = train
         diagonal = train.diagonal(dim1=1, dim2=2).to(torch.float64)
         lambdas = prior.per_group({name: diagonal[:, place] for name, place in layout.items()})
@@ -334,6 +367,7 @@ class _Blocks:
             )
         after, repaired = _log_determinants([self.H, Hc], self.keep, self.added, self.rounding)
         gains = after - self.before
+        gains = gains if self.shares is None else gains * self.shares
         parts = {DENSE: float(gains.sum())}
         unseen = {DENSE: float(gains[self.H.diagonal(dim1=1, dim2=2).sum(1) == 0].sum())}
         return Gain(_total("block_logdet", parts), parts, dict(self.left_out), unseen, self.repaired + repaired)

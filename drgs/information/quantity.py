@@ -161,6 +161,10 @@ class Quantity:
         """Names of what is computed that may be negative."""
         return ()
 
+    def of_part(self) -> Quantity:
+        """The same, of those pixels of a view that a mask keeps: what is known of the others does not count."""
+        return self
+
     def hit_probes(self, view: ViewContext) -> HitProbes | None:
         """Sums over hits that a traversal for another quantity may fill; None: there are none."""
         return None
@@ -200,6 +204,10 @@ class Joint(Quantity):
     def key(self, camera: Camera, settings: RenderSettings) -> Hashable:
         """That of each part."""
         return tuple((block, quantity.key(camera, settings)) for block, quantity in self.parts)
+
+    def of_part(self) -> Joint:
+        """That of each part."""
+        return Joint(tuple((block, quantity.of_part()) for block, quantity in self.parts))
 
     @property
     def signed(self) -> tuple[str, ...]:

@@ -55,20 +55,23 @@ class Combination:
         needed = criterion_named(self.scoring.criterion, "select").needs_pool
         return needed and (bool(self.apart) or not self.traced)
 
-    def scorer(self, H: Information, pool: Information | None = None) -> Callable[[Information], Gain]:
+    def scorer(
+        self, H: Information, pool: Information | None = None, shares: Information | None = None
+    ) -> Callable[[Information], Gain]:
         """Gains of candidates against H, that of the known views.
 
         Args:
             H: Group -> tensor.
             pool: The information of all views together, where scores are `pooled`.
+            shares: Factors of what each parameter adds, as `drgs.information.gains.scorer` takes them; None: 1.
         Raises:
             ValueError: If the prior or weights name a group that there is not.
         """
         scoring = self.scoring
         if not self.apart:
             if self.traced:
-                return _Trace(scoring.weights)
-            return scorer(H, scoring.criterion, scoring.prior_of(), scoring.weights, pool)
+                return _Trace(scoring.weights, shares)
+            return scorer(H, scoring.criterion, scoring.prior_of(), scoring.weights, pool, shares)
         known = {name.partition(".")[2] for name in H}
         lambdas = scoring.prior_of()
         for what, names in (("Prior: groups", lambdas.groups), ("information_gain: weights", scoring.weights)):
@@ -81,11 +84,12 @@ class Combination:
             weights = {name: x for name, x in scoring.weights.items() if name in own}
             theirs = {name: x for name, x in lambdas.groups.items() if name in own}
             prior = dataclasses.replace(lambdas, groups=theirs)
+            its_shares = None if shares is None else _own(shares, block)
             if block == self.traced:
-                by_block[block] = _Trace(weights)
+                by_block[block] = _Trace(weights, its_shares)
             else:
                 everything = None if pool is None else _own(pool, block)
-                by_block[block] = scorer(own, scoring.criterion, prior, weights, everything)
+                by_block[block] = scorer(own, scoring.criterion, prior, weights, everything, its_shares)
 
         def score(candidate: Information) -> Gain:
             gains = {block: one(_own(candidate, block)) for block, one in by_block.items()}
@@ -133,15 +137,17 @@ class Combination:
 class _Trace:
     """Scores of candidates by their own information alone: it is a trace already."""
 
-    def __init__(self, weights: Mapping[str, float]) -> None:
+    def __init__(self, weights: Mapping[str, float], shares: Information | None = None) -> None:
         self.weights = dict(weights)
+        self.shares = shares
 
     def __call__(self, candidate: Information) -> Gain:
         """The gain of one candidate."""
         if unknown := [name for name in self.weights if name not in candidate]:
             known = ", ".join(candidate)
             raise ValueError(f"information_gain: weights must be of {known}, got {unknown[0]!r}; drop it")
-        parts = {name: self.weights.get(name, 1.0) * float(x.double().sum()) for name, x in candidate.items()}
+        counted = {name: x.double() if self.shares is None else x * self.shares[name] for name, x in candidate.items()}
+        parts = {name: self.weights.get(name, 1.0) * float(x.sum()) for name, x in counted.items()}
         return Gain(math.fsum(parts.values()), parts, {}, dict.fromkeys(parts, 0.0))
 
 

@@ -15,13 +15,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import torch
 
 from drgs.cameras import Camera
-from drgs.information.gains import Gain, check
+from drgs.information.gains import Gain, check, shares_of
 from drgs.information.network_groups import NETWORK_GROUPS
 from drgs.information.prior import Prior
 from drgs.information.quantity import Quantity
@@ -35,6 +35,7 @@ from drgs.selection.refining import refined
 __all__ = ["PoolView", "ViewInformation", "greedy"]
 
 _MEMORY_SHARE = 0.25  # of the free memory, for information that could be computed again; chosen
+_WHOLE = 1e-5  # below 1, from which on a share of a pixel is all of it: rounding of float32 sums of weights
 _ROUNDING = 1e-12  # relative: how far a sum of float64 gains may rise again by rounding, and a bound be missed by
 
 
@@ -45,12 +46,14 @@ class PoolView(NamedTuple):
         title: What it is called in messages.
         camera, mask: The camera and the mask of the view.
         is_known: Whether it is one of the known ones.
+        of_region: Whether its mask is that of a region.
     """
 
     title: str
     camera: Camera
     is_known: bool = False
     mask: torch.Tensor | None = None
+    of_region: bool = False
 
 
 class ViewInformation:
@@ -78,7 +81,7 @@ class ViewInformation:
 
     def each(self, views: Sequence[PoolView]) -> Iterator[Information]:
         """The information of these views, one after another: nothing of one is held while the next one is computed."""
-        quantities = [self.of_known if view.is_known else self.quantity for view in views]
+        quantities = [self._quantity_of(view) for view in views]
 
         def accept(i: int, computed: Information) -> None:
             self.computed += 1
@@ -100,6 +103,10 @@ class ViewInformation:
     def expect(self, more: int) -> None:
         """So many more views will be computed, for `progress`."""
         self._expected += more
+
+    def _quantity_of(self, view: PoolView) -> Quantity:
+        quantity = self.of_known if view.is_known else self.quantity
+        return quantity.of_part() if view.of_region else quantity
 
     def _counted(self, quantity: Quantity, view: PoolView, computed: Information) -> Information:
         """The information that adds up over views, of what was computed of one."""
@@ -129,7 +136,7 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         raise ValueError("select: refine must be None with combine zscore, which compares candidates; use combine sum")
     if not combination.traced or combination.apart:  # a trace alone has no lambda
         _check_prior(pool, prior)
-    H, everything, scores, kept = _first_round(pool, information, combination)
+    H, wanted, scores, kept = _first_round(pool, information, combination)
     gains = combination.compared(scores)
     selection = Selection(
         picks=[],
@@ -140,7 +147,12 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         prior=dataclasses.replace(prior, lengths={}),  # what is told of it, as of the scoring, are plain numbers
         evaluations=len(gains),
         computed=information.computed,
-        notes=[*_notes(gains, combination.apart), *_silent(information.has_any), *_crowded(pool.cache, information)],
+        notes=[
+            *_notes(gains, combination.apart),
+            *_silent(information.has_any),
+            *_crowded(pool.cache, information),
+            *([wanted.note] if wanted.note else []),
+        ],
     )
     # Scores never rise as H grows, unless lambda or the set of counted parameters changes with it.
     falling = pool.lazy and not prior.relative and min((prior.value, *prior.groups.values())) > 0 and combination.falls
@@ -151,7 +163,7 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         margin = gains[best].total - gains[order[1]].total if len(order) > 1 else None
         pick, picked = pool.pick(best, gains[best].total, gains[best].parts, margin), kept.get(best)
         if pool.refine is not None:
-            score = combination.scorer(H, everything)
+            score = combination.scorer(H, wanted.pool, wanted.shares)
             compute = information.again(pool.refine.evaluations)
             start = pool.candidates[best]
             camera, gain, moved, count = refined(
@@ -168,16 +180,32 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         assert picked is not None  # kept, as more than one is picked
         _add(H, picked)
         fresh = set()  # the other scores are bounds now
-        selection.evaluations += _refresh(gains, left, fresh, falling, combination.scorer(H, everything), kept)
+        selection.evaluations += _refresh(
+            gains, left, fresh, falling, combination.scorer(H, wanted.pool, wanted.shares), kept
+        )
         for i, gain in zip(left, combination.compared([gains[i] for i in left]), strict=True):
             gains[i] = gain
 
 
+class _Wanted(NamedTuple):
+    """What scores need to know of all views together, known ones and candidates.
+
+    Attributes:
+        pool: The information of all views, of the pixels that count; None where scores are not pooled.
+        shares: Factors of what each parameter adds to a score, where a region counts and scores are not pooled.
+        note: What is to be said of the region; "" where there is nothing.
+    """
+
+    pool: Information | None = None
+    shares: Information | None = None
+    note: str = ""
+
+
 def _first_round(
     pool: Pool, information: ViewInformation, combination: Combination
-) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor] | None, list[Gain], dict[int, Information]]:
-    """H of the training views and, where scores are pooled, of all views; every candidate's gain and, where it is
-    wanted again, its information by index.
+) -> tuple[dict[str, torch.Tensor], _Wanted, list[Gain], dict[int, Information]]:
+    """H of the training views, what scores need of all views, every candidate's gain and, where it is wanted again, its
+    information by index.
     """
     H: dict[str, torch.Tensor] = {}
     gains: list[Gain] = []
@@ -187,6 +215,7 @@ def _first_round(
         for i, (camera, mask) in enumerate(zip(pool.train, pool.masks or [None] * len(pool.train), strict=True))
     ]
     candidates = [PoolView(f"candidate {i} ({camera.name})", camera) for i, camera in enumerate(pool.candidates)]
+    shares, note = _shares_of_region(pool, [*known, *candidates])
     each = information.each([*known, *candidates])
     for _ in known:
         part = next(each)
@@ -199,7 +228,7 @@ def _first_round(
         part = next(each)
         if i == 0:
             H = _nothing(part) | H  # also of groups that are not computed of known views
-            if combination.pooled:
+            if combination.pooled or pool.region is not None:
                 everything = {name: x.clone() for name, x in H.items()}
                 keeps = keeps or _fits(part, len(candidates))
             else:
@@ -211,13 +240,63 @@ def _first_round(
         if keeps:
             kept[i] = part
         del part  # else two views are alive while the next one is computed
+    wanted = _Wanted()
     if everything is not None:
-        score = combination.scorer(H, everything)
+        wanted = _Wanted(everything)
+        if pool.region is not None:
+            of_region = _of_region(information, [*known, *candidates], shares, everything)
+            wanted = _Wanted(of_region) if combination.pooled else _Wanted(None, shares_of(of_region, everything))
+        score = combination.scorer(H, wanted.pool, wanted.shares)
         if not keeps:
             information.expect(len(candidates))
             each = information.each(candidates)
         gains = [score(kept[i] if keeps else next(each)) for i in range(len(candidates))]
-    return H, everything, gains, kept
+    return H, wanted._replace(note=note), gains, kept
+
+
+def _shares_of_region(pool: Pool, views: Sequence[PoolView]) -> tuple[list[torch.Tensor | None], str]:
+    """How much of each pixel of the views shows the pool's region, and what is to be said of it; None: all of it does.
+
+    Raises:
+        NothingOfRegion: If no view shows any of it.
+    """
+    if pool.region is None:
+        return [None] * len(views), ""
+    shares, note = pool.region.shares(pool.scene, [view.camera for view in views], pool.scoring.settings, "select")
+    return [None if bool((share > 1 - _WHOLE).all()) else share for share in shares], note
+
+
+def _of_region(
+    information: ViewInformation,
+    views: Sequence[PoolView],
+    shares: Sequence[torch.Tensor | None],
+    everything: Mapping[str, torch.Tensor],
+) -> dict[str, torch.Tensor]:
+    """The information of all views, each pixel weighed by how much of it shows a region.
+
+    Squares of derivatives are multiplied by the square of a mask, so that the root of the shares is the mask.
+
+    Args:
+        information: The information of single views.
+        views: All views.
+        shares: (H, W) of each; None: all of it shows the region.
+        everything: The information of all pixels of all views.
+    """
+    if all(share is None for share in shares):
+        return dict(everything)
+    parts = []
+    for view, share in zip(views, shares, strict=True):
+        if share is not None and not bool(share.any()):
+            continue
+        mask = view.mask
+        if share is not None:
+            mask = share.sqrt() if view.mask is None else share.sqrt() * view.mask
+        parts.append(view._replace(mask=mask, of_region=share is not None))
+    information.expect(len(parts))
+    total = {name: torch.zeros_like(x) for name, x in everything.items()}
+    for part in information.each(parts):
+        _add(total, {name: part.get(name, torch.zeros_like(x)) for name, x in everything.items()})
+    return total
 
 
 def _fits(part: Information, count: int) -> bool:

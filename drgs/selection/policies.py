@@ -12,7 +12,7 @@ from drgs.checks.arguments import kind_of, must_be
 from drgs.information.choices import POLICIES, check_named
 from drgs.selection.pool import Pick, Pool, Selection
 
-__all__ = ["choose", "policy_named"]
+__all__ = ["check_region", "choose", "policy_named"]
 
 _INFORMED = ("fisher", "fisherrf", "coverage")
 """Policies that score a camera by the information of its view."""
@@ -33,9 +33,19 @@ def choose(policy: str, pool: Pool) -> Selection:
                 raise ValueError(
                     f"select: {name} must be None with policy {policy}, got some; use {', '.join(_INFORMED)}{advice}"
                 )
+    check_region(None if pool.region is None else pool.region.text, policy)
     selection = function(pool)
     _check_selection(f"select: policy {policy}", pool, selection)
     return selection
+
+
+def check_region(region: str | None, policy: str) -> None:
+    """Raise ValueError if there is a region, and the policy does not look at what views show."""
+    if region is not None and policy in POLICIES and policy not in _INFORMED:
+        raise ValueError(
+            f"select: region must be none with policy {policy}, which does not score by what pixels show, got "
+            f"{region}; use {', '.join(_INFORMED)}"
+        )
 
 
 def policy_named(name: str) -> Callable[[Pool], Selection]:

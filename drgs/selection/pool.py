@@ -18,6 +18,7 @@ from drgs.information.choices import Combine
 from drgs.information.criteria import criterion_named
 from drgs.information.prior import Prior
 from drgs.information.quantity import Quantity, ViewContext, once_per_time
+from drgs.information.region import Region
 from drgs.information.scoring import Scoring
 from drgs.information.sums import Information
 from drgs.selection.cache import Cache, view_key
@@ -163,6 +164,7 @@ class Pool:
         information: Camera -> Information, in place of what `drgs.fisher` computes.
         workers: Processes that compute information; None: this one.
         refine: How far picks are moved to where they score higher; None: not at all.
+        region: The part of the scene that counts; None: all of it.
     Raises:
         ValueError: If there are no candidates or fewer than k, or an argument is wrong or means nothing beside others.
     """
@@ -181,6 +183,7 @@ class Pool:
     information: Callable[[Camera], Information] | None = None
     workers: Workers | None = None
     refine: Refine | None = None
+    region: Region | None = None
 
     def __post_init__(self) -> None:
         count = len(self.candidates)
@@ -195,8 +198,14 @@ class Pool:
         criterion_named(self.scoring.criterion, "select")  # else the first view's information would be computed before
         if self.refine is not None:
             must_be("select", "refine", self.refine, Refine, "e.g. drgs.select.Refine(evaluations=40)")
+        if self.region is not None:
+            must_be("select", "region", self.region, Region, "e.g. drgs.Region.box((0, 0, 0), (1, 1, 1))")
         if self.information is None:
             return
+        if self.region is not None:
+            raise ValueError(
+                "select: region must be None with information, got both; an information function weighs pixels itself"
+            )
         if self.workers is not None:
             raise ValueError("select: workers must be None with information, got both; a function is called here")
         scoring = self.scoring  # of the rest, what means nothing beside information would be dropped in silence

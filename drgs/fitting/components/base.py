@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.data import Dataset, View
     from drgs.ellipsoids import Gaussians, Scene
+    from drgs.features.decoder import Decoder
+    from drgs.features.segmentation import Classes
     from drgs.fitting.config import FitConfig
     from drgs.fitting.frames import Frame
     from drgs.fitting.losses import LossTerm
@@ -345,6 +347,10 @@ class Component:
     def scoring(self, scoring: Scoring) -> Scoring:
         """How candidates of an active fit are scored."""
         return scoring
+
+    def labels(self) -> tuple[Classes | None, Decoder | None]:
+        """The classes of the scene, and the decoder of its features, by which a class is found; None without."""
+        return None, None
 
     def log_fields(self, fit: Fit, terms: Sequence[Mapping[str, float]]) -> dict[str, Any]:
         """Its part of the `train` events; `terms` of the loss by name, of the steps since the last event."""

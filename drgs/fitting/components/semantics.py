@@ -434,6 +434,12 @@ class SemanticsComponent(Component):
 
         return dataclasses.replace(scoring, semantics=SemanticMetric(self.decoder.metric()))
 
+    def labels(self) -> tuple[Classes | None, Decoder | None]:
+        """See `Component`."""
+        if self.known is None or self._folder is None:
+            return None, None
+        return self.known.read_classes(self._folder), self.decoder
+
     def log_fields(self, fit: Fit, terms: Sequence[Mapping[str, float]]) -> dict[str, Any]:
         """See `Component`: the mean distance of features."""
         values = [x for one in terms if math.isfinite(x := one.get("features", math.nan))]

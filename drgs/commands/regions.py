@@ -1,0 +1,52 @@
+"""The region that `--region` names, of a command's scene and known views."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from drgs.commands.viewpoints import Source
+from drgs.information.region import Region, RegionText, masked_photographs
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import torch
+
+    from drgs.cameras import Camera
+    from drgs.commands.scene_input import SceneInput
+    from drgs.commands.viewpoints import Known
+    from drgs.settings import RenderSettings
+
+__all__ = ["region_of"]
+
+
+def region_of(command: str, args: Any, given: SceneInput, known: Known, settings: RenderSettings) -> Region | None:
+    """The region of `--region`; None without.
+
+    Args:
+        command: Name of the command, for messages.
+        args: Options of a command with --region and --train.
+        given: The command's scene.
+        known: Its known views, whose photographs masks may be of.
+        settings: Settings of the renderer, by which masks are put on Gaussians.
+    Raises:
+        ValueError: If the text is none of a region, or the scene or its data set do not have what it names.
+    """
+    if args.region is None:
+        return None
+
+    def photographs(folder: Path) -> tuple[Sequence[torch.Tensor], Sequence[Camera]]:
+        source = Source.known(args.train, given)
+        if source.kind == "list":
+            raise ValueError(
+                f"{command}: region masks:{folder} must be of photographs, --train {source.text} is a list of cameras; "
+                "name their data set or a run"
+            )
+        views = {view.name: view for view in source.dataset(args, given).views}
+        photographed = [dataclasses.replace(views[x.name], keeps_lens=known.lenses) for x in known.cameras]
+        return masked_photographs(folder, photographed, known.cameras, command)
+
+    text = RegionText.of(args.region, command)
+    return text.region(photographs, lambda: (given.classes, given.decoder), settings, command)
