@@ -150,6 +150,25 @@ def test_arrows_in_the_viewer(half_seen, viewers):  # noqa: F811
     assert len(points) == 2
 
 
+def test_places_that_look_at_a_region(half_seen, capsys):
+    """For the side of the ball that is on the one or the other end of the hole, places are on that end."""
+    found = {}
+    for degrees in (GAP[0], GAP[1]):
+        x, y = (0.7 * f(math.radians(degrees)) for f in (math.cos, math.sin))
+        region = f"sphere:{x:.3f},{y:.3f},0,0.4"
+        assert cli.main(["capture", "--more", "-k", "1", "-o", str(half_seen), "--region", region]) == 0
+        written = json.loads((half_seen / "next.json").read_text())
+        assert written["region"] == region
+        eye = np.array(written["picks"][0]["camera"]["c2w"])[:3, 3]
+        found[degrees] = abs((degrees_of(eye) - degrees + 180) % 360 - 180)
+    assert all(apart < 90 for apart in found.values())
+    capsys.readouterr()
+    assert cli.main(["capture", "--more", "-o", str(half_seen), "--region", "ball"]) == 2
+    assert "region must be box:" in capsys.readouterr().err
+    assert cli.main(["capture", str(half_seen), "-o", str(half_seen / "x"), "--region", "sphere:0,0,0,1"]) == 2
+    assert "--region must have --more" in capsys.readouterr().err
+
+
 def test_lengths_in_meters(half_seen):
     """A distance between two photographs makes meters of all of them."""
     base = math.dist(on_ring(0).center, on_ring(25).center)

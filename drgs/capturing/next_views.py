@@ -18,6 +18,7 @@ from drgs.data.camera_lists import camera_to_json
 from drgs.display.progress import Bar
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import fitted_views, load_run
+from drgs.information.region import Region, RegionText, masked_photographs
 from drgs.information.scoring import Scoring
 from drgs.information.semantics import SemanticMetric
 from drgs.integrator import render
@@ -47,7 +48,9 @@ _COMPARED_PHOTOGRAPHS = 8  # of those there are, whose own gain a place's is div
 _FARTHEST = 3.0  # times the median distance of Gaussians from the cameras: beyond are floaters
 
 
-def rank_next(run: Path, k: int, length: str | None, show: bool = True) -> list[dict[str, Any]]:
+def rank_next(
+    run: Path, k: int, length: str | None, show: bool = True, region: str | None = None
+) -> list[dict[str, Any]]:
     """Rank places for the next photographs, and write them into the run as `next.json`.
 
     Args:
@@ -55,13 +58,16 @@ def rank_next(run: Path, k: int, length: str | None, show: bool = True) -> list[
         k: How many places.
         length: Two photographs and the distance between them, from which meters follow; None: shares of the way.
         show: Whether to show progress.
+        region: Text of the part of the scene that counts; None: all of it.
     Returns:
         The picks of the file, the best first, with `text`: what to do, and `gain`: its information gain over that of
         one of the photographs that are there beside all others, on average.
     Raises:
         FileNotFoundError: If it is no run, or its data set has gone.
-        ValueError: If things move, the photographs say nothing of where one can stand, or `length` is wrong.
+        ValueError: If things move, the photographs say nothing of where one can stand, `length` is wrong, or there is
+            no such region.
     """
+    text = None if region is None else RegionText.of(region, "capture")
     folder = Run(run)
     with lock_folder(run, "capture", [NEXT]), Bar("next photographs", show=show) as bar:
         loaded = load_run(folder)
@@ -71,7 +77,8 @@ def rank_next(run: Path, k: int, length: str | None, show: bool = True) -> list[
         record.check_data(run)
         dataset = load_dataset(record.data, record.config, lazy=True, points=False, semantics=False)
         pixels = min(_INFORMATION_PIXELS, record.config.data.max_pixels)
-        cameras = {view.name: _camera(view, pixels) for view in record.with_refined_poses(dataset).views}
+        views = {view.name: view for view in record.with_refined_poses(dataset).views}
+        cameras = {name: _camera(view, pixels) for name, view in views.items()}
         meters = None if length is None else meters_of(length, {name: x.center for name, x in cameras.items()})
         train = [cameras[name] for name in fitted_views(folder, record) if name in cameras]
         settings = RenderSettings.preset("fast")
@@ -80,6 +87,13 @@ def rank_next(run: Path, k: int, length: str | None, show: bool = True) -> list[
             raise ValueError(f"{run}: there must be a place to stand at, found none that is free; use drgs select")
         metric = None if loaded.decoder is None else SemanticMetric(loaded.decoder.metric())
         scoring, cache = Scoring(settings=settings, semantics=metric).over(record.estimated), Cache()
+        counts = None
+        if text is not None:
+            seen = [views[camera.name] for camera in train]
+            labels = (loaded.classes, loaded.decoder)
+            counts = text.region(
+                lambda masks: masked_photographs(masks, seen, train, "capture"), lambda: labels, settings, "capture"
+            )
         bar.update(0, len(train) + len(places))
         ranked = select(
             loaded.scene,
@@ -89,8 +103,9 @@ def rank_next(run: Path, k: int, length: str | None, show: bool = True) -> list[
             scoring=scoring,
             cache=cache,
             progress=bar.update,
+            region=counts,
         )
-        usual = statistics.mean(_gains_of_photographs(loaded, train, scoring, cache))
+        usual = statistics.mean(_gains_of_photographs(loaded, train, scoring, cache, counts))
         rows = [{"index": i, "name": place.camera.name} for i, place in enumerate(places)]
         after = [_place_json(place, meters) for place in places]
         picks = [
@@ -104,6 +119,7 @@ def rank_next(run: Path, k: int, length: str | None, show: bool = True) -> list[
                 "command": "capture",
                 "policy": "fisher",
                 "criterion": scoring.criterion,
+                "region": region,
                 "known": [camera.name for camera in train],
                 "meters": meters,
                 "picks": picks,
@@ -114,11 +130,13 @@ def rank_next(run: Path, k: int, length: str | None, show: bool = True) -> list[
     return picks
 
 
-def _gains_of_photographs(loaded: LoadedRun, train: list[Camera], scoring: Scoring, cache: Cache) -> Iterator[float]:
+def _gains_of_photographs(
+    loaded: LoadedRun, train: list[Camera], scoring: Scoring, cache: Cache, region: Region | None
+) -> Iterator[float]:
     """Information gain of each of a few existing photographs, given all others."""
     for one in train[:: -(-len(train) // _COMPARED_PHOTOGRAPHS)]:
         others = [camera for camera in train if camera is not one]
-        yield select(loaded.scene, [one], others, 1, scoring=scoring, cache=cache).scores[0]
+        yield select(loaded.scene, [one], others, 1, scoring=scoring, cache=cache, region=region).scores[0]
 
 
 def _places(gaussians: Gaussians, cameras: list[Camera], train: list[Camera], settings: RenderSettings) -> list[Place]:

@@ -26,6 +26,8 @@ def run(args: Capture) -> None:
     """`drgs capture PATH... -o RUN`, with `--add` further photographs, and `drgs capture --more -o RUN`."""
     if args.more:
         _print_next(args)
+    elif args.region is not None:
+        raise ValueError(f"--region must have --more, whose photographs it is for, got {args.region}; drop it")
     else:
         capture_photographs(args, FitConfig().replace(exposure="auto"))
 
@@ -64,7 +66,7 @@ def _print_next(args: Capture) -> None:
         raise ValueError(f"--more must have no photographs, got {args.paths[0]}; drop one or the other")
     if args.k < 1:
         raise ValueError(f"-k must be at least 1, got {args.k}; ask for some")
-    picks = rank_next(args.output, args.k, args.length, not args.quiet)
+    picks = rank_next(args.output, args.k, args.length, not args.quiet, args.region)
     if args.quiet:
         return
     if args.length is None:

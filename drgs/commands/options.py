@@ -604,6 +604,13 @@ class Fisher(ComparedViews):
         Path("out/fisher"), "Folder for information.safetensors, fisher.json and the maps.", short="o"
     )
     limit: int = option(4, "At most this many views for maps, evenly spaced.", heading="Views", within=VIEWS)
+    region: str | None = same_option(
+        SelectionConfig,
+        "region",
+        help="Part of the scene whose pixels are told apart, too: a box or a sphere (world coordinates), what masks of"
+        " some photographs show, or a class of a scene with labels.",
+        heading="Views",
+    )
     pose: bool = option(False, "Also report the information of each of these views about its own pose, a 6x6 matrix.")
     maps: bool = option(
         False, "Also write an image of each view side by side with its maps of moments, of fisherrf and of every block."
@@ -803,6 +810,7 @@ class Capture(Common):
         False, "Print which photographs to take next: where to stand, where to look, and how much they would tell."
     )
     k: int = option(5, "Number of photographs that --more suggests.", short="k", heading="Views", within=COUNT)
+    region: str | None = same_option(SelectionConfig, "region", heading="Views")
     length: str | None = option(
         None, "Measured distance of two photographs, 'IMG_0001 IMG_0004 1.5 m', so that --more prints meters."
     )
