@@ -492,3 +492,24 @@ def test_configuration_of_a_region():
     """A text that is none is refused where the configuration is made."""
     with pytest.raises(ValueError, match="active: region must be box"):
         drgs.SelectionConfig(region="cube")
+
+
+def test_fisher_tells_its_pixels(place, capsys):
+    """Pixels, mean variance and expected error of what shows it, in each view; of everything, those of the view."""
+    line = ["fisher", str(place / "run"), "--limit", "2", "--preset", "fast", "-o", str(place / "fisher")]
+    assert cli.main([*line, "--region", "box:-9,-9,-9,9,9,9"]) == 0, capsys.readouterr().err
+    text = capsys.readouterr().out
+    report = json.loads((place / "fisher/fisher.json").read_text())
+    assert report["region"] == "box:-9,-9,-9,9,9,9"
+    for view in report["views"]:
+        assert view["region"]["pixels"] == pytest.approx(SIZE**2, rel=1e-4)
+        assert view["region"]["variance"] == pytest.approx(view["variance"]["mean"], rel=1e-4)
+        assert view["region"]["rmse"] == pytest.approx(view["error"]["rmse"], rel=1e-4)
+        assert (place / "fisher" / view["files"][-1]).is_file()
+    assert "region box:-9,-9,-9,9,9,9" in text
+    assert cli.main([*line, "--region", f"masks:{place / 'left'}"]) == 0, capsys.readouterr().err
+    for view in json.loads((place / "fisher/fisher.json").read_text())["views"]:
+        assert 0 < view["region"]["pixels"] < SIZE**2
+        assert view["region"]["rmse"] > 0
+    assert cli.main([*line, "--region", "sphere:0,90,0,1"]) == 2
+    assert "fisher: region sphere:0,90,0,1 must be in sight of a view" in capsys.readouterr().err

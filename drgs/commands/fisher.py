@@ -28,6 +28,7 @@ import torch
 
 from drgs import fisher
 from drgs.commands.orbits import OrbitShape
+from drgs.commands.regions import region_of
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import check_lenses, evenly, known_views, views_to_compare, with_times
 from drgs.data.camera_lists import camera_to_json
@@ -39,6 +40,7 @@ from drgs.gain import Information, Prior, check, information_gain, variances
 from drgs.information.blocks import MAP_PRIOR, SceneBlocks
 from drgs.information.expected_error import PARTS, error_parts
 from drgs.information.maps import fisherrf_map, moments_map
+from drgs.information.region import RegionText
 from drgs.information.sums import add, together
 from drgs.integrator import render
 from drgs.io.checkpoint import save_state
@@ -70,6 +72,8 @@ def run(args: Fisher) -> None:
     OrbitShape.of(args)  # refuses what cannot be, before anything is read, as settings do
     settings = args.settings()
     prior = args.scoring.prior or MAP_PRIOR
+    if args.region is not None:
+        RegionText.of(args.region, "fisher")
     inputs = [args.scene, args.train or "", args.cameras or ""]
     output = lock_folder(args.output, "fisher", ["information.safetensors", "fisher.json"], inputs)
     given = SceneInput.of(args)
@@ -90,12 +94,18 @@ def run(args: Fisher) -> None:
     views = evenly(with_times(views, args, given), args.limit)
     check_lenses("fisher", settings, [*known.cameras, *views])
     scoring = given.scoring(args.scoring, settings)
+    region = region_of("fisher", args, given, known, settings)
+    shown = None if region is None else region.shares(given.scene, views, settings, "fisher")
     with Bar("information", len(known.cameras) + len(views), not args.quiet) as bar:
         errors = _errors(args, given, known, settings)
         maps = InformationMaps(args.scene, given, scoring, prior, known, views, source, args.pose, args.maps, errors)
+        if region is not None and shown is not None:
+            maps = dataclasses.replace(maps, region=region.text, shares=shown.shares)
         groups, rows = maps.write(output, bar.advance)
     if not args.quiet:
         _print(args, known, groups, rows, source)
+        if shown is not None and shown.note:
+            print(f"note: {shown.note}")
 
 
 def _errors(args: Fisher, given: SceneInput, known: Known, settings: RenderSettings) -> ErrorRecord | None:
@@ -129,6 +139,8 @@ class InformationMaps:
         pose: Whether to compute the information of each of these views about its own pose, too.
         compare: Whether to write a picture of each view beside its maps of several rules, too.
         errors: What the photographs of the known views say about errors; None: there are none.
+        region: The text of a region whose pixels are told apart; None: there is none.
+        shares: (H, W) of each view: how much of each pixel shows it.
     """
 
     path: Path
@@ -141,6 +153,8 @@ class InformationMaps:
     pose: bool = False
     compare: bool = False
     errors: ErrorRecord | None = None
+    region: str | None = None
+    shares: Sequence[torch.Tensor] = ()
 
     def write(
         self, output: LockedFolder, advance: Callable[[], None] = lambda: None
@@ -159,6 +173,7 @@ class InformationMaps:
         compared = ComparedMaps(self.given.scene, settings, self.prior.over(1.0)) if self.compare else None
         names = pictures.file_names([camera.name for camera in self.views])
         kinds = [*(["error"] if self.errors else []), *_map_kinds(blocks.names), *(["maps"] if compared else [])]
+        kinds += ["region"] if self.shares else []
         output.check(f"{name}.{kind}.png" for name in names for kind in kinds)
         by_block: dict[str, dict[str, torch.Tensor]] = {}
         for camera in cameras:
@@ -170,14 +185,18 @@ class InformationMaps:
             advance()
         H = together(by_block)
         rows = []
-        for camera, name in zip(self.views, names, strict=True):
-            row = _view(output.path, blocks, camera, name, H, prior, compared, self.pose)
+        for number, (camera, name) in enumerate(zip(self.views, names, strict=True)):
+            share = self.shares[number].numpy() if self.shares else None
+            row = _view(output.path, blocks, camera, name, H, prior, compared, self.pose, share)
             if self.errors:
                 parts = {part: x.numpy() for part, x in error_parts(self.given.scene, camera, self.errors).items()}
                 error = np.sqrt(sum(parts.values()))
                 files = [f"{name}.error.png", *row.files]
                 pictures.write_png(output.path / files[0], pictures.map_picture(error))
                 row = dataclasses.replace(row, files=files, error=ErrorSummary.of(parts))
+                if share is not None and row.region is not None and row.region.pixels:
+                    rmse = float((share * error**2).sum(dtype=np.float64) / row.region.pixels) ** 0.5
+                    row = dataclasses.replace(row, region=dataclasses.replace(row.region, rmse=rmse))
             rows.append(row)
             advance()
         groups = {name: GroupSummary.of(x, by_block, name) for name, x in H.items()}
@@ -207,6 +226,7 @@ class InformationMaps:
             "probes": scoring.probes if is_probed else None,
             "settings": dataclasses.asdict(scoring.settings),
             "pixels": self.known.pixels,
+            "region": self.region,
             "misfit": self.errors.mean_misfit**0.5 if self.errors else None,
             "known": {"source": self.known.source, "names": [camera.name for camera in self.known.cameras]},
             "groups": {name: dataclasses.asdict(row) for name, row in groups.items()},
@@ -283,6 +303,27 @@ class ErrorSummary:
 
 
 @dataclasses.dataclass(frozen=True)
+class RegionSummary:
+    """What a view says of a region, its pixels weighed by how much of each shows it.
+
+    Attributes:
+        pixels: Sum of the shares.
+        variance: Mean of the map `variance` over them; None where no pixel shows any of it, as `rmse`.
+        rmse: Root of the mean squared error that is expected of them, units of color; None without photographs, too.
+    """
+
+    pixels: float
+    variance: float | None
+    rmse: float | None = None
+
+    @classmethod
+    def of(cls, share: np.ndarray, variance: np.ndarray) -> RegionSummary:
+        """The summary of (H, W) shares and a map."""
+        pixels = float(share.sum(dtype=np.float64))
+        return cls(pixels, float((share * variance).sum(dtype=np.float64)) / pixels if pixels else None)
+
+
+@dataclasses.dataclass(frozen=True)
 class PoseSummary:
     """A view's information about its own pose: a 6x6 matrix and its eigenvalues, ascending."""
 
@@ -302,6 +343,7 @@ class MappedView:
         blocks: Block of the image -> kind -> the map of that block alone.
         pose: What it says about its own pose, with --pose; else None.
         error: The error that is expected of it; None where there are no photographs of the known views.
+        region: What it says of the region; None without one.
     """
 
     name: str
@@ -313,6 +355,7 @@ class MappedView:
     blocks: dict[str, dict[str, MapSummary]]
     pose: PoseSummary | None
     error: ErrorSummary | None = None
+    region: RegionSummary | None = None
 
     def to_json(self) -> dict[str, Any]:
         """As fisher.json holds it."""
@@ -322,6 +365,7 @@ class MappedView:
         blocks = self.blocks.items()
         fields |= {"blocks": {b: {kind: dataclasses.asdict(x) for kind, x in maps.items()} for b, maps in blocks}}
         fields |= {} if self.error is None else {"error": dataclasses.asdict(self.error)}
+        fields |= {} if self.region is None else {"region": dataclasses.asdict(self.region)}
         return fields | ({} if self.pose is None else {"pose": dataclasses.asdict(self.pose)})
 
 
@@ -360,8 +404,9 @@ def _view(
     prior: Prior,
     compared: ComparedMaps | None,
     has_pose: bool,
+    share: np.ndarray | None = None,
 ) -> MappedView:
-    """Write the maps of one view; returns its part of the report."""
+    """Write the maps of one view; returns its part of the report. `share` is how much of each pixel shows a region."""
     Hc = together(scene_blocks.information(camera))
     rows = together(scene_blocks.with_unknowns().information(camera)) if scene_blocks.scoring.nuisances.names else None
     weights = dict(zip(KINDS, map_weights(H, Hc, prior, rows), strict=True))
@@ -380,13 +425,19 @@ def _view(
     if compared:
         files.append(f"{name}.maps.png")
         pictures.write_png(folder / files[-1], compared.row(camera, maps["variance"]))
+    of_region = None
+    if share is not None:
+        files.append(f"{name}.region.png")
+        pictures.write_png(folder / files[-1], pictures.map_picture(share))
+        of_region = RegionSummary.of(share, totals["variance"])
     pose = None
     if has_pose:
         information = fisher.pose_information(scene_blocks.scene, camera, scene_blocks.scoring.settings)
         pose = PoseSummary(information.tolist(), torch.linalg.eigvalsh(information).tolist())
     gain = {criterion: information_gain(Hc, H, criterion, prior).total for criterion in ("logdet", "eig")}
     blocks = {block: {kind: MapSummary.of(maps[kind][block]) for kind in KINDS} for block in scene_blocks.names}
-    return MappedView(camera.name, camera, files, gain, *(MapSummary.of(totals[kind]) for kind in KINDS), blocks, pose)
+    summaries = (MapSummary.of(totals[kind]) for kind in KINDS)
+    return MappedView(camera.name, camera, files, gain, *summaries, blocks, pose, region=of_region)
 
 
 def _print(args: Fisher, known: Known, groups: dict[str, GroupSummary], views: list[MappedView], source: str) -> None:
@@ -398,6 +449,13 @@ def _print(args: Fisher, known: Known, groups: dict[str, GroupSummary], views: l
             rows.append((view.name, f"{view.error.rmse:.3g}", f"{-20 * math.log10(view.error.rmse):.1f}", *shares))
     if rows:
         tables.show(f"expected error ({source})", ("view", "of a color", "PSNR", *PARTS), rows)
+    rows = []
+    for view in views:
+        if view.region is not None:
+            told = [f"{x:.3g}" if x is not None else "-" for x in (view.region.rmse, view.region.variance)]
+            rows.append((view.name, f"{view.region.pixels:.1f}", *told))
+    if rows:
+        tables.show(f"region {args.region} ({source})", ("view", "pixels", "expected error", "mean variance"), rows)
     rows = []
     several = blocks if len(blocks := tuple(next(iter(groups.values())).blocks)) > 1 else ()
     for name, row in groups.items():
