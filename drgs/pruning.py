@@ -11,6 +11,7 @@ show. It is kept, unless the caller says otherwise.
 from __future__ import annotations
 
 import dataclasses
+import logging
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Generic, Literal, TypeVar
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from drgs.fitting.components.base import Component
     from drgs.fitting.config import FitConfig, RateConfig
     from drgs.information.inputs import Masks
+    from drgs.information.region import Region
     from drgs.information.semantics import SemanticMetric
 
 __all__ = ["POWER", "ROUNDS", "Pruned", "Round", "Unseen", "check_amount", "fit_on", "prune"]
@@ -53,6 +55,7 @@ ROUNDS = 5
 POWER = 1.5
 """Power of `drgs.fisher.removal_error` that `prune` ranks by: of three that were tried near the best on every scene."""
 
+_log = logging.getLogger(__name__)
 _BISECTIONS = 8  # renderings of all views for a `loss`: as many are removed as it allows, but for 1/256 of them
 
 _BEGUN = 0.5  # part of the schedule that `fit_on` takes as done: 0 to 0.9 end within 0.1 dB on `banana`
@@ -106,6 +109,7 @@ def prune(
     unseen: Unseen = "keep",
     semantics: SemanticMetric | None = None,
     power: float = POWER,
+    region: Region | None = None,
 ) -> Pruned[_S]:
     """Remove the Gaussians that given views need least.
 
@@ -126,8 +130,11 @@ def prune(
         unseen: What becomes of Gaussians that change no view: `keep` or `remove`.
         semantics: The metric in which features are a part of the image; None: colors are all of it.
         power: That of `drgs.fisher.removal_error`.
+        region: The part of the scene whose pixels count, each by how much of it shows the region; also in PSNRs. What
+            no such pixel shows goes first, that without which other pixels change least before the rest of it. None:
+            all pixels of all views.
     Raises:
-        ValueError: If a number is out of range, or the views show nothing of the scene.
+        ValueError: If a number is out of range, or the views show nothing of the scene, or of the region.
     """
     where = "prune"
     check_gaussians(where, gaussians.gaussians if isinstance(gaussians, DynamicGaussians) else gaussians)
@@ -140,8 +147,12 @@ def prune(
             f"{where}: loss must have images that the views are compared with, got none; pass keep instead"
         )
     settings = settings or RenderSettings.preset("fast")
-    with Bar("errors without a Gaussian", rounds * len(cameras)) as bar:
-        views = _Views(cameras, settings, mask_list(where, masks, cameras), images, semantics, power, bar)
+    shares = None if region is None else region.shares(gaussians, cameras, settings, where)
+    if shares is not None and shares.note:
+        _log.warning("prune: %s", shares.note)
+    with Bar("errors without a Gaussian", (rounds + (region is not None)) * len(cameras)) as bar:
+        shown = None if shares is None else shares.shares
+        views = _Views(cameras, settings, mask_list(where, masks, cameras), images, semantics, power, bar, shown)
         return _pruned(gaussians, views, keep, loss, rounds, unseen)
 
 
@@ -151,7 +162,9 @@ def _pruned(
     """`prune`, of arguments that have been checked."""
     start = views.psnr(gaussians)
     left = torch.arange(len(gaussians))
-    ever_seen = torch.zeros(len(gaussians), dtype=torch.bool)
+    # What no pixel of a region shows has error 0, but other pixels may show it: it is no Gaussian that no view shows.
+    elsewhere = torch.zeros(len(gaussians)) if views.shares is None else views.everywhere.removal_error(gaussians)
+    ever_seen = elsewhere > 0
     seen = 0  # in the first round; a share of these is kept
     done = []
     for number in range(rounds):
@@ -165,6 +178,9 @@ def _pruned(
             )
         # Least first; what changes nothing is no candidate.
         order = error.argsort()[int((error == 0).sum()) :]
+        if views.shares is not None:
+            outside = ((error == 0) & ever_seen[left]).nonzero()[:, 0]
+            order = torch.cat([outside[elsewhere[left[outside]].argsort()], order])
         part = (number + 1) / rounds
         if keep is not None:
             # Every round keeps the same share of what there is; something is left of the last one.
@@ -209,11 +225,18 @@ class _Views:
     semantics: SemanticMetric | None
     power: float
     bar: Bar
+    shares: list[torch.Tensor] | None = None  # of each pixel, that shows a region
+
+    @property
+    def everywhere(self) -> _Views:
+        """The same of all pixels."""
+        return dataclasses.replace(self, shares=None)
 
     def removal_error(self, gaussians: Scene) -> torch.Tensor:
         """(N,) summed over the views."""
         total = torch.zeros(len(gaussians), dtype=torch.float64)
-        for camera, mask in zip(self.cameras, self.masks, strict=True):
+        # A mask multiplies an image, so that the error of a pixel is multiplied by a power of it.
+        for camera, mask in zip(self.cameras, self._masks(1 / self.power), strict=True):
             total += removal_error(gaussians, camera, self.settings, self.power, semantics=self.semantics, masks=[mask])
             self.bar.advance()
         return total
@@ -223,12 +246,21 @@ class _Views:
         if self.images is None:
             return None
         found = []
-        for camera, target, mask in zip(self.cameras, self.images, self.masks, strict=True):
+        for camera, target, mask in zip(self.cameras, self.images, self._masks(1), strict=True):
+            if self.shares is not None and mask is not None and not bool((mask > 0).any()):
+                continue
             with torch.no_grad():  # a measure
                 seen = colors_only(gaussians, camera.time)
                 image = render(seen, camera, self.settings, outputs=()).rgb.cpu().clamp(0, 1)
             found.append(psnr(image, target, mask))
         return float(np.mean(found))
+
+    def _masks(self, power: float) -> list[torch.Tensor | None]:
+        """The mask of each view, times this power of the shares of a region."""
+        if self.shares is None:
+            return self.masks
+        masks = zip(self.masks, self.shares, strict=True)
+        return [share**power if mask is None else mask.cpu() * share**power for mask, share in masks]
 
     def most_removed(self, gaussians: _S, left: torch.Tensor, order: torch.Tensor, least: float) -> int:
         """How many of `left` may go, in an order, so that the PSNR stays at `least` dB or above: by bisection."""

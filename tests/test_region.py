@@ -513,3 +513,54 @@ def test_fisher_tells_its_pixels(place, capsys):
         assert view["region"]["rmse"] > 0
     assert cli.main([*line, "--region", "sphere:0,90,0,1"]) == 2
     assert "fisher: region sphere:0,90,0,1 must be in sight of a view" in capsys.readouterr().err
+
+
+# -------------------------------------------------- pruning
+
+
+def test_pruning_for_a_region_removes_the_rest():
+    """Of two things, each half of the Gaussians: the one outside goes, its least needed Gaussians first."""
+    g, known, candidates = two_things()
+    cameras = [*known, *candidates]
+    region = Region.masks(*zip(*[(x, c) for c, x in zip(cameras, sides(g, cameras), strict=True)], strict=True))
+    half = drgs.prune(g, cameras, keep=0.5, region=region)
+    assert int(half.kept[:20].sum()) <= 2  # what a pixel of the other thing's edge shows, too
+    assert int(half.kept.sum()) == 20
+    fifth = drgs.prune(g, cameras, keep=0.9, rounds=1, region=region)
+    assert bool(fifth.kept[20:].all())
+    plain = drgs.prune(g, cameras, keep=0.5)
+    assert int(plain.kept[:20].sum()) > 4
+    assert half.unseen == plain.unseen == 0
+
+
+def sides(g, cameras):
+    """Masks of the thing at x = 1.5, as it is rendered alone."""
+    alone = g.take(torch.arange(20, 40))
+    return [(drgs.render(alone, camera, outputs=()).alpha > 0.5).float() for camera in cameras]
+
+
+def test_pruning_of_everything_is_pruning():
+    """With all pixels the same Gaussians go; the PSNR by which a loss is told is that of the region's pixels."""
+    g, known, candidates = two_things()
+    plain, whole = (drgs.prune(g, [*known, *candidates], keep=0.4, region=x) for x in (None, EVERYTHING))
+    assert torch.equal(plain.kept, whole.kept)
+    images = [drgs.render(g, camera, RenderSettings.preset("fast"), outputs=()).rgb.clamp(0, 1) for camera in known]
+    images[0][:, :] = 0  # a photograph that differs where the region is, and elsewhere
+    region = Region.sphere((1.5, 0, 0), 0.8)
+    found = drgs.prune(g, known, keep=0.5, images=images, region=region)
+    share = region.shares(g, known).shares[0]
+    seen = drgs.render(g, known[0], RenderSettings.preset("fast"), outputs=()).rgb.clamp(0, 1)
+    mse = float((share * seen.square().mean(2)).sum() / share.sum())
+    assert found.psnr == pytest.approx((-10 * math.log10(mse) + 100) / 2, rel=1e-3)
+
+
+def test_prune_command(place, tmp_path, capsys):
+    """--region, in prune.json and in the table; a region out of sight leaves no file."""
+    line = ["prune", str(place / "run"), "--keep", "0.5", "-o", str(tmp_path / "small.ply")]
+    assert cli.main([*line, "--region", "sphere:0,90,0,1"]) == 2
+    assert "prune: region sphere:0,90,0,1 must be in sight" in capsys.readouterr().err
+    assert not [*tmp_path.glob("small*")]
+    assert cli.main([*line, "--region", f"masks:{place / 'left'}", "--refit", "2"]) == 0, capsys.readouterr().err
+    report = json.loads((tmp_path / "small.json").read_text())
+    assert report["region"].endswith("left")
+    assert "of the pixels that show masks:" in capsys.readouterr().out

@@ -30,7 +30,7 @@ from drgs import fisher
 from drgs.commands.orbits import OrbitShape
 from drgs.commands.regions import region_of
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewpoints import check_lenses, evenly, known_views, views_to_compare, with_times
+from drgs.commands.viewpoints import Source, check_lenses, evenly, known_views, views_to_compare, with_times
 from drgs.data.camera_lists import camera_to_json
 from drgs.display import pictures, tables
 from drgs.display.progress import Bar
@@ -94,7 +94,7 @@ def run(args: Fisher) -> None:
     views = evenly(with_times(views, args, given), args.limit)
     check_lenses("fisher", settings, [*known.cameras, *views])
     scoring = given.scoring(args.scoring, settings)
-    region = region_of("fisher", args, given, known, settings)
+    region = region_of("fisher", args, given, Source.known(text, given), known.cameras, settings)
     shown = None if region is None else region.shares(given.scene, views, settings, "fisher")
     with Bar("information", len(known.cameras) + len(views), not args.quiet) as bar:
         errors = _errors(args, given, known, settings)

@@ -695,6 +695,13 @@ class Prune(Settings, Views, Lenses):
     loss: str | None = option(
         None, "Remove as many as the mean PSNR of the training photographs may fall by, e.g. 0.1dB.", metavar="DB"
     )
+    region: str | None = same_option(
+        SelectionConfig,
+        "region",
+        help="Part of the scene whose pixels count: a box or a sphere (world coordinates), what masks of some"
+        " photographs show, or a class of a scene with labels. What is elsewhere goes first; default all.",
+        heading="Views",
+    )
     unseen: Literal["keep", "remove"] = option("keep", "What becomes of Gaussians that no training view shows.")
     refit: int | None = option(
         None, "Fit the Gaussians that are left to the photographs again, for so many steps.", within=COUNT

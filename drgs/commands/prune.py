@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drgs.codecs import check_suffix, origin_file, save_gaussians
+from drgs.commands.regions import region_of
 from drgs.commands.scene_input import SELECTION, SceneInput
 from drgs.commands.viewpoints import Source, check_lenses, warn_of_unseen
 from drgs.display import tables
@@ -22,6 +23,7 @@ from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.metrics import TRAIN_VIEWS, through_renderers
 from drgs.fitting.records import fitted_views, is_run, of_some
 from drgs.fitting.renderers import renderers_to_measure
+from drgs.information.region import RegionText
 from drgs.io.checkpoint import load_state, save_state, state_header
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import atomic_write, lock_folder, write_json
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
     from drgs.commands.options import Prune
     from drgs.data import View
     from drgs.ellipsoids import Scene
+    from drgs.information.region import Region
     from drgs.pruning import Pruned
     from drgs.settings import RenderSettings
 
@@ -49,6 +52,8 @@ def run(args: Prune) -> None:
     settings = args.settings()  # refuses what cannot be, before anything is read, as all up to the lock
     loss = None if args.loss is None else _decibels(args.loss)
     check_amount("prune", args.keep, loss)
+    if args.region is not None:
+        RegionText.of(args.region, "prune")
     output = _Output.of(args)
     with lock_folder(output.report.parent, "prune", output.names, [args.scene, args.data or ""]):
         with Bar("reading", show=not args.quiet):
@@ -66,6 +71,7 @@ def run(args: Prune) -> None:
         check_lenses("prune", settings, views.cameras)
         warn_of_unseen(given.gaussians, views.cameras)
         exposures = _exposures(args, given, views, checkpoint)
+        region = region_of("prune", args, given, views.origin, views.cameras, settings)
         with Bar("prune", show=not args.quiet):
             pruned = prune(
                 given.scene,
@@ -77,6 +83,7 @@ def run(args: Prune) -> None:
                 masks=None if views.train is None else [frame.mask for frame in views.train],
                 semantics=given.semantics(),
                 unseen=args.unseen,
+                region=region,
                 rounds=args.rounds or ROUNDS,
             )
             if bool(pruned.kept.all()):
@@ -88,8 +95,9 @@ def run(args: Prune) -> None:
             if args.refit and views.train is not None and isinstance(pruned.gaussians, Gaussians):
                 far = int(pruned.kept[: _skybox(given)].sum())
                 config = given.record.config if given.record else _config_over(given)
-                stages["refitted"] = fit_on(pruned.gaussians, views.train, config, args.refit, far, exposures)
-            costs = views.measured(stages, given, settings, lenses)
+                frames = _shown(views.train, region, given, settings)
+                stages["refitted"] = fit_on(pruned.gaussians, frames, config, args.refit, far, exposures)
+            costs = views.measured(stages, given, settings, lenses, region)
             *_, left = stages.values()
             output.write(left, given, checkpoint, pruned.kept)
             write_json(output.report, _record(args, pruned, views, settings, costs))
@@ -195,12 +203,14 @@ class _Views:
         train: Their photographs; None where there are cameras alone.
         held_out: Photographs of other views.
         source: Where they come from, in words.
+        origin: Where they come from.
     """
 
     cameras: list[Camera]
     train: list[Frame] | None
     held_out: list[Frame]
     source: str
+    origin: Source
 
     @classmethod
     def of(cls, args: Prune, given: SceneInput, lenses: bool) -> _Views:
@@ -213,7 +223,7 @@ class _Views:
         source = Source.of("--data", text, (), given)
         if source.kind == "list":
             cameras = source.listed()
-            return cls(cameras if lenses else [camera.undistorted() for camera in cameras], None, [], text)
+            return cls(cameras if lenses else [camera.undistorted() for camera in cameras], None, [], text, source)
         dataset = source.dataset(args, given, lazy=False)
         record = source.record or given.record
         config = record.config.data if record else FitConfig().data
@@ -234,17 +244,24 @@ class _Views:
 
         with Bar("photographs", show=not args.quiet):
             seen, held_out = frames(train), frames(test)
-        return cls([frame.camera for frame in seen], seen, held_out, text)
+        return cls([frame.camera for frame in seen], seen, held_out, text, source)
 
     def measured(
-        self, stages: dict[str, Scene], given: SceneInput, settings: RenderSettings, lenses: bool
+        self,
+        stages: dict[str, Scene],
+        given: SceneInput,
+        settings: RenderSettings,
+        lenses: bool,
+        region: Region | None = None,
     ) -> dict[str, dict[str, float]]:
         """Renderer -> stage -> mean PSNR in dB: of held-out views, or else of some of those that decide; of the object
-        where masks or alpha say where it is. Nothing without photographs.
+        where masks or alpha say where it is, of the pixels that show a region where there is one. Nothing without
+        photographs.
         """
         frames = self.held_out or self.train
         if frames is None:
             return {}
+        frames = _shown(frames, region, given, settings)
         renderers = renderers_to_measure(("fast",), given.settings("fast"), "all", lenses)
         found: dict[str, dict[str, float]] = {name: {} for name in renderers}
         for stage, scene in stages.items():
@@ -278,6 +295,23 @@ def _exposures(args: Prune, given: SceneInput, views: _Views, checkpoint: Checkp
     return [ExposureComponent.held(checkpoint, given.background)]
 
 
+def _shown(frames: list[Frame], region: Region | None, given: SceneInput, settings: RenderSettings) -> list[Frame]:
+    """The photographs that show a region, each pixel weighed by how much of it does; all of them without one.
+
+    Raises:
+        NothingOfRegion: If none does.
+    """
+    if region is None:
+        return frames
+    shares = region.shares(given.scene, [frame.camera for frame in frames], settings, "prune").shares
+    masks = (x if frame.mask is None else frame.mask * x for frame, x in zip(frames, shares, strict=True))
+    # What is outside is not empty, but does not count.
+    shown = (
+        dataclasses.replace(frame, mask=x, is_object=False, alpha=None) for frame, x in zip(frames, masks, strict=True)
+    )
+    return [frame for frame in shown if frame.mask is not None and bool((frame.mask > 0).any())]
+
+
 def _skybox(given: SceneInput) -> int:
     """How many of the first Gaussians are a run's skybox."""
     if given.run is None or given.step is None:
@@ -302,6 +336,7 @@ def _record(
         "views": {"source": views.source, "names": [camera.name for camera in views.cameras]},
         "gaussians": {"before": len(pruned.kept), "after": len(pruned.gaussians), "unseen": pruned.unseen},
         "unseen": args.unseen,
+        "region": args.region,
         "asked": {"keep": args.keep, "loss": args.loss},
         "rounds": [dataclasses.asdict(x) for x in pruned.rounds],
         "train_psnr": pruned.psnr,
@@ -317,12 +352,13 @@ def _print(args: Prune, pruned: Pruned, views: _Views, costs: dict[str, dict[str
     stages: Sequence[str] = list(next(iter(costs.values()), {}))
     if costs:
         kind = "held-out" if views.held_out else "training"
+        of = "" if args.region is None else f", of the pixels that show {args.region}"
         count = len(views.held_out) or min(len(views.cameras), TRAIN_VIEWS)
         rows = []
         for name, row in costs.items():
             last = row[stages[-1]] - row["before"]
             rows.append((name, *(f"{row[stage]:.2f}" for stage in stages), f"{last:+.2f}"))
-        tables.show(f"PSNR in dB of {count} {kind} views", ("renderer", *stages, "change"), rows)
+        tables.show(f"PSNR in dB of {count} {kind} views{of}", ("renderer", *stages, "change"), rows)
     else:
         print(f"{views.source} has no photographs: what it costs is not measured (--data names a data set)")
     if pruned.unseen:

@@ -6,7 +6,6 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drgs.commands.viewpoints import Source
 from drgs.information.region import Region, RegionText, masked_photographs
 
 if TYPE_CHECKING:
@@ -16,20 +15,23 @@ if TYPE_CHECKING:
 
     from drgs.cameras import Camera
     from drgs.commands.scene_input import SceneInput
-    from drgs.commands.viewpoints import Known
+    from drgs.commands.viewpoints import Source
     from drgs.settings import RenderSettings
 
 __all__ = ["region_of"]
 
 
-def region_of(command: str, args: Any, given: SceneInput, known: Known, settings: RenderSettings) -> Region | None:
+def region_of(
+    command: str, args: Any, given: SceneInput, source: Source, cameras: Sequence[Camera], settings: RenderSettings
+) -> Region | None:
     """The region of `--region`; None without.
 
     Args:
         command: Name of the command, for messages.
-        args: Options of a command with --region and --train.
+        args: Options of a command with --region.
         given: The command's scene.
-        known: Its known views, whose photographs masks may be of.
+        source: Where its known views are from, whose photographs masks may be of.
+        cameras: Cameras of these under the names of the views.
         settings: Settings of the renderer, by which masks are put on Gaussians.
     Raises:
         ValueError: If the text is none of a region, or the scene or its data set do not have what it names.
@@ -38,15 +40,15 @@ def region_of(command: str, args: Any, given: SceneInput, known: Known, settings
         return None
 
     def photographs(folder: Path) -> tuple[Sequence[torch.Tensor], Sequence[Camera]]:
-        source = Source.known(args.train, given)
         if source.kind == "list":
             raise ValueError(
-                f"{command}: region masks:{folder} must be of photographs, --train {source.text} is a list of cameras; "
-                "name their data set or a run"
+                f"{command}: region masks:{folder} must be of photographs, {source.option} {source.text} is a list of "
+                "cameras; name their data set or a run"
             )
         views = {view.name: view for view in source.dataset(args, given).views}
-        photographed = [dataclasses.replace(views[x.name], keeps_lens=known.lenses) for x in known.cameras]
-        return masked_photographs(folder, photographed, known.cameras, command)
+        lenses = given.keeps_lenses(args.undistort)
+        photographed = [dataclasses.replace(views[camera.name], keeps_lens=lenses) for camera in cameras]
+        return masked_photographs(folder, photographed, cameras, command)
 
     text = RegionText.of(args.region, command)
     return text.region(photographs, lambda: (given.classes, given.decoder), settings, command)

@@ -11,7 +11,7 @@ import torch
 from drgs.commands.orbits import OrbitShape
 from drgs.commands.regions import region_of
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewpoints import check_lenses, known_views, views_to_compare, with_times
+from drgs.commands.viewpoints import Source, check_lenses, known_views, views_to_compare, with_times
 from drgs.data.camera_lists import camera_to_json
 from drgs.display import tables
 from drgs.display.progress import Bar
@@ -57,7 +57,7 @@ def run(args: Select) -> None:
     candidates = with_times(candidates, args, given)
     train = with_times(known.cameras, args, given)
     check_lenses("select", settings, [*train, *candidates])
-    region = region_of("select", args, given, dataclasses.replace(known, cameras=train), settings)
+    region = region_of("select", args, given, Source.known(args.train, given), train, settings)
     views = len(known.cameras) + len(candidates)
     with args.cluster() as workers, Bar("information", views, not args.quiet) as bar:
         selection = select(
