@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import itertools
 import json
@@ -48,6 +49,7 @@ from drgs.ellipsoids import Gaussians
 from drgs.fitting.config import FitConfig
 from drgs.fitting.online import OnlineFit
 from drgs.gain import Information
+from drgs.information.region import NothingOfRegion, Region, RegionText
 from drgs.io import atomic
 from drgs.io.checkpoint import load_state, save_state, state_header
 from drgs.io.json_files import check_json, parse_json
@@ -149,6 +151,7 @@ class ViewPlan:
         computed: Views whose information was computed for this answer.
         left_out: Known views whose information was not computed in time.
         seconds: Wall time.
+        note: What is to be said of the region, a sentence; "" where there is nothing.
     """
 
     picks: list[PlannedView]
@@ -157,6 +160,7 @@ class ViewPlan:
     computed: int
     left_out: int
     seconds: float
+    note: str = ""
 
 
 class Planner:
@@ -175,6 +179,7 @@ class Planner:
         *,
         scene: Gaussians | None = None,
         scoring: Scoring | None = None,
+        region: Region | None = None,
         info_pixels: int = 2_700,
         max_views: int = 64,
         bound: float = 0.2,
@@ -186,6 +191,8 @@ class Planner:
             config: Configuration of the planner's own model; default `drgs.planner.default_config`.
             scene: A model of the caller's own, in its place; see `scene`.
             scoring: How views are scored; default as `drgs.select_views`, rendered by preset `fast`.
+            region: The part of the scene that counts, by the model as it is at each answer; None: all of it. Every
+                answer then computes the information of all views that show some of it, whatever is kept.
             info_pixels, max_views, look: See the attributes.
             bound: Largest change of a view's rendering, in [0, 1], up to which its information is not computed again.
             max_bytes: Largest size of the information that is kept, bytes.
@@ -203,7 +210,10 @@ class Planner:
         self.max_views = max_views
         self.look = float(look)
         self.notes: Any = None
+        if region is not None:
+            must_be("Planner", "region", region, Region, "e.g. drgs.Region.box((0, 0, 0), (1, 1, 1))")
         self._scoring = scoring or _FAST
+        self._region = region
         self._fit = OnlineFit(config or default_config())
         self._cache = Cache(max_bytes, bound=bound)
         self._known: list[Camera] = []  # at the size at which their information is computed
@@ -364,7 +374,7 @@ class Planner:
                 box = tuple(np.r_[centers.min(0), centers.max(0)].tolist())
                 refine = dataclasses.replace(refine or Refine(evaluations=20), box=box)
             self._expect([*known, *self._pool, start])
-            return select(scene, [start], known, 1, scoring=self._scoring, cache=self._cache, refine=refine).picks[0]
+            return self._chosen(scene, [start], known, 1, refine).picks[0]
 
     # -------------------------------------------------- kill and resume
 
@@ -407,11 +417,12 @@ class Planner:
                 "cache": cache_header,
                 "expected": records(expected),
                 "notes": notes,
+                **({} if self._region is None else {"region": self._region.text}),
             }
         _write_file(path, {**fit, **answers, **own}, header)
 
     @classmethod
-    def load(cls, path: str | os.PathLike, *, scoring: Scoring | None = None) -> Planner:
+    def load(cls, path: str | os.PathLike, *, scoring: Scoring | None = None, region: Region | None = None) -> Planner:
         """The planner that `save` wrote to a file.
 
         With one thread its answers have the bits that they would have had without the interruption, except that a
@@ -420,14 +431,16 @@ class Planner:
         Args:
             path: The file.
             scoring: That of the planner that was saved, where it was not the default.
+            region: Likewise; a box and a sphere are in the file.
         Raises:
             FileNotFoundError: If there is no such file.
-            ValueError: If it is none that a planner wrote, or damaged, or the scoring is another one.
+            ValueError: If it is none that a planner wrote, or damaged, or the scoring or the region is another one.
         """
         where, tensors, header = _read_file(path)
+        region = _region_of(where, header.get("region"), region)
         names = ("info_pixels", "max_views", "bound", "look", "max_bytes")
         try:
-            planner = cls(scoring=scoring, **{name: header[name] for name in names})
+            planner = cls(scoring=scoring, region=region, **{name: header[name] for name in names})
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from None
         if header["scoring"] != (named_by(planner._scoring) or ""):
@@ -560,6 +573,8 @@ class Planner:
         # Without costs all picks come of one call; with costs each is of another value than its score.
         at_once = max(k, 1) if self._cost is None else 1
         selection, places, there = self._selected(scene, list(range(len(self._pool))), known, at_once)
+        notes = [] if selection is None else selection.notes
+        note = next((x for x in notes if x.startswith("region ")), "")
         scores: list[float | None] = [None] * len(self._pool)
         left_out = len(known) - len(there)
         picks: list[PlannedView] = []
@@ -578,7 +593,8 @@ class Planner:
             picks.append(PlannedView(places[best], here, selection.scores[best], costs[best], values[best]))
             there = [*there, here]
             selection, places, there = self._selected(scene, [i for i in places if i != places[best]], there, 1)
-        return ViewPlan(picks, scores, max(self._cache.changes.values(), default=0.0), 0, left_out, 0.0)
+        changed = max(self._cache.changes.values(), default=0.0)
+        return ViewPlan(picks, scores, changed, 0, left_out, 0.0, note)
 
     def _selected(
         self, scene: Gaussians, places: list[int], known: list[Camera], k: int
@@ -590,13 +606,31 @@ class Planner:
         while places:
             pool = [self._pool[i] for i in places]
             try:
-                selection = select(scene, pool, known, min(k, len(pool)), scoring=self._scoring, cache=self._cache)
+                selection = self._chosen(scene, pool, known, min(k, len(pool)))
             except NotCached as lacking:
                 places = [i for i in places if self._cache.keeps(lacking.quantity, self._pool[i])]
                 known = [camera for camera in known if self._cache.keeps(lacking.quantity, camera)]
             else:
                 return selection, places, known
         return None, places, known
+
+    def _chosen(
+        self, scene: Gaussians, pool: list[Camera], known: list[Camera], k: int, refine: Refine | None = None
+    ) -> Selection:
+        """The choice, by the region as far as the model shows any of it."""
+        choose = functools.partial(
+            select, scene, pool, known, k, scoring=self._scoring, cache=self._cache, refine=refine
+        )
+        if self._region is None:
+            return choose()
+        try:
+            return choose(region=self._region)
+        except NothingOfRegion:
+            selection = choose()
+            selection.notes.append(
+                f"region {self._region.text}: no view shows any of it yet; the whole scene counts in this answer"
+            )
+            return selection
 
     def _costs(self, places: list[int], here: Camera | None) -> list[float]:
         """Costs of going from a camera to candidates."""
@@ -636,6 +670,18 @@ class _Duration:
     def usual(self) -> float:
         """The median, seconds; 0 as long as nothing is known."""
         return statistics.median(self.seconds) if self.seconds else 0.0
+
+
+def _region_of(where: str, saved: Any, given: Region | None) -> Region | None:
+    """The region of a planner that was saved: the one that is given, or one that its text describes."""
+    if given is None and isinstance(saved, str) and saved.partition(":")[0] in ("box", "sphere"):
+        return RegionText.of(saved, where).region(lambda folder: ([], []), lambda: (None, None))
+    if saved != (None if given is None else given.text):
+        raise ValueError(
+            f"{where}: region must be that of the planner that was saved, {saved}, got "
+            f"{'none' if given is None else given.text}; give it to Planner.load"
+        )
+    return given
 
 
 def _unknown_cost(here: Camera, there: Camera) -> float:

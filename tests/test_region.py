@@ -25,6 +25,7 @@ from drgs.select import select
 from drgs.settings import RenderSettings
 from drgs.train import fit
 
+FAST = RenderSettings.preset("fast")
 EXACT = RenderSettings.preset("exact")
 EVERYTHING = Region.box((-99,) * 3, (99,) * 3)
 
@@ -564,3 +565,32 @@ def test_prune_command(place, tmp_path, capsys):
     report = json.loads((tmp_path / "small.json").read_text())
     assert report["region"].endswith("left")
     assert "of the pixels that show masks:" in capsys.readouterr().out
+
+
+# -------------------------------------------------- planner
+
+
+def test_planner_looks_at_it(tmp_path):
+    """Of two candidates each sees one thing: the region's is next, also after a save; out of sight all count."""
+    g, known, _ = two_things()
+    candidates = [camera_at((x, 0.5, -2.0), (x, 0, 0), str(x)) for x in (-1.5, 1.5)]
+    for index, x in enumerate((-1.5, 1.5)):
+        planner = drgs.Planner(scene=g, region=Region.sphere((x, 0, 0), 1.0))
+        for camera in known:
+            planner.observe(None, camera)
+        planner.scores(candidates)
+        found = planner.next(1)
+        assert found.picks[0].index == index
+        assert found.note == ""
+        want = select(g, candidates, known, region=Region.sphere((x, 0, 0), 1.0), settings=FAST)
+        assert found.scores == pytest.approx(want.scores, rel=1e-4)
+        planner.save(tmp_path / f"{index}.planner")
+        again = drgs.Planner.load(tmp_path / f"{index}.planner")
+        assert again.next(1).scores == pytest.approx(found.scores, rel=1e-6)
+        with pytest.raises(ValueError, match="region must be that of the planner that was saved, sphere:"):
+            drgs.Planner.load(tmp_path / f"{index}.planner", region=EVERYTHING)
+    planner = drgs.Planner(scene=g, region=Region("class:rug", lambda scene: lambda time: torch.zeros(40)))
+    for camera in known:
+        planner.observe(None, camera)
+    planner.scores(candidates)
+    assert "no view shows any of it yet" in planner.next(1).note

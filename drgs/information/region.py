@@ -101,7 +101,7 @@ class RegionText:
         return cls(kind, numbers=numbers)
 
     def __str__(self) -> str:
-        return f"{self.kind}:{self.name or ','.join(f'{x:g}' for x in self.numbers)}"
+        return f"{self.kind}:{self.name or ','.join(f'{x:.15g}' for x in self.numbers)}"
 
     def region(
         self,

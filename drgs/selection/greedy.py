@@ -14,6 +14,7 @@ Reference:
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
@@ -81,6 +82,9 @@ class ViewInformation:
 
     def each(self, views: Sequence[PoolView]) -> Iterator[Information]:
         """The information of these views, one after another: nothing of one is held while the next one is computed."""
+        # Where the scene may change so do the shares of pixels, which are never looked for again.
+        changes = self.pool.cache is not None and self.pool.cache.bound is not None
+        pool = dataclasses.replace(self.pool, cache=None) if changes and any(x.of_region for x in views) else self.pool
         quantities = [self._quantity_of(view) for view in views]
 
         def accept(i: int, computed: Information) -> None:
@@ -91,7 +95,7 @@ class ViewInformation:
             check(where, {name: x for name, x in computed.items() if name not in signed})
 
         requests = [(quantity, view.camera, view.mask) for quantity, view in zip(quantities, views, strict=True)]
-        results = self.pool.compute(requests, accept)
+        results = pool.compute(requests, accept)
         for quantity, view in zip(quantities, views, strict=True):
             yield self._counted(quantity, view, next(results))
 
@@ -284,17 +288,15 @@ def _of_region(
     """
     if all(share is None for share in shares):
         return dict(everything)
-    parts = []
-    for view, share in zip(views, shares, strict=True):
-        if share is not None and not bool(share.any()):
-            continue
-        mask = view.mask
-        if share is not None:
-            mask = share.sqrt() if view.mask is None else share.sqrt() * view.mask
-        parts.append(view._replace(mask=mask, of_region=share is not None))
-    information.expect(len(parts))
+    whole = [view for view, share in zip(views, shares, strict=True) if share is None]
+    partly = [
+        view._replace(mask=share.sqrt() if view.mask is None else share.sqrt() * view.mask, of_region=True)
+        for view, share in zip(views, shares, strict=True)
+        if share is not None and bool(share.any())
+    ]
+    information.expect(len(whole) + len(partly))
     total = {name: torch.zeros_like(x) for name, x in everything.items()}
-    for part in information.each(parts):
+    for part in itertools.chain(information.each(whole), information.each(partly)):
         _add(total, {name: part.get(name, torch.zeros_like(x)) for name, x in everything.items()})
     return total
 
