@@ -164,8 +164,8 @@ class RegionShares(NamedTuple):
 class Region:
     """A part of a scene, by the constructors `box`, `sphere`, `masks` and `of_class`.
 
-        chair = drgs.Region.box((0.2, -0.5, 1.0), (1.1, 0.6, 2.0))
-        drgs.select_views(scene, candidates, known, region=chair)
+        chair = drgs.Region.box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
+        drgs.select_views(g, candidates=cameras[2:], train=cameras[:2], region=chair)
 
     Attributes:
         text: As the option --region writes it.
