@@ -425,6 +425,31 @@ def test_views_are_chosen_in_the_metric_of_the_decoder_as_it_is(taught, tmp_path
         assert "features" in pick["parts"]
 
 
+def test_views_are_chosen_for_a_class(taught, tmp_path, monkeypatch):
+    """By the features and the decoder at every pick; a class that there is not is refused before the first step."""
+    regions, choose = [], policies.choose
+
+    def watched(policy, pool):
+        if pool.region is not None:
+            regions.append((pool.region.text, pool.region.members(pool.scene)))
+        return choose(policy, pool)
+
+    monkeypatch.setattr(policies, "choose", watched)
+    active = SelectionConfig().replace(policy="fisher", add=2, every=8, info_pixels=100, region="class:Sky")
+    many = {**FIT, "max_steps": 24, "feature_rate": 0.05}
+    done = fit(taught, tmp_path / "run", config(**many, selection=active), progress=False)
+    assert [text for text, _ in regions] == ["class:Sky"] * 2
+    run = load_run(done.run)
+    sky = drgs.Region.of_class("sky", run.classes, run.decoder).members(run.scene)
+    assert 0 < float(sky.mean()) < 1
+    assert float((regions[-1][1] == sky[: len(regions[-1][1])]).float().mean()) > 0.6  # of an earlier step
+    with pytest.raises(ValueError, match="must be one of ground, middle, sky"):
+        fit(taught, tmp_path / "no", config(**many, selection=active.replace(region="class:sofa")), progress=False)
+    with pytest.raises(ValueError, match="must be of a scene with classes"):
+        fit(taught, tmp_path / "no", config(**many, selection=active, semantics="ignore"), progress=False)
+    assert not (tmp_path / "no/state.safetensors").exists()
+
+
 def test_blocks_that_the_fit_does_not_have(taught, tmp_path, monkeypatch):
     """Semantic information of a fit without features is refused before the first step, not at the first pick."""
     monkeypatch.setattr("drgs.train.Trainer", lambda *arguments: pytest.fail("it began"))
