@@ -564,7 +564,7 @@ class Select(ComparedViews, Workers):
         heading="Views",
     )
     k: int = option(1, "Number of views to pick, one after the other.", short="k", heading="Views")
-    region: str | None = same_option(SelectionConfig, "region", heading="Views")
+    region: str | None = same_option(SelectionConfig, "region", rare=False, heading="Views")
     refine: int = option(
         0,
         "Move each pick to a better pose near it, by scoring at most this many further cameras; 0: keep it.",
@@ -607,6 +607,7 @@ class Fisher(ComparedViews):
     region: str | None = same_option(
         SelectionConfig,
         "region",
+        rare=False,
         help="Part of the scene whose pixels are told apart, too: a box or a sphere (world coordinates), what masks of"
         " some photographs show, or a class of a scene with labels.",
         heading="Views",
@@ -698,6 +699,7 @@ class Prune(Settings, Views, Lenses):
     region: str | None = same_option(
         SelectionConfig,
         "region",
+        rare=False,
         help="Part of the scene whose pixels count: a box or a sphere (world coordinates), what masks of some"
         " photographs show, or a class of a scene with labels. What is elsewhere goes first; default all.",
         heading="Views",
@@ -817,7 +819,7 @@ class Capture(Common):
         False, "Print which photographs to take next: where to stand, where to look, and how much they would tell."
     )
     k: int = option(5, "Number of photographs that --more suggests.", short="k", heading="Views", within=COUNT)
-    region: str | None = same_option(SelectionConfig, "region", heading="Views")
+    region: str | None = same_option(SelectionConfig, "region", rare=False, heading="Views")
     length: str | None = option(
         None, "Measured distance of two photographs, 'IMG_0001 IMG_0004 1.5 m', so that --more prints meters."
     )

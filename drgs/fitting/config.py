@@ -468,6 +468,7 @@ class SelectionConfig(Record):
         "Part of the scene that counts: a box or a sphere (world coordinates), what masks of some photographs show, or"
         " a class of a scene with labels; default all.",
         metavar="|".join(REGION_FORMS),
+        rare=True,
     )
     schedule: Schedule = option(
         "auto",
