@@ -2,9 +2,9 @@
 
     python benchmarks/regions.py [--scenes room51 statue ...] [--starts 2] [--runs runs/regions] [--page]
 
-Units, policies, sizes and what is compared are on docs/active-region.md, and were there before any fit ran. Appends a row
-a fit to benchmarks/regions.jsonl as it ends, leaves out what is there, and writes tables, picture and data of that page.
-A fit that fails is a row with its error. One thread; captures are in $DRGS_DATA.
+Units, policies, sizes and what is compared are on docs/active-region.md, and were there before any fit ran. Appends a
+row a fit to benchmarks/regions.jsonl as it ends, leaves out what is there; with --page it writes tables, picture and
+data of that page. A fit that fails is a row with its error. One thread; captures are in $DRGS_DATA.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
+from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import DATA, add_row, ran, read_rows  # noqa: E402
 
 from drgs import scenes  # noqa: E402
@@ -48,7 +49,10 @@ from drgs.scenes import labelled, room  # noqa: E402
 from drgs.scenes.output import write_png  # noqa: E402
 from drgs.selection.pool import Pool, Selection  # noqa: E402
 from drgs.selection.spread import farthest  # noqa: E402
-from drgs.studies.cells import FAILURES  # noqa: E402
+from drgs.studies.cells import FAILURES, Metric  # noqa: E402
+from drgs.studies.cells import Study as StudyOfFits  # noqa: E402
+from drgs.studies.statistics import FEWEST_UNITS, at_views, coverage, differences, estimate, over_views, unit_of  # noqa: E402
+from drgs.studies.tables import draw_curves, fill_between, markdown_table, paragraph  # noqa: E402
 from drgs.train import fit  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "regions.jsonl"
@@ -196,7 +200,8 @@ def _masks_in(folder: Path, fit_: Fit) -> tuple[list[torch.Tensor], list[Camera]
         path = folder / f"{frame.name}.png"
         if path.exists():
             size = frame.camera.width, frame.camera.height
-            masks.append(torch.from_numpy(cv2.resize(plain_labels(path) / np.float32(255), size, None, 0, 0, cv2.INTER_AREA)))
+            mask = cv2.resize(plain_labels(path) / np.float32(255), size, interpolation=cv2.INTER_AREA)
+            masks.append(torch.from_numpy(mask).clamp(0, 1))  # sums are rounded
             cameras.append(frame.camera)
     return masks, cameras
 
@@ -401,15 +406,152 @@ def run(study: Study, starts: int, runs: Path, rows: Path) -> None:
             print(key, row.get("error") or row["curve"], flush=True)
 
 
+# ------------------------------------------------------------------------------------------------------------ page
+
+PAGE = ROOT / "docs" / "active-region.md"
+PICTURE = ROOT / "docs" / "pictures" / "active-region.png"
+METRICS = (Metric("psnr", "PSNR, dB", 2), Metric("iou", "IoU"))
+REFERENCE = "region"
+SHOWN = (4, 6, 12)  # views
+GROUPS = {"rooms": tuple(ROOMS), "captures": CAPTURES}
+"""Name -> scenes whose means are averaged."""
+
+Rows = Sequence[Mapping[str, Any]]
+
+
+def study_rows(rows: Rows) -> list[dict[str, Any]]:
+    """A row a fit and object, as those of `drgs.studies`; a unit is an object, or a split of a capture, and a start."""
+    found = []
+    for row in rows:
+        scene, _, offset = row["scene"].partition("-")
+        for name in () if "error" in row else row["curve"]["12"]:
+            curve = {n: {metric.key: at[name][metric.key] for metric in METRICS} for n, at in row["curve"].items()}
+            found.append(
+                {
+                    "scene": scene,
+                    "split": (3, int(offset)) if offset else (0, 0),
+                    "start": "seed",
+                    "seed": row["start"],
+                    "initial": [name, f"start {row['start']}"],
+                    "policy": row["policy"],
+                    "picks": row["picks"],
+                    "metrics": curve["12"],
+                    "curve": {count: at for count, at in curve.items() if count not in ("2", "12")},
+                    "seeing": row["seeing"][name],
+                    "known": row["curve"]["2"][name]["gaussians"] >= 1,
+                    "object": name,
+                    "commit": row["commit"],
+                }
+            )
+    return found
+
+
+def compared(rows: Rows, metric: Metric, other: str) -> str:
+    """`region` less another policy: mean and interval; bold where that excludes 0."""
+    found = estimate(differences(rows, metric.key, REFERENCE, other))
+    mean = f"{found.mean:+.{metric.digits}f}"
+    interval = f"[{found.low:+.{metric.digits}f}, {found.high:+.{metric.digits}f}]"
+    is_clear = found.units >= FEWEST_UNITS and not found.low <= 0 <= found.high
+    return f"{f'**{mean}**' if is_clear else mean} {interval}"
+
+
+def main_table(rows: Rows) -> str:
+    """A row a group of scenes, metric and other policy."""
+    shown = [f"{count} views" for count in SHOWN]
+    heads = ["", "`region` less", "units", "wins", "3 to 12 views", *shown, "detectable"]
+    lines = []
+    for metric in METRICS:
+        over = [over_views(row, metric.key) for row in rows]
+        for group, scenes_ in GROUPS.items():
+            own = [row for row in over if row["scene"] in scenes_]
+            for other in POLICIES:
+                values = differences(own, metric.key, REFERENCE, other)
+                if other == REFERENCE or not values:
+                    continue
+                whole = estimate(values)
+                detectable = "" if whole.detectable is None else f"{whole.detectable:.{metric.digits}f}"
+                at = [compared([x for x in at_views(rows, n) if x["scene"] in scenes_], metric, other) for n in SHOWN]
+                counted = [str(whole.units), str(whole.positive), compared(own, metric, other)]
+                lines.append([f"{group}, {metric.title}", f"`{other}`", *counted, *at, detectable])
+    return markdown_table(heads, lines)
+
+
+def unit_table(rows: Rows) -> str:
+    """A row an object, or a capture: PSNR with 12 views, and picks of ten that see it, mean over starts and splits."""
+    heads = ["scene", "object", "units", *(f"`{policy}`" for policy in POLICIES)]
+    lines = []
+    for scene, name in dict.fromkeys((row["scene"], row["object"]) for row in rows):
+        mine = [row for row in rows if (row["scene"], row["object"]) == (scene, name)]
+        cells = []
+        for policy in POLICIES:
+            own = [row for row in mine if row["policy"] == policy]
+            mean = np.mean([row["metrics"]["psnr"] for row in own]) if own else None
+            cells.append("" if mean is None else f"{mean:.2f} ({np.mean([row['seeing'] for row in own]):.1f})")
+        lines.append([scene, name, str(len({unit_of(row) for row in mine})), *cells])
+    return markdown_table(heads, lines)
+
+
+def by_start(rows: Rows) -> str:
+    """A sentence: the difference from the default where two views have shown something of the object, and elsewhere."""
+    parts = []
+    for known, words in ((True, "have made Gaussians in the box"), (False, "have not")):
+        own = [over_views(row, "psnr") for row in rows if row["scene"] in ROOMS and row["known"] == known]
+        if values := differences(own, "psnr", REFERENCE, "default"):
+            parts.append(f"{np.mean(list(values.values())):+.2f} dB in {len(values)} units where two views {words}")
+    return f"`region` less `default` in rooms, 3 to 12 views: {', '.join(parts)}."
+
+
+def data_lines(rows: Rows) -> Iterator[list[str]]:
+    """A line a fit and object."""
+    counts = [str(count) for count in COUNTS if count > 2]
+    heads = [f"{metric.key}_{count}" for metric in METRICS for count in counts]
+    yield ["scene", "split", "object", "start", "policy", "picks_that_see_it", *heads, "commit"]
+    for row in rows:
+        curve = {**row["curve"], "12": row["metrics"]}
+        numbers = [f"{curve[count][metric.key]:.{metric.digits}f}" for metric in METRICS for count in counts]
+        given = [row["scene"], str(row["split"][1]), row["object"], str(row["seed"]), row["policy"], str(row["seeing"])]
+        yield [*given, *numbers, row["commit"]]
+
+
+def write_page() -> None:
+    """Tables, picture and data file of the rows that there are."""
+    told = read_rows(ROWS)
+    rows = study_rows(told)
+    study = StudyOfFits(
+        name="regions", folder=Path, policies=POLICIES, fit=FIT, metrics=METRICS, reference="farthest",
+        comparisons=((REFERENCE, "default"),),
+    )  # fmt: skip
+    draw_curves(study, rows, METRICS[0], PICTURE)
+    failed = sum("error" in row for row in told)
+    processor = sum(row.get("process_seconds", 0) for row in told) / 60
+    commits = ", ".join(sorted({row["commit"] for row in told}))
+    head = (
+        f"{len(told)} fits by `python benchmarks/regions.py`, {failed} of them failed, {processor:.0f} minutes of "
+        f"processor, {told[0]['machine']}, {told[0]['date']}, commits {commits} ([rows](../benchmarks/regions.jsonl), "
+        "[by fit](data/active-region.csv)). `region` less another policy, mean and 95 % interval, bold where that "
+        f"excludes 0 and there are {FEWEST_UNITS} units; *wins*: units in which `region` is better, 3 to 12 views; "
+        f"*detectable*: what a t test over scenes would find in 80 % of such studies. {coverage(3, 18):.0%} of such "
+        "intervals of three scenes hold the true mean where scenes differ as much as their units do, 94 % where they "
+        "do not."
+    )
+    below = "PSNR with 12 views, and in parentheses how many of ten picks see the object; means over starts and splits:"
+    text = [paragraph(head), main_table(rows), paragraph(by_start(rows)), below, unit_table(rows)]
+    fill_between(PAGE, "regions", "\n\n".join(text))
+    write_csv(PAGE_DATA / "active-region.csv", data_lines(rows))
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="*", default=[])
     parser.add_argument("--starts", type=int, default=2)
     parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "regions")
     parser.add_argument("--rows", type=Path, default=ROWS)
+    parser.add_argument("--page", action="store_true", help="then write the page of the rows that there are")
     args = parser.parse_args()
     for name in args.scenes:
         run(study_of(name, args.runs), args.starts, args.runs, args.rows)
+    if args.page:
+        write_page()
     return 0
 
 
