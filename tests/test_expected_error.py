@@ -17,7 +17,7 @@ from drgs import reference
 from drgs.cameras import orbit
 from drgs.checks.arguments import ArgumentError
 from drgs.information.backdrop import backdrop_cells
-from drgs.information.expected_error import ANGLE, HIDDEN, NEW, PARTS, SPREAD, error_parts
+from drgs.information.expected_error import ANGLE, HIDDEN, NEW, PARTS, PIVOT, SPREAD, error_parts
 from drgs.settings import RenderSettings
 
 
@@ -132,6 +132,35 @@ def test_the_unit_and_the_zero_of_the_world_do_not_matter(ring):
     assert float((far - near).abs().max()) <= 1e-3 * float(near.max())
 
 
+def test_calibration(ring, rng):
+    """Power and pivot, from what a record of the other views says of a quarter of the second of three views."""
+    g, cameras = ring
+    cameras = cameras[:3]
+    images = [noisy(rng, x * (1 + 0.2 * k)) for k, x in enumerate(photographs(g, cameras))]
+    masks = [torch.from_numpy(rng.uniform(size=(24, 32))).float() for _ in cameras]
+    record = drgs.error_record(g, cameras, images, masks=masks)
+    others = drgs.error_record(g, [cameras[0], cameras[2]], [images[0], images[2]], masks=[masks[0], masks[2]])
+    assert (others.pivot, others.power) == (1, 1)  # two views say too little of each other
+    parts = error_parts(g, cameras[1], others)
+    n = (parts["misfit"] + parts["direction"])[:12, :16].double()
+    shown = drgs.render(g, cameras[1], outputs=()).rgb
+    e = (shown.clamp(0, 1) - images[1]).square().mean(2)[:12, :16].double()
+    w = masks[1][:12, :16].double() / masks[1][:12, :16].sum()
+    powers = torch.linspace(0.25, 1.6, 2000, dtype=torch.float64)
+    minus = torch.stack([(w * e * n**-p).sum().log() + p * (w * n.log()).sum() for p in powers])
+    assert record.power == pytest.approx(float(powers[minus.argmin()]), abs=2e-3)
+    assert 0.26 < record.power < 1.59
+    assert record.pivot == pytest.approx(PIVOT * float((w * n).sum()), rel=1e-4)
+    plain = drgs.expected_error(g, cameras[1], dataclasses.replace(record, power=1.0))
+    found = error_parts(g, cameras[1], record)
+    total = drgs.expected_error(g, cameras[1], record)
+    below = plain < record.pivot
+    assert 0.1 < float(below.double().mean()) < 1
+    torch.testing.assert_close(total[below], (record.pivot * (plain / record.pivot) ** record.power)[below])
+    torch.testing.assert_close(total[~below], plain[~below])
+    torch.testing.assert_close(total, sum(found.values()))  # parts keep their shares
+
+
 @pytest.mark.parametrize("preset", ["exact", "fast"])
 def test_sums_of_views_add_up(preset, ring):
     """What two views say is what each says; no view is kept but its sums, and its place."""
@@ -211,7 +240,9 @@ def test_units(ring):
 def test_state(ring):
     """A record goes through tensors and JSON."""
     g, cameras = ring
-    record = drgs.error_record(g, cameras[:2], photographs(g, cameras[:2]), RenderSettings.preset("fast"))
+    images = photographs(g.replace(sh=-g.sh), cameras[:4])
+    record = drgs.error_record(g, cameras[:4], images, RenderSettings.preset("fast"))
+    assert record.power != 1
     tensors, header = record.to_state()
     again = drgs.ErrorRecord.from_state(tensors, json.loads(json.dumps(header)))
     assert again.settings == record.settings
@@ -246,12 +277,13 @@ def test_what_moves(ring):
 
 
 def test_no_gaussians():
-    """Of nothing, all is unseen."""
+    """Of nothing, all is unseen, and as wrong everywhere, by which nothing can be calibrated."""
     g = drgs.Gaussians.from_arrays(
         np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 1, 3))
     )
     cameras = orbit((0, 0, 0), 3.0, 4, width=8, height=6)
-    record = drgs.error_record(g, cameras[:2], [torch.full((6, 8, 3), 0.5)] * 2)
+    record = drgs.error_record(g, cameras[:3], [torch.full((6, 8, 3), 0.5)] * 3)
+    assert record.power == 1
     error = drgs.expected_error(g, cameras[3], record)
     assert bool(torch.isfinite(error).all())
     assert float(error.min()) > 0

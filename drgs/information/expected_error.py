@@ -13,6 +13,9 @@ directions d_i, the expected squared error (mean over channels) is the sum of fo
                  variance leaves open of the parameters
     unseen       HIDDEN (1 - alpha)^2 t^2 / (H_c + 1): a color behind everything that no view has seen
 
+and their sum x is calibrated: below q, q (x / q)^g is expected, g the power at which what other training views say of a
+training view (its `misfit` and `direction`) explains its residuals best, q PIVOT times what they say on average.
+
 W_iv and R_iv are the sums of view v (misfit.py), k_iv = exp(-angle^2 / (2 ANGLE^2)) of the angle between the pixel's
 direction and that of view v, s_i^2 = (sum_v R_iv + s^2) / (sum_v W_iv + 1) the misfit of Gaussian i, shrunk to the mean
 s^2 of all of them by one pixel, and t^2 the mean squared difference of the photographs from the background.
@@ -21,12 +24,14 @@ s^2 of all of them by one pixel, and t^2 the mean squared difference of the phot
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
+from drgs.cameras.sizes import cropped
 from drgs.checks.arguments import ArgumentError, kind_of, must_be
 from drgs.checks.records import nested, stated
 from drgs.information.backdrop import BACKDROP, Backdrop, Sphere, backdrop_sphere
@@ -46,6 +51,7 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians, Scene
     from drgs.information.inputs import Masks
+    from drgs.tracing.call import Output
 
 __all__ = ["PARTS", "ErrorRecord", "error_parts", "error_record", "expected_error"]
 
@@ -57,10 +63,18 @@ ANGLE = 0.1  # radians between directions at which what one says of the other ha
 NEW = 2.0  # squared error from a new direction over that from directions that were fitted
 SPREAD = 6.0  # variance of a pixel over what the diagonal of H, without its other entries, says
 HIDDEN = 0.6  # squared error where nothing is, over the mean squared difference of photographs from the background
+PIVOT = 2.5  # squared error from which on all stay as they are, over the mean that training views expect of each other
 _PRIOR = Prior(1.0)  # lambda: what one pixel that is wholly the parameter's says; of positions in a length of the scene
 _MOST_PLACES = 64  # places that directions are known from; views beyond share the nearest one, so that a record of any
 # number of views has at most 512 bytes a Gaussian
 _BYTES = 64 << 20  # bytes of the angles that are held at once
+# One of three views calibrates, by a quarter of its pixels; 16 at most, 128 bytes a Gaussian while a record is made.
+_CALIBRATING = 1 / 3
+_MOST_CALIBRATING = 16
+_FEWEST_VIEWS = 3  # of two, what one says of the other is too little to calibrate by
+_POWERS = (0.25, 1.6)  # what a power is held within: the runs that constants were chosen on have 0.29 to 1.56
+_EVEN = 1e-6  # standard deviation of logarithms of what is all the same but for rounding
+_HALVINGS = 20  # of that range, for a power known to 2e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,6 +92,8 @@ class ErrorRecord:
         information: Group -> float64, that of the views about Gaussians and backdrop, as of `drgs.fisher`.
         sphere: What the backdrop is painted on.
         length: World units that positions count in beside a prior, of the views (`drgs.gain.unit_length`).
+        pivot, power: The calibration: of a pixel whose parts add up to x, min(x / pivot, 1)^(power - 1) x is expected.
+            Pivot in squared units of color.
     """
 
     settings: RenderSettings
@@ -90,6 +106,8 @@ class ErrorRecord:
     information: Information
     sphere: Sphere | None
     length: float
+    pivot: float = 1.0
+    power: float = 1.0
 
     @property
     def mean_misfit(self) -> float:
@@ -130,7 +148,8 @@ class ErrorRecord:
         tensors |= {f"information.{name}": x for name, x in self.information.items()}
         sphere = None if self.sphere is None else dataclasses.asdict(self.sphere)
         settings = dataclasses.asdict(self.settings)
-        return tensors, {"views": self.views, "settings": settings, "sphere": sphere, "length": self.length}
+        numbers = {name: getattr(self, name) for name in ("views", "length", "pivot", "power")}
+        return tensors, {**numbers, "settings": settings, "sphere": sphere}
 
     @classmethod
     def from_state(cls, tensors: Mapping[str, torch.Tensor], header: Mapping[str, Any]) -> ErrorRecord:
@@ -140,10 +159,9 @@ class ErrorRecord:
         sphere = header["sphere"]
         return cls(
             settings=nested(RenderSettings, None, stated(RenderSettings, header["settings"], "ErrorRecord")),
-            views=header["views"],
             information=information,
             sphere=None if sphere is None else Sphere(tuple(sphere["center"]), sphere["radius"]),
-            length=header["length"],
+            **{name: header[name] for name in ("views", "length", "pivot", "power")},
             **{name: x for name, x in tensors.items() if not name.startswith(begin)},
         )
 
@@ -164,7 +182,9 @@ def error_record(
         record = drgs.error_record(g, cameras, photographs)
         error = drgs.expected_error(g, camera, record).sqrt()  # (H, W), units of color
 
-    It costs what the views' information costs, whose traversal finds the residuals of Gaussians on its way.
+    It costs what the views' information costs, whose traversal finds the residuals of Gaussians on its way. Of three or
+    more views it is calibrated: a quarter of every third, of 16 at most, is rendered once more, with the errors that
+    the other views say it has.
 
     Args:
         scene: N Gaussians, world frame, or a `drgs.ellipsoids.Scene`, whose Gaussians each camera sees at its time.
@@ -192,6 +212,7 @@ def error_record(
     count = len(gaussians_at(where, scene, cameras[0]))
     columns = {name: torch.zeros(count, len(places)) for name in (WEIGHTS, RESIDUALS)}
     total: dict[str, torch.Tensor] = {}
+    own_sums: dict[int, dict[str, torch.Tensor]] = {view: {} for view in _calibrating(len(cameras))}
     for view, (camera, own, mask, place) in enumerate(zip(cameras, each, shown, place_of, strict=True)):
         context = ViewContext(scene, camera, own, mask, photograph=photographs[view])
         if len(context.gaussians) != count:
@@ -200,11 +221,13 @@ def error_record(
                 f"{len(context.gaussians)} in cameras[{view}]; take views of one time"
             )
         found = quantity.summand(quantity.compute(context), camera, mask)
+        if view in own_sums:
+            own_sums[view] = {name: found[name].clone() for name in (WEIGHTS, RESIDUALS, BEHIND)}
         for name, by_place in columns.items():
             by_place[:, place] += found.pop(name)
         add(total, found)
         advance()
-    return ErrorRecord(
+    record = ErrorRecord(
         settings=each[0],
         views=len(cameras),
         places=torch.from_numpy(places),
@@ -216,6 +239,11 @@ def error_record(
         sphere=sphere,
         length=unit_length(scene, cameras),
     )
+    pixels = []
+    for turn, (view, sums) in enumerate(own_sums.items()):
+        others = _without(record, place_of[view], sums)
+        pixels.append(_foretold(scene, cameras[view], photographs[view], shown[view], others, turn))
+    return dataclasses.replace(record, **_calibration(pixels)) if pixels else record
 
 
 @alone
@@ -256,24 +284,103 @@ def error_parts(scene: Scene, camera: Camera, record: ErrorRecord) -> dict[str, 
             "record of this scene"
         )
     seen = seen.detach()
-    misfit = record.misfit
-    fitted, new = _by_direction(seen, camera, record, misfit)
-    with torch.no_grad():  # a map is a number a pixel
-        values = torch.stack([fitted, new], 1).to(seen.means.device, torch.float32)
-        out = render(seen.replace(sh=seen.sh[:, :1], features=values), camera, record.settings, outputs=())
-    assert out.features is not None  # two channels were given
-    composited, alpha = out.features.cpu(), out.alpha.cpu()
+    (misfit, direction), out = _noise(seen.replace(sh=seen.sh[:, :1]), camera, record)
     weights = variances(record.information, _PRIOR.over(record.length))
     behind = weights.pop(BACKDROP) * (HIDDEN * _difference(record) / 3)
-    scale = SPREAD / 3 * misfit
+    scale = SPREAD / 3 * record.misfit
     weights = {name: x * scale.reshape(-1, *[1] * (x.dim() - 1)) for name, x in weights.items()}
-    view = ViewContext(scene, camera, record.settings, opacity=alpha)
-    return {
-        "misfit": composited[..., 0] + (1 - alpha).clamp(min=0) * (NEW * record.misfit_behind),
-        "direction": composited[..., 1],
+    view = ViewContext(scene, camera, record.settings, opacity=out.alpha.cpu())
+    parts = {
+        "misfit": misfit,
+        "direction": direction,
         "information": variance_map(view, weights),
         "unseen": variance_map(view, {BACKDROP: behind}, sphere=record.sphere),
     }
+    total = torch.stack(list(parts.values())).sum(0)
+    factor = torch.where(total > 0, (total / record.pivot).clamp(max=1) ** (record.power - 1), 1.0)
+    return {name: x * factor for name, x in parts.items()}
+
+
+def _noise(seen: Gaussians, camera: Camera, record: ErrorRecord) -> tuple[tuple[torch.Tensor, torch.Tensor], Output]:
+    """(H, W) each, the parts `misfit` and `direction` of a view before they are calibrated, and the rendering of the
+    Gaussians that they come with.
+    """
+    values = torch.stack(_by_direction(seen, camera, record), 1).to(seen.means.device, torch.float32)
+    with torch.no_grad():  # a map is a number a pixel
+        out = render(seen.replace(features=values), camera, record.settings, outputs=())
+    assert out.features is not None  # two channels were given
+    fitted, new = out.features.cpu().unbind(2)
+    return (fitted + (1 - out.alpha.cpu()).clamp(min=0) * (NEW * record.misfit_behind), new), out
+
+
+def _calibrating(views: int) -> list[int]:
+    """Evenly spaced views by which a record of so many is calibrated."""
+    count = min(_MOST_CALIBRATING, math.ceil(views * _CALIBRATING)) if views >= _FEWEST_VIEWS else 0
+    return [int((k + 0.5) * views / count) for k in range(count)]
+
+
+def _without(record: ErrorRecord, place: int, own: Information) -> ErrorRecord:
+    """What all views but one, from a place, say of misfit."""
+    columns = {}
+    for name, field in ((WEIGHTS, "weights"), (RESIDUALS, "residuals")):
+        columns[field] = getattr(record, field).clone()
+        columns[field][:, place] = (columns[field][:, place] - own[name]).clamp(min=0)  # but for rounding it is
+    return dataclasses.replace(record, behind=(record.behind - own[BEHIND]).clamp(min=0), **columns)
+
+
+def _foretold(
+    scene: Scene,
+    camera: Camera,
+    photograph: torch.Tensor,
+    mask: torch.Tensor | None,
+    others: ErrorRecord,
+    turn: int,
+) -> torch.Tensor:
+    """(3, P) float64 of the pixels of a quarter of a view: the noise that other views expect, squared residual, weight.
+
+    Args:
+        scene, camera, photograph, mask: The scene, and the view.
+        others: The record of the others.
+        turn: Which quarter; from corner to corner.
+    """
+    width, height = -(-camera.width // 2), -(-camera.height // 2)
+    x, y = turn % 2 * (camera.width - width), turn // 2 % 2 * (camera.height - height)
+    part = slice(y, y + height), slice(x, x + width)
+    seen = scene.at(camera.time).detach()
+    camera = cropped(camera, x, y, width, height)
+    noise, out = _noise(seen, camera, others)
+    squared = (out.rgb.cpu().clamp(0, 1) - photograph[part].cpu()).square().mean(2)
+    weight = torch.ones_like(squared) if mask is None else mask[part].cpu()
+    return torch.stack([sum(noise), squared, weight]).double().flatten(1)
+
+
+def _calibration(pixels: Sequence[torch.Tensor]) -> dict[str, float]:
+    """Pivot and power of a record, by how squared residuals e go with the noise n that other views expect.
+
+    Of exponential variables e with means a n^g, the best a given, minus the mean log-likelihood is log(mean(e n^-g)) +
+    g mean(log n) but for a constant. That is convex in g, and its slope's zero is found by halving.
+
+    Args:
+        pixels: (3, P) n, e and weight of the pixels of each view; each view counts as much.
+    Returns:
+        Fields of the record; none where there is nothing to be found.
+    """
+    share = torch.cat([x[2] / x[2].sum().clamp(min=1e-9) for x in pixels])
+    expected, squared, _ = torch.cat(list(pixels), 1)
+    keep = (expected > 0) & (share > 0)
+    share, expected, squared = (x[keep] for x in (share, expected, squared))
+    share = share / share.sum()
+    mean = float((share * expected).sum())
+    logs = (expected / mean).log()
+    if not len(logs) or float(logs.std(correction=0)) < _EVEN or not bool((share * squared).sum() > 0):
+        return {}  # nothing is shown, or all is expected to be as wrong, or nothing is wrong
+    low, high = _POWERS
+    for _ in range(_HALVINGS):
+        power = (low + high) / 2
+        likely = share * squared * torch.exp(-power * logs)
+        slope = float((share * logs).sum() - (likely * logs).sum() / likely.sum())
+        low, high = (low, power) if slope > 0 else (power, high)
+    return {"pivot": PIVOT * mean, "power": power}
 
 
 def _difference(record: ErrorRecord) -> float:
@@ -282,9 +389,7 @@ def _difference(record: ErrorRecord) -> float:
     return squares / pixels if pixels else 0.0
 
 
-def _by_direction(
-    seen: Gaussians, camera: Camera, record: ErrorRecord, misfit: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
+def _by_direction(seen: Gaussians, camera: Camera, record: ErrorRecord) -> tuple[torch.Tensor, torch.Tensor]:
     """(N,) float64 each: what training pixels from about this direction say of a Gaussian's squared error, and what is
     left to the prior of a new direction; their sum is its variance from there.
     """
@@ -302,7 +407,7 @@ def _by_direction(
         near = torch.exp(-0.5 * (angle / ANGLE).square())
         fitted[part] = (near * record.residuals[part]).sum(1)
         pixels[part] = (near * record.weights[part]).sum(1)
-    return fitted / (pixels + 1), NEW * misfit / (pixels + 1)
+    return fitted / (pixels + 1), NEW * record.misfit / (pixels + 1)
 
 
 def _grouped(centers: np.ndarray) -> tuple[np.ndarray, list[int]]:
