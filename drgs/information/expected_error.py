@@ -73,6 +73,7 @@ _CALIBRATING = 1 / 3
 _MOST_CALIBRATING = 16
 _FEWEST_VIEWS = 3  # of two, what one says of the other is too little to calibrate by
 _POWERS = (0.25, 1.6)  # what a power is held within: the runs that constants were chosen on have 0.29 to 1.56
+_AS_IT_IS = (1.0, 1.0)  # pivot and power that change nothing
 _EVEN = 1e-6  # standard deviation of logarithms of what is all the same but for rounding
 _HALVINGS = 20  # of that range, for a power known to 2e-6
 
@@ -159,9 +160,12 @@ class ErrorRecord:
         sphere = header["sphere"]
         return cls(
             settings=nested(RenderSettings, None, stated(RenderSettings, header["settings"], "ErrorRecord")),
+            views=header["views"],
             information=information,
             sphere=None if sphere is None else Sphere(tuple(sphere["center"]), sphere["radius"]),
-            **{name: header[name] for name in ("views", "length", "pivot", "power")},
+            length=header["length"],
+            pivot=header["pivot"],
+            power=header["power"],
             **{name: x for name, x in tensors.items() if not name.startswith(begin)},
         )
 
@@ -243,7 +247,8 @@ def error_record(
     for turn, (view, sums) in enumerate(own_sums.items()):
         others = _without(record, place_of[view], sums)
         pixels.append(_foretold(scene, cameras[view], photographs[view], shown[view], others, turn))
-    return dataclasses.replace(record, **_calibration(pixels)) if pixels else record
+    pivot, power = _calibration(pixels) if pixels else _AS_IT_IS
+    return dataclasses.replace(record, pivot=pivot, power=power)
 
 
 @alone
@@ -351,10 +356,10 @@ def _foretold(
     noise, out = _noise(seen, camera, others)
     squared = (out.rgb.cpu().clamp(0, 1) - photograph[part].cpu()).square().mean(2)
     weight = torch.ones_like(squared) if mask is None else mask[part].cpu()
-    return torch.stack([sum(noise), squared, weight]).double().flatten(1)
+    return torch.stack([noise[0] + noise[1], squared, weight]).double().flatten(1)
 
 
-def _calibration(pixels: Sequence[torch.Tensor]) -> dict[str, float]:
+def _calibration(pixels: Sequence[torch.Tensor]) -> tuple[float, float]:
     """Pivot and power of a record, by how squared residuals e go with the noise n that other views expect.
 
     Of exponential variables e with means a n^g, the best a given, minus the mean log-likelihood is log(mean(e n^-g)) +
@@ -363,7 +368,7 @@ def _calibration(pixels: Sequence[torch.Tensor]) -> dict[str, float]:
     Args:
         pixels: (3, P) n, e and weight of the pixels of each view; each view counts as much.
     Returns:
-        Fields of the record; none where there is nothing to be found.
+        Both; where there is nothing to be found, those that change nothing.
     """
     share = torch.cat([x[2] / x[2].sum().clamp(min=1e-9) for x in pixels])
     expected, squared, _ = torch.cat(list(pixels), 1)
@@ -373,14 +378,14 @@ def _calibration(pixels: Sequence[torch.Tensor]) -> dict[str, float]:
     mean = float((share * expected).sum())
     logs = (expected / mean).log()
     if not len(logs) or float(logs.std(correction=0)) < _EVEN or not bool((share * squared).sum() > 0):
-        return {}  # nothing is shown, or all is expected to be as wrong, or nothing is wrong
+        return _AS_IT_IS  # nothing is shown, or all is expected to be as wrong, or nothing is wrong
     low, high = _POWERS
     for _ in range(_HALVINGS):
         power = (low + high) / 2
         likely = share * squared * torch.exp(-power * logs)
         slope = float((share * logs).sum() - (likely * logs).sum() / likely.sum())
         low, high = (low, power) if slope > 0 else (power, high)
-    return {"pivot": PIVOT * mean, "power": power}
+    return PIVOT * mean, power
 
 
 def _difference(record: ErrorRecord) -> float:
