@@ -135,7 +135,12 @@ class ErrorRecord:
         their mean squared residual, and where none does, that of a new direction.
         """
         pixels = self.weights.double().sum(1)
-        return (self.residuals.double().sum(1) + NEW * self.misfit) / (pixels + 1)
+        total = (self.residuals.double().sum(1) + NEW * self.misfit) / (pixels + 1)
+        return total * self.calibration(total)
+
+    def calibration(self, total: torch.Tensor) -> torch.Tensor:
+        """What sums of the parts are multiplied by, so that training views expect of each other what they show."""
+        return torch.where(total > 0, (total / self.pivot).clamp(max=1) ** (self.power - 1), 1.0)
 
     def times(self, factor: float) -> ErrorRecord:
         """The record of as many views again and again: of some that stand for all."""
@@ -302,7 +307,7 @@ def error_parts(scene: Scene, camera: Camera, record: ErrorRecord) -> dict[str, 
         "unseen": variance_map(view, {BACKDROP: behind}, sphere=record.sphere),
     }
     total = torch.stack(list(parts.values())).sum(0)
-    factor = torch.where(total > 0, (total / record.pivot).clamp(max=1) ** (record.power - 1), 1.0)
+    factor = record.calibration(total)
     return {name: x * factor for name, x in parts.items()}
 
 
