@@ -181,6 +181,21 @@ def test_what_is_not_there_is_left_out(run, tmp_path, caplog):
     assert page.sections == {"cameras", "time-spent", "repeat"}
 
 
+def test_what_a_capture_found(run, tmp_path, capsys):
+    """Findings of the last photographs stand on the page, as text; a damaged record of a capture is named."""
+    found = {"kind": "direction", "text": "the left of <b>IMG_1</b>: expected error 0.12", "advice": "take one"}
+    batches = [{"findings": [{"kind": "blur", "text": "all", "advice": "again"}]}, {"findings": [found]}]
+    (run / "capture").mkdir()
+    (run / "capture" / "capture.json").write_text(json.dumps({"batches": batches}))
+    page = page_of(run, tmp_path)
+    assert "findings" in page.sections
+    assert "the left of <b>IMG_1</b>: expected error 0.12; take one" in page.texts["li"]
+    assert "again" not in page.texts["li"]
+    (run / "capture" / "capture.json").write_text(json.dumps({"batches": [{"findings": [{"text": 3}]}]}))
+    assert cli.main(["report", str(run), "-o", str(tmp_path / "page.html")]) == 2
+    assert re.search(r"capture\.json: .*text", capsys.readouterr().err)
+
+
 def test_without_matplotlib(run, tmp_path, monkeypatch):
     """No chart, and the page says how to get them."""
     monkeypatch.setitem(sys.modules, "matplotlib", None)

@@ -78,7 +78,7 @@ _FEWER_STEPS, _MORE_STEPS = 0.5, 1.5  # of the steps of a size that it may have;
 _TIMED_VIEWS = 8  # photographs that timed steps go through, evenly of all
 _TIMED_STEPS = 12  # steps that are timed: twice the longest cycle of renderers
 _RESERVE = 0.05  # of what is left, for steps that take longer than the timed ones
-_REPORT_SECONDS = 6.0  # of held-out views and report, whatever the size
+_REPORT_SECONDS = 9.0  # of held-out views, findings of the expected error and report, whatever the size
 _TRAINING_STEPS, _HELD_OUT_STEPS = 2.0, 4.0  # and, in steps, of each view: a held-out one is drawn by each renderer
 
 

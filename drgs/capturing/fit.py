@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from drgs.capturing import diagnosis
 from drgs.capturing.budget import FitPlan, Pacer, plan_fit
 from drgs.capturing.capture import config_of
+from drgs.capturing.expected_errors import of_expected_error
 from drgs.fitting.config import FitConfig
 from drgs.fitting.records import fit_record, is_run
 from drgs.fitting.resume import FILES, last_checkpoint, lock_run
@@ -22,6 +23,7 @@ from drgs.viewing.placed_views import NEXT
 if TYPE_CHECKING:
     from drgs.capturing.capture import Capture
     from drgs.capturing.poses import Outcome
+    from drgs.sfm.findings import Finding
     from drgs.train import FitResult
 
 __all__ = ["fit_photographs"]
@@ -70,7 +72,17 @@ def fit_photographs(capture: Capture) -> Outcome:
     line = f"{len(result.gaussians)} Gaussians after {result.metrics['step']} steps{quality}"
     is_test = result.metrics["split"] == "test"
     psnr = {row["name"]: row["psnr"] for row in result.metrics["views"] if is_test and row.get("psnr") is not None}
-    return line, diagnosis.of_views(capture.dataset, fit_record(result.run).train, psnr)
+    findings = diagnosis.of_views(capture.dataset, fit_record(result.run).train, psnr)
+    return line, findings + _of_expected_error(capture)
+
+
+def _of_expected_error(capture: Capture) -> list[Finding]:
+    """Where the fit is expected to be wrong; a line says so where the photographs are not there to say it."""
+    try:
+        return of_expected_error(capture.run, capture.refined_dataset())
+    except (OSError, ValueError) as error:
+        capture.say(f"fit: it cannot be said where it is wrong, {error}")
+        return []
 
 
 def _within_budget(

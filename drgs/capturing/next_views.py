@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.fitting.records import LoadedRun
 
-__all__ = ["rank_next"]
+__all__ = ["pinhole_of", "rank_next", "reachable_places"]
 
 _INFORMATION_PIXELS = 20_000  # pixels of a view whose information is compared: a ranking takes many views
 _SOLID_OPACITY = 0.3  # opacity of Gaussians that one does not walk through
@@ -78,11 +78,11 @@ def rank_next(
         dataset = load_dataset(record.data, record.config, lazy=True, points=False, semantics=False)
         pixels = min(_INFORMATION_PIXELS, record.config.data.max_pixels)
         views = {view.name: view for view in record.with_refined_poses(dataset).views}
-        cameras = {name: _camera(view, pixels) for name, view in views.items()}
+        cameras = {name: pinhole_of(view, pixels) for name, view in views.items()}
         meters = None if length is None else meters_of(length, {name: x.center for name, x in cameras.items()})
         train = [cameras[name] for name in fitted_views(folder, record) if name in cameras]
         settings = RenderSettings.preset("fast")
-        places = _places(loaded.gaussians, list(cameras.values()), train, settings)
+        places = reachable_places(loaded.gaussians, list(cameras.values()), train, settings)
         if not places:
             raise ValueError(f"{run}: there must be a place to stand at, found none that is free; use drgs select")
         metric = None if loaded.decoder is None else SemanticMetric(loaded.decoder.metric())
@@ -139,13 +139,15 @@ def _gains_of_photographs(
         yield select(loaded.scene, [one], others, 1, scoring=scoring, cache=cache, region=region).scores[0]
 
 
-def _places(gaussians: Gaussians, cameras: list[Camera], train: list[Camera], settings: RenderSettings) -> list[Place]:
-    """Places where a person can stand, and whose view is not emptier than the photographs."""
+def reachable_places(
+    gaussians: Gaussians, cameras: list[Camera], train: list[Camera], settings: RenderSettings, most: int = 48
+) -> list[Place]:
+    """Places where a person can stand, and whose view is not emptier than the photographs; `most` at most."""
     obstacles = _obstacles(gaussians, train)
-    places = places_around(cameras, upright(cameras), seen_distance(gaussians), obstacles)
+    places = places_around(cameras, upright(cameras), seen_distance(gaussians), obstacles, most)
     # What looks past the scene would tell most, of what nobody wants to see.
-    most = _MOST_EMPTY + max(_empty_share(gaussians, camera, settings) for camera in train)
-    return [place for place in places if _empty_share(gaussians, place.camera, settings) <= most]
+    emptiest = _MOST_EMPTY + max(_empty_share(gaussians, camera, settings) for camera in train)
+    return [place for place in places if _empty_share(gaussians, place.camera, settings) <= emptiest]
 
 
 def _place_json(place: Place, meters: float | None) -> dict[str, Any]:
@@ -158,7 +160,7 @@ def _place_json(place: Place, meters: float | None) -> dict[str, Any]:
     }
 
 
-def _camera(view: View, pixels: int) -> Camera:
+def pinhole_of(view: View, pixels: int) -> Camera:
     """The pinhole camera of a photograph, reduced in size."""
     return at_most(dataclasses.replace(view.camera.undistorted(), name=view.name), pixels)
 

@@ -12,8 +12,8 @@ class Finding:
     """Something that is wrong with photographs or a video.
 
     Attributes:
-        kind: Name of what it is: `turn`, `still`, `fast`, `blur`, `blank`, `overlap`, `poses`, `exposure` or
-            `view`.
+        kind: Name of what it is: `turn`, `still`, `fast`, `blur`, `blank`, `overlap`, `poses`, `exposure`, `view`, or
+            a part of the expected error.
         text: A sentence without a full stop that says where it is and what it is.
         advice: What to do about it, in the imperative.
     """

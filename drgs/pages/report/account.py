@@ -28,6 +28,7 @@ _METRICS = {"split": str, "count": int, "gaussians": int, "mean": dict, "views":
 _PICK = {"number": int, "step": int, "index": int, "name": str, "score": _NUMBER, "margin": _NUMBER, "seconds": float}
 _PICK |= {"policy": str, "parts": dict, "candidates": [{"index": int, "name": str, "score": _NUMBER}]}
 _PLACE = {"rank": int, "text": str, "origin": [float], "camera": dict}
+_CAPTURE = {"batches": [{"findings": [{"text": str, "advice": str}]}]}
 _SELECTION = {"start": [{"index": int, "name": str}], "picks": [_PICK], "pool": [str], "pool_leak": bool}
 
 
@@ -44,6 +45,7 @@ class Account:
         metrics: Content of metrics.json; None before there is one.
         selection: Content of selection.json of an active fit, else None.
         places: Picks of next.json, places for the next photographs; empty without.
+        findings: Those of the last batch of capture/capture.json, what to do at the next shoot; empty without.
         wall: Seconds from each start of the fit to the last thing that it logged, pauses left out.
     """
 
@@ -56,6 +58,7 @@ class Account:
     selection: dict[str, Any] | None
     wall: float
     places: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+    findings: list[dict[str, Any]] = dataclasses.field(default_factory=list)
 
     def of(self, event: str) -> list[dict[str, Any]]:
         """The events of a name."""
@@ -96,7 +99,9 @@ def account_of(run: Run) -> Account:
     env = _optional(run.path / "env.json", {}) or {}
     events, wall = _events(run)
     places = _optional(run.path / "next.json", {"picks": [_PLACE]}) or {"picks": []}
-    return Account(run, record, run.config(), env, events, metrics, selection, wall, places["picks"])
+    batches = (_optional(run.path / "capture" / "capture.json", _CAPTURE) or {"batches": []})["batches"]
+    findings = batches[-1]["findings"] if batches else []
+    return Account(run, record, run.config(), env, events, metrics, selection, wall, places["picks"], findings)
 
 
 def _optional(path: Path, kind: dict) -> dict[str, Any] | None:
