@@ -28,6 +28,7 @@ from where import add_row, ran, read_rows
 
 import drgs
 from drgs import fisher
+from drgs.ellipsoids import Scene, colors_only
 from drgs.fitting.frames import Frame, frames_for, load_dataset
 from drgs.fitting.records import load_run
 from drgs.gain import Prior, variances
@@ -36,6 +37,10 @@ from drgs.studies.tables import fill_between, markdown_table, paragraph
 
 CHOOSING = ("banana", "fern", "office", "still0", "room21")
 MADE = ("still0", "room21", "still7", "room22")
+MOVING = (
+    "collision",
+    "occlusion",
+)  # around what moves there all is empty, and right: pixels that Gaussians cover count
 TOLD = "expected error"
 MAPS = {"variance, lambda 1": Prior(1.0), "variance, lambda 1e-2": Prior(1e-2)}  # of the blocks geometry and backdrop
 ROWS = ROOT / "benchmarks" / "expected_error.jsonl"
@@ -58,7 +63,7 @@ def ause(wrong: np.ndarray, order: np.ndarray) -> float:
 def measured(path: Path) -> dict:
     """The row of a run."""
     loaded = load_run(path)
-    config, scene = loaded.record.config, loaded.gaussians
+    config, scene = loaded.record.config, loaded.scene
     settings = config.settings
     dataset = loaded.record.with_refined_poses(load_dataset(loaded.record.data, config, points=False))
     train, test = (frames_for(views, config.data) for views in dataset.split())
@@ -68,7 +73,7 @@ def measured(path: Path) -> dict:
     wrong: list[np.ndarray] = []
     maps: dict[str, list[np.ndarray]] = {}
     for frame in test:
-        error, by_map = _view(scene, frame, record)
+        error, by_map = _view(scene, frame, record, loaded.moving is not None)
         wrong.append(error)
         for name, x in by_map.items():
             maps.setdefault(name, []).append(x)
@@ -88,12 +93,15 @@ def measured(path: Path) -> dict:
     }
 
 
-def _view(scene: drgs.Gaussians, frame: Frame, record: drgs.ErrorRecord) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def _view(
+    scene: Scene, frame: Frame, record: drgs.ErrorRecord, is_moving: bool
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Squared errors of a held-out view's pixels, and each map of it."""
     camera, settings = frame.camera, record.settings
     with torch.no_grad():
-        out = drgs.render(scene.replace(features=None), camera, settings, outputs=())
+        out = drgs.render(colors_only(scene, camera.time), camera, settings, outputs=())
     keep = torch.ones(camera.height, camera.width, dtype=torch.bool) if frame.mask is None else frame.mask > 0.5
+    keep = keep & (out.alpha > 0.5) if is_moving else keep
     maps = error_parts(scene, camera, record)
     maps[TOLD] = torch.stack(list(maps.values())).sum(0)
     for name, prior in MAPS.items():
@@ -111,7 +119,7 @@ def _bins(error: np.ndarray, told: np.ndarray) -> list[list[float]]:
     return [[x.mean(), told[x].mean() if x.any() else 0, error[x].mean() if x.any() else 0] for x in own]
 
 
-def _seconds(scene: drgs.Gaussians, frames: list[Frame], settings: drgs.RenderSettings) -> list[float]:
+def _seconds(scene: Scene, frames: list[Frame], settings: drgs.RenderSettings) -> list[float]:
     """CPU seconds of some views' information, as maps have needed it so far, and of their record; medians in turn."""
     cameras, masks = [frame.camera for frame in frames], [frame.mask for frame in frames]
     images = [frame.image() for frame in frames]
@@ -164,9 +172,12 @@ def main_table(rows: list[dict]) -> str:
 
 def halves(rows: list[dict]) -> dict[str, list[dict]]:
     """The runs that constants were chosen on, and captures and made scenes that only report."""
+    moving = [row for row in rows if row["run"] in MOVING]
+    rows = [row for row in rows if row["run"] not in MOVING]
     other = [row for row in rows if row["run"] not in CHOOSING]
     return {
         "choosing": [row for row in rows if row["run"] in CHOOSING],
+        "moving": moving,
         "captures": [row for row in other if row["run"] not in MADE],
         "made": [row for row in other if row["run"] in MADE],
     }
@@ -237,6 +248,9 @@ def main() -> int:
     text += [paragraph(summary(rows))] if parts["captures"] else []
     text += ["**Chosen nothing:**", main_table([*parts["captures"], *parts["made"]])]
     text += ["**Constants chosen on these:**", main_table(parts["choosing"])]
+    text += (
+        ["**Scenes that move, which chose nothing either:**", main_table(parts["moving"])] if parts["moving"] else []
+    )
     print("\n\n".join(text))
     if PAGE.exists():
         fill_between(PAGE, "expected-error", "\n\n".join(text))
