@@ -196,9 +196,8 @@ class RenderSettings:
 
     def for_pictures(self) -> RenderSettings:
         """Settings for files and screens of 8 bits: of preset `exact` with a tolerance of half a step of theirs."""
-        if self != RenderSettings.preset("exact", background=self.background):
-            return self
-        return self.replace(tolerance=TOLERANCE_OF_PICTURES)
+        is_exact = self.nearest_preset() == ("exact", {})
+        return self.replace(tolerance=TOLERANCE_OF_PICTURES) if is_exact else self
 
     @property
     def least_transmittance(self) -> float:

@@ -187,16 +187,16 @@ def test_the_command_says_how_well_it_fits(place, tmp_path, caplog):
 
 
 def test_a_page_of_a_splat_and_its_data_set(place, tmp_path, caplog, capsys):
-    """`drgs share --train`: in the data set's frame, with the photographs' cameras and what they leave uncertain."""
+    """`drgs share --train`: in the data set's frame, with the photographs' cameras and the errors that they show."""
     data, blobs = place
     save_simple_trainer(tmp_path / "results", _moved(blobs, *parts_of(normalization(data))))
     line = ["share", str(tmp_path / "results"), "--train", str(data), "-o", str(tmp_path / "page.html")]
     assert cli.main(line) == 0
     assert "by gsplat's normalization" in caplog.text
-    assert "uncertainty 0.00 MB" in capsys.readouterr().out
+    assert "scale 0.00 MB" in capsys.readouterr().out
     assert "30 Gaussians, with 9 photographs." in (tmp_path / "page.html").read_text()
     assert cli.main([*line, "--no-uncertainty"]) == 0
-    assert "uncertainty" not in capsys.readouterr().out
+    assert "scale" not in capsys.readouterr().out
 
 
 def test_checkpoints_that_are_refused(place, tmp_path):

@@ -463,7 +463,7 @@ def test_active_fit_reads_masks_of_picked_views_only(place, tmp_path, opened):
 def test_active_fit_without_a_mask_yet(place, tmp_path):
     """Masks of photographs that are not picked: the whole scene counts, and the pick says so; nothing is lost."""
     result = fitted(place, tmp_path / "run")
-    later = ({str(i) for i in range(9)} - {x["name"] for x in [*result["start"], *result["picks"]]}).pop()
+    later = min(set(result["pool"]) - {x["name"] for x in [*result["start"], *result["picks"]]})
     (tmp_path / "masks").mkdir()
     (tmp_path / f"masks/{later}.png").write_bytes((place / "left/1.png").read_bytes())
     region = fitted(place, tmp_path / "region", region=f"masks:{tmp_path / 'masks'}")

@@ -169,8 +169,9 @@ def test_the_page(capture, viewer, name):  # noqa: F811
         assert found[key] == pytest.approx(scale * wanted[key], rel=0.03)
     assert 0 < found["near"] < 0.01 * found["reach"] < found["far"]
     assert [photo["name"] for photo in found["photos"]] == [photo["name"] for photo in wanted["photos"]]
-    ends = [page["uncertainty"][key] for page in pages for key in ("low", "high")]
-    assert ends[:2] == pytest.approx([scale * x for x in ends[2:]], rel=0.3)
+    assert [page["scale"]["name"] for page in pages] == ["error", "error"]
+    ends = [page["scale"][key] for page in pages for key in ("low", "high")]
+    assert ends[:2] == pytest.approx(ends[2:], rel=0.3)  # in units of color, which the world's unit does not change
 
 
 @pytest.mark.parametrize("suffix", STEPS)
