@@ -16,8 +16,9 @@ import drgs
 from drgs import reference
 from drgs.cameras import orbit
 from drgs.checks.arguments import ArgumentError
+from drgs.fitting.semantic_errors import wrong_label
 from drgs.information.backdrop import backdrop_cells
-from drgs.information.expected_error import ANGLE, HIDDEN, NEW, PARTS, PIVOT, SPREAD, error_parts
+from drgs.information.expected_error import ANGLE, HIDDEN, NEW, PARTS, PIVOT, SPREAD, error_parts, residual_record
 from drgs.settings import RenderSettings
 
 
@@ -320,3 +321,71 @@ def test_no_residual_and_another_scene(ring):
         drgs.expected_error(few, cameras[2], record)
     with pytest.raises(ArgumentError, match="what drgs.error_record returns"):
         drgs.expected_error(g, cameras[2], None)
+
+
+def test_residuals_of_another_kind(rng, settings):
+    """Labels that are right or wrong: every part, from the oracle's weights, of two views of different masks."""
+    g, cam, _ = dense.scene(rng, settings, K=4)
+    others = [camera(rng, (12, 10)) for _ in range(2)]
+    masks = [None, torch.from_numpy(rng.uniform(size=(others[1].height, others[1].width))).float()]
+    residuals = [torch.from_numpy(rng.integers(0, 2, (c.height, c.width))).float() for c in others]
+    told, pixels, behind = [], [], [0.0, 0.0]
+    for other, mask, residual in zip(others, masks, residuals, strict=True):
+        w, _ = seen(g, other, settings)
+        m = torch.ones(len(w), dtype=torch.float64) if mask is None else mask.double().reshape(-1)
+        e, T = residual.double().reshape(-1), 1 - w.sum(1)
+        pixels.append((w * m[:, None]).sum(0))
+        told.append((w * (m * e)[:, None]).sum(0))
+        behind = [behind[0] + float((T * m).sum()), behind[1] + float((T * m * e).sum())]
+    mean = float((sum(told).sum() + behind[1]) / (sum(pixels).sum() + behind[0]))
+    misfit = (sum(told) + mean) / (sum(pixels) + 1)
+    towards = lambda c: torch.nn.functional.normalize(g.means.detach().double() - torch.from_numpy(c.center), dim=1)  # noqa: E731
+    near = [
+        torch.exp(-0.5 * (torch.arccos((towards(cam) * towards(o)).sum(1).clamp(-1, 1)) / ANGLE).square())
+        for o in others
+    ]
+    n = sum(k * x for k, x in zip(near, pixels, strict=True))
+    w, _ = seen(g, cam, settings)
+    T = 1 - w.sum(1)
+    fitted = sum(k * x for k, x in zip(near, told, strict=True)) / (n + 1)
+    truth = {
+        "misfit": w @ fitted + T * NEW * (behind[1] + mean) / (behind[0] + 1),
+        "direction": w @ (NEW * misfit / (n + 1)),
+        "unseen": 0.7 * T.square(),
+    }
+    record = residual_record(g, others, residuals, 0.7, settings, masks=masks)
+    found = error_parts(g, cam, record)
+    assert not found.pop("information").any()
+    for name, x in truth.items():
+        assert float((found[name].reshape(-1) - x).abs().max()) <= 2e-4 * float(x.max()), name
+    tensors, header = record.to_state()
+    again = drgs.ErrorRecord.from_state(tensors, json.loads(json.dumps(header)))
+    assert torch.equal(drgs.expected_error(g, cam, again), drgs.expected_error(g, cam, record))
+
+
+def test_a_wrong_label_is_told(ring):
+    """Where all labels are wrong in training views, the next from there is expected to be; so are a half, and none."""
+    g, cameras = ring
+    covered = drgs.render(g, cameras[2], outputs=()).alpha > 0.98
+    assert covered.any()
+    for wrong in (0.0, 0.5, 1.0):
+        residual = torch.full((24, 32), wrong)
+        told = wrong_label(g, cameras[2], residual_record(g, cameras, [residual] * len(cameras), 0.5))
+        assert told.max() <= 1
+        assert float(told[covered].mean()) == pytest.approx(wrong, abs=0.15)
+
+
+@pytest.mark.parametrize(
+    ("residuals", "nothing", "message"),
+    [
+        (torch.zeros(24, 31), 1.0, r"must be \(24, 32\) like its camera"),
+        (-torch.ones(24, 32), 1.0, "must be finite floats >= 0"),
+        ([torch.zeros(24, 32)] * 2, 1.0, "one for each of 1 cameras, got 2"),
+        (torch.zeros(24, 32), math.nan, "nothing must be a finite number"),
+    ],
+)
+def test_residuals_are_checked(ring, residuals, nothing, message):
+    """One line says what must hold."""
+    g, cameras = ring
+    with pytest.raises(ArgumentError, match=message):
+        residual_record(g, cameras[0], residuals, nothing)

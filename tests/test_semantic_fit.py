@@ -33,6 +33,7 @@ from drgs.fitting.frames import load_frames
 from drgs.fitting.records import load_run
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.segments import segmentation_of
+from drgs.fitting.semantic_errors import feature_record, label_record, wrong_label
 from drgs.fitting.trainer import Trainer
 from drgs.selection import policies
 from drgs.tracing.weights import Weights
@@ -615,3 +616,36 @@ def test_a_run_is_asked_for_its_classes(run, taught, tmp_path, monkeypatch):
         masks = list(out.glob("*.mask.png"))
         assert len(masks) == 1
         assert read_image(masks[0]).shape == (SIZE, SIZE, 3)
+
+
+def test_errors_of_labels_and_features(run, taught):
+    """Records of training views: as much is wrong on average as labels and decoded features are, and a map is of a view
+    without any. Where the data set has no labels, the teacher's count, and without either there is nothing to say.
+    """
+    loaded, frames = load_run(run.run), load_frames(taught.split()[0], 10**6)
+    right = metrics.evaluate(
+        loaded.gaussians,
+        frames,
+        loaded.record.config.settings,
+        segmentation=segmentation_of(loaded.gaussians, loaded.decoder, loaded.classes, "labels", "maps", frames),
+    )["segmentation"]
+    record = label_record(loaded, frames)
+    assert record.mean_misfit == pytest.approx(1 - right["run"]["pixel_accuracy"], abs=1e-3)
+    told = wrong_label(loaded.scene, frames[0].camera, record)
+    assert told.shape == (SIZE, SIZE)
+    assert 0 < float(told.mean()) < 1
+    unlabelled = [dataclasses.replace(frame, labels=None) for frame in frames]
+    by_teacher = label_record(loaded, unlabelled).mean_misfit
+    assert by_teacher == pytest.approx(record.mean_misfit, abs=0.15)  # a perfect teacher, but for edges
+    of_features, squares = feature_record(loaded, frames), []
+    for frame in frames:
+        with torch.no_grad():
+            shown = loaded.decoder(drgs.render(loaded.scene, frame.camera, loaded.record.config.settings).features)
+        taught_map = frame.teacher().float()[None]
+        wanted = torch.nn.functional.interpolate(taught_map, (SIZE, SIZE), mode="bilinear")[0].permute(1, 2, 0)
+        squares.append(float((shown - wanted).square().mean()))
+    assert of_features.mean_misfit == pytest.approx(np.mean(squares), rel=1e-3)
+    with pytest.raises(ValueError, match="label_record: no view has labels or a map"):
+        label_record(loaded, [dataclasses.replace(frame, teacher=None) for frame in unlabelled])
+    with pytest.raises(ValueError, match="feature_record: must have a run with a decoder"):
+        feature_record(dataclasses.replace(loaded, decoder=None), frames)

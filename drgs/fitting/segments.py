@@ -53,7 +53,7 @@ class Segmentation:
             Of this view alone, as `SCORE_DEFINITIONS` says: `pixel_accuracy` and `miou`, None without reference.
         """
         found = self.labels(features)
-        reference = self._reference(frame)
+        reference = self.reference_of(frame)
         if reference is None or not reference.any():
             return {"pixel_accuracy": None, "miou": None}
         pair = found.astype(np.int16), reference.astype(np.int16)
@@ -88,7 +88,7 @@ class Segmentation:
     def write(self, path: Path, frame: Frame, features: torch.Tensor) -> None:
         """A picture of a view: labels of the run, of the reference, the features, and labels over the photograph."""
         self._colors = self._colors or feature_colors(self._gaussians, self._decoder)
-        found, reference = self.labels(features), self._reference(frame)
+        found, reference = self.labels(features), self.reference_of(frame)
         count = len(self._classes)
         shown = np.zeros_like(found) if reference is None else reference
         photo = to_bytes(frame.image().numpy())
@@ -101,8 +101,8 @@ class Segmentation:
         seen = np.union1d(np.unique(found), np.unique(shown))
         write_png(path, with_legend(np.concatenate(panels, axis=1), self._classes.names, seen))
 
-    def _reference(self, frame: Frame) -> np.ndarray | None:
-        """(H, W) labels to compare with, 0 outside the mask; None where the view has none."""
+    def reference_of(self, frame: Frame) -> np.ndarray | None:
+        """(H, W) int64 labels to compare with, 0 outside the mask; None where the view has none."""
         if self.reference == "labels":
             labels = None if frame.labels is None else frame.labels()
         else:

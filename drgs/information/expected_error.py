@@ -16,6 +16,9 @@ directions d_i, the expected squared error (mean over channels) is the sum of fo
 and their sum x is calibrated: below q, q (x / q)^g is expected, g the power at which what other training views say of a
 training view (its `misfit` and `direction`) explains its residuals best, q PIVOT times what they say on average.
 
+Of errors of another kind, such as those of labels (`residual_record`), misfit and direction are the same sums of their
+residuals, information and calibration are left out, and unseen is (1 - alpha)^2 times the error of saying nothing.
+
 W_iv and R_iv are the sums of view v (misfit.py), k_iv = exp(-angle^2 / (2 ANGLE^2)) of the angle between the pixel's
 direction and that of view v, s_i^2 = (sum_v R_iv + s^2) / (sum_v W_iv + 1) the misfit of Gaussian i, shrunk to the mean
 s^2 of all of them by one pixel, and t^2 the mean squared difference of the photographs from the background.
@@ -53,7 +56,7 @@ if TYPE_CHECKING:
     from drgs.information.inputs import Masks
     from drgs.tracing.call import Output
 
-__all__ = ["PARTS", "ErrorRecord", "error_parts", "error_record", "expected_error"]
+__all__ = ["PARTS", "ErrorRecord", "error_parts", "error_record", "expected_error", "residual_record"]
 
 PARTS = ("misfit", "direction", "information", "unseen")
 """Where the expected error of a pixel comes from."""
@@ -89,9 +92,11 @@ class ErrorRecord:
         weights: (N, P) float32 sum of w over the pixels of the views from a place, in pixels.
         residuals: (N, P) float32 sum of w times the squared residual (mean over channels), squared units of color.
         behind: (2,) float64, both sums for what lies behind everything, with weights 1 - alpha.
-        contrast: (2,) float64 number of pixels, and sum of their squared differences from the background.
-        information: Group -> float64, that of the views about Gaussians and backdrop, as of `drgs.fisher`.
-        sphere: What the backdrop is painted on.
+        contrast: (2,) float64 number of pixels, and sum of their squared differences from the background, or of what
+            their residuals are where nothing is said.
+        information: Group -> float64, that of the views about Gaussians and backdrop, as of `drgs.fisher`; empty of
+            residuals that are not those of colors.
+        sphere: What the backdrop is painted on; None: nothing is said about it.
         length: World units that positions count in beside a prior, of the views (`drgs.gain.unit_length`).
         pivot, power: The calibration: of a pixel whose parts add up to x, min(x / pivot, 1)^(power - 1) x is expected.
             Pivot in squared units of color.
@@ -213,47 +218,113 @@ def error_record(
     scene = once_per_time(scene)
     cameras, each, shown = checked_views(where, scene, cameras, settings, masks)
     photographs = _checked_images(where, images, cameras)
-    if not any(float(mask.sum()) > 0 if mask is not None else True for mask in shown):
-        raise ValueError(f"{where}: masks must leave a pixel whose residual counts, got none above 0; pass other views")
     sphere = sphere or backdrop_sphere(scene, cameras)
-    quantity = Joint((("", Diagonal(without=("features",), of_gaussians=True)), ("", Backdrop(sphere)), ("", Misfit())))
+    parts = (("", Diagonal(without=("features",), of_gaussians=True)), ("", Backdrop(sphere)), ("", Misfit()))
+    views = [
+        ViewContext(scene, camera, own, mask, photograph=image)
+        for camera, own, mask, image in zip(cameras, each, shown, photographs, strict=True)
+    ]
+    chosen = _calibrating(len(views))
+    record, others = _record_of(where, views, Joint(parts), sphere, chosen, advance)
+    pixels = [_foretold(views[k], told, turn) for turn, (k, told) in enumerate(zip(chosen, others, strict=True))]
+    pivot, power = _calibration(pixels) if pixels else _AS_IT_IS
+    return dataclasses.replace(record, pivot=pivot, power=power)
+
+
+@alone
+def residual_record(
+    scene: Scene,
+    cameras: Camera | Sequence[Camera],
+    residuals: torch.Tensor | Sequence[torch.Tensor],
+    nothing: float,
+    settings: RenderSettings | None = None,
+    *,
+    masks: Masks = None,
+    advance: Callable[[], None] = lambda: None,
+) -> ErrorRecord:
+    """What training views say about errors of another kind than those of colors, for `expected_error`.
+
+    A residual is any number >= 0 of a pixel: 1 where its label is wrong, so that the expected error of a pixel is the
+    probability that its label is, or the squared residual of its feature. The record says nothing about parameters: its
+    maps have the parts `misfit`, `direction` and, of what no Gaussian covers, `unseen`, (1 - alpha)^2 `nothing`; the
+    part `information` is 0. It is not calibrated, so that it is too even: what is small is expected too large.
+
+    Args:
+        scene, cameras, settings, masks, advance: The same as for `error_record`.
+        residuals: (H, W) of each camera, in squared units of whatever they are residuals of.
+        nothing: The residual of saying nothing, on average over the pixels of the views, in the same units.
+    Raises:
+        ValueError: If there is no view, residuals or masks are not of the cameras' sizes, or a residual, or `nothing`,
+            is negative or not finite.
+    """
+    where = "residual_record"
+    scene = once_per_time(scene)
+    cameras, each, shown = checked_views(where, scene, cameras, settings, masks)
+    values = _checked_residuals(where, residuals, cameras)
+    if not (isinstance(nothing, int | float) and 0 <= nothing < math.inf):
+        raise ArgumentError(f"{where}: nothing must be a finite number >= 0, got {nothing!r}; pass a mean residual")
+    views = [
+        ViewContext(scene, camera, own, mask, residual=residual)
+        for camera, own, mask, residual in zip(cameras, each, shown, values, strict=True)
+    ]
+    record, _ = _record_of(where, views, Joint((("", Misfit()),)), None, [], advance)
+    pixels = float(sum(x.numel() for x in values))
+    return dataclasses.replace(record, contrast=torch.tensor([pixels, pixels * nothing], dtype=torch.float64))
+
+
+def _record_of(
+    where: str,
+    views: Sequence[ViewContext],
+    quantity: Joint,
+    sphere: Sphere | None,
+    left_out: Sequence[int],
+    advance: Callable[[], None],
+) -> tuple[ErrorRecord, list[ErrorRecord]]:
+    """The record of views of one scene, and what all views but one of them say of misfit, for some of them.
+
+    Args:
+        where: What errors begin with.
+        views: The views, with photographs or residuals.
+        quantity: What is computed of each: its misfit, and information if any.
+        sphere: What the backdrop is painted on; None: nothing is said about it.
+        left_out: Numbers of these views.
+        advance: Called after each view.
+    """
+    if not any(float(view.mask.sum()) > 0 if view.mask is not None else True for view in views):
+        raise ValueError(f"{where}: masks must leave a pixel whose residual counts, got none above 0; pass other views")
+    cameras = [view.camera for view in views]
     places, place_of = _grouped(np.stack([camera.center for camera in cameras]))
-    count = len(gaussians_at(where, scene, cameras[0]))
+    count = len(gaussians_at(where, views[0].scene, cameras[0]))
     columns = {name: torch.zeros(count, len(places)) for name in (WEIGHTS, RESIDUALS)}
     total: dict[str, torch.Tensor] = {}
-    own_sums: dict[int, dict[str, torch.Tensor]] = {view: {} for view in _calibrating(len(cameras))}
-    for view, (camera, own, mask, place) in enumerate(zip(cameras, each, shown, place_of, strict=True)):
-        context = ViewContext(scene, camera, own, mask, photograph=photographs[view])
-        if len(context.gaussians) != count:
+    own_sums: dict[int, dict[str, torch.Tensor]] = {view: {} for view in left_out}
+    for number, (view, place) in enumerate(zip(views, place_of, strict=True)):
+        if len(view.gaussians) != count:
             raise ValueError(
                 f"{where}: a scene must have as many Gaussians in all views, got {count} in the first and "
-                f"{len(context.gaussians)} in cameras[{view}]; take views of one time"
+                f"{len(view.gaussians)} in cameras[{number}]; take views of one time"
             )
-        found = quantity.summand(quantity.compute(context), camera, mask)
-        if view in own_sums:
-            own_sums[view] = {name: found[name].clone() for name in (WEIGHTS, RESIDUALS, BEHIND)}
+        found = quantity.summand(quantity.compute(view), view.camera, view.mask)
+        view.probes.clear()  # which hold buffers of the traversal
+        if number in own_sums:
+            own_sums[number] = {name: found[name].clone() for name in (WEIGHTS, RESIDUALS, BEHIND)}
         for name, by_place in columns.items():
             by_place[:, place] += found.pop(name)
         add(total, found)
         advance()
     record = ErrorRecord(
-        settings=each[0],
-        views=len(cameras),
+        settings=views[0].settings,
+        views=len(views),
         places=torch.from_numpy(places),
         weights=columns[WEIGHTS],
         residuals=columns[RESIDUALS],
         behind=total.pop(BEHIND),
-        contrast=total.pop(CONTRAST),
+        contrast=total.pop(CONTRAST, torch.zeros(2, dtype=torch.float64)),
         information=total,
         sphere=sphere,
-        length=unit_length(scene, cameras),
+        length=unit_length(views[0].scene, cameras),
     )
-    pixels = []
-    for turn, (view, sums) in enumerate(own_sums.items()):
-        others = _without(record, place_of[view], sums)
-        pixels.append(_foretold(scene, cameras[view], photographs[view], shown[view], others, turn))
-    pivot, power = _calibration(pixels) if pixels else _AS_IT_IS
-    return dataclasses.replace(record, pivot=pivot, power=power)
+    return record, [_without(record, place_of[number], sums) for number, sums in own_sums.items()]
 
 
 @alone
@@ -295,20 +366,26 @@ def error_parts(scene: Scene, camera: Camera, record: ErrorRecord) -> dict[str, 
         )
     seen = seen.detach()
     (misfit, direction), out = _noise(seen.replace(sh=seen.sh[:, :1]), camera, record)
+    view = ViewContext(scene, camera, record.settings, opacity=out.alpha.cpu())
+    parts = {"misfit": misfit, "direction": direction, **_left_open(view, record)}
+    total = torch.stack(list(parts.values())).sum(0)
+    factor = record.calibration(total)
+    return {name: x * factor for name, x in parts.items()}
+
+
+def _left_open(view: ViewContext, record: ErrorRecord) -> dict[str, torch.Tensor]:
+    """(H, W) each, the parts `information` and `unseen` of a view before they are calibrated."""
+    if not record.information:
+        unseen = (1 - view.opacity).square() * _difference(record)
+        return {"information": torch.zeros_like(unseen), "unseen": unseen}
     weights = variances(record.information, _PRIOR.over(record.length))
     behind = weights.pop(BACKDROP) * (HIDDEN * _difference(record) / 3)
     scale = SPREAD / 3 * record.misfit
     weights = {name: x * scale.reshape(-1, *[1] * (x.dim() - 1)) for name, x in weights.items()}
-    view = ViewContext(scene, camera, record.settings, opacity=out.alpha.cpu())
-    parts = {
-        "misfit": misfit,
-        "direction": direction,
+    return {
         "information": variance_map(view, weights),
         "unseen": variance_map(view, {BACKDROP: behind}, sphere=record.sphere),
     }
-    total = torch.stack(list(parts.values())).sum(0)
-    factor = record.calibration(total)
-    return {name: x * factor for name, x in parts.items()}
 
 
 def _noise(seen: Gaussians, camera: Camera, record: ErrorRecord) -> tuple[tuple[torch.Tensor, torch.Tensor], Output]:
@@ -338,29 +415,22 @@ def _without(record: ErrorRecord, place: int, own: Information) -> ErrorRecord:
     return dataclasses.replace(record, behind=(record.behind - own[BEHIND]).clamp(min=0), **columns)
 
 
-def _foretold(
-    scene: Scene,
-    camera: Camera,
-    photograph: torch.Tensor,
-    mask: torch.Tensor | None,
-    others: ErrorRecord,
-    turn: int,
-) -> torch.Tensor:
+def _foretold(view: ViewContext, others: ErrorRecord, turn: int) -> torch.Tensor:
     """(3, P) float64 of the pixels of a quarter of a view: the noise that other views expect, squared residual, weight.
 
     Args:
-        scene, camera, photograph, mask: The scene, and the view.
+        view: The view.
         others: The record of the others.
         turn: Which quarter; from corner to corner.
     """
+    camera = view.camera
     width, height = -(-camera.width // 2), -(-camera.height // 2)
     x, y = turn % 2 * (camera.width - width), turn // 2 % 2 * (camera.height - height)
     part = slice(y, y + height), slice(x, x + width)
-    seen = scene.at(camera.time).detach()
-    camera = cropped(camera, x, y, width, height)
-    noise, out = _noise(seen, camera, others)
-    squared = (out.rgb.cpu().clamp(0, 1) - photograph[part].cpu()).square().mean(2)
-    weight = torch.ones_like(squared) if mask is None else mask[part].cpu()
+    noise, out = _noise(view.gaussians.detach(), cropped(camera, x, y, width, height), others)
+    assert view.photograph is not None  # calibrated is what is about colors
+    squared = (out.rgb.cpu().clamp(0, 1) - view.photograph[part].cpu()).square().mean(2)
+    weight = torch.ones_like(squared) if view.mask is None else view.mask[part].cpu()
     return torch.stack([noise[0] + noise[1], squared, weight]).double().flatten(1)
 
 
@@ -433,6 +503,28 @@ def _grouped(centers: np.ndarray) -> tuple[np.ndarray, list[int]]:
         place[from_here < distance] = len(chosen) - 1
         distance = np.minimum(distance, from_here)
     return np.stack([centers[place == k].mean(0) for k in range(len(chosen))]), place.tolist()
+
+
+def _checked_residuals(where: str, residuals: Any, cameras: Sequence[Camera]) -> list[torch.Tensor]:
+    """A map for each camera; `ArgumentError` for another number of them, another size, or what is no number >= 0."""
+    residuals = [residuals] if isinstance(residuals, torch.Tensor) and residuals.dim() == 2 else residuals
+    if not isinstance(residuals, list | tuple | torch.Tensor) or len(residuals) != len(cameras):
+        got = str(len(residuals)) if isinstance(residuals, list | tuple | torch.Tensor) else kind_of(residuals)
+        raise ArgumentError(
+            f"{where}: residuals must be a list with one for each of {len(cameras)} cameras, got {got}; pass theirs"
+        )
+    for index, (residual, camera) in enumerate(zip(residuals, cameras, strict=True)):
+        must_be(where, f"residuals[{index}]", residual, torch.Tensor, "(H, W) >= 0")
+        size = (camera.height, camera.width)
+        if tuple(residual.shape) != size:
+            raise ArgumentError(
+                f"{where}: residuals[{index}] must be {size} like its camera, got {tuple(residual.shape)}; resize it"
+            )
+        if not residual.is_floating_point() or not bool((torch.isfinite(residual) & (residual >= 0)).all()):
+            raise ArgumentError(
+                f"{where}: residuals[{index}] must be finite floats >= 0, got {residual.dtype} or others; square them"
+            )
+    return list(residuals)
 
 
 def _checked_images(where: str, images: Any, cameras: Sequence[Camera]) -> list[torch.Tensor]:

@@ -6,7 +6,8 @@ shown) and w_ip the compositing weights, a view adds to Gaussian i
     W_i = sum_p w_ip      pixels in which it is seen
     R_i = sum_p w_ip e_p  their squared residuals
 
-so that R_i / W_i is the mean squared residual where Gaussian i is seen. What lies behind everything gets the same sums
+so that R_i / W_i is the mean squared residual where Gaussian i is seen. Of a view whose residuals are given, such as 1
+where a label is wrong, e_p is these, and the view needs no photograph. What lies behind everything gets the same sums
 with the transmittance 1 - alpha_p in place of w_ip. All of them add up over views, and are linear in the image, so that
 a traversal of the view for something else, such as the diagonal, fills them on its way.
 """
@@ -41,12 +42,14 @@ _WIDTH = 2  # floats of a Gaussian: sum w, sum w e
 
 @dataclasses.dataclass(frozen=True)
 class Misfit(Quantity):
-    """Sums of squared residuals by Gaussian, of a view with a photograph; a mask multiplies weights and transmittance.
+    """Sums of squared residuals by Gaussian, of a view with a photograph or with residuals of another kind; a mask
+    multiplies weights and transmittance.
 
     misfit.weights    (N,) sum of w, in pixels
     misfit.residuals  (N,) sum of w e, squared units of color
     misfit.behind     (2,) the same two of the transmittance 1 - alpha, for what lies behind everything
-    misfit.contrast   (2,) sum of the mask, and of the squared differences between photograph and background
+    misfit.contrast   (2,) sum of the mask, and of the squared differences between photograph and background; not where
+                      there is no photograph
     """
 
     where: ClassVar[str] = "expected_error"
@@ -74,24 +77,30 @@ class MisfitSums:
     def __init__(self, view: ViewContext) -> None:
         """
         Args:
-            view: A view with a photograph.
+            view: A view with a photograph, or with residuals.
         """
-        assert view.photograph is not None  # a view without has been refused
+        assert view.photograph is not None or view.residual is not None  # a view without has been refused
         self.sums: WalkSums = self
         self._view = view
-        self._photograph = view.photograph.detach().float().cpu()
-        self._residual: torch.Tensor | None = None  # (H, W)
+        self._photograph = None if view.photograph is None else view.photograph.detach().float().cpu()
+        self._residual = None if view.residual is None else view.residual.detach().float().cpu()  # (H, W)
         self._buffer: Float | None = None
 
     def sink(self, replay: Replay, walk: Walk) -> _Sink:
         """The sink of one walk of the view."""
         lib = replay.lib
         if self._buffer is None:
-            self._residual = (replay.image.clamp(0, 1) - self._photograph).square().mean(2)
             self._buffer = dr.zeros(lib.Float, _WIDTH * replay.count)
-        assert self._residual is not None  # set with the buffer
-        residual = to_drjit(lib, self._residual.reshape(-1).to(replay.call.home)).array
+        values = self._residual_of(replay.image)
+        residual = to_drjit(lib, values.reshape(-1).to(replay.call.home)).array
         return _Sink(lib, walk, residual, self._buffer)
+
+    def _residual_of(self, image: torch.Tensor) -> torch.Tensor:
+        """(H, W) what is given, or the squared residuals of a rendering, computed once."""
+        if self._residual is None:
+            assert self._photograph is not None  # one of both is there
+            self._residual = (image.clamp(0, 1) - self._photograph).square().mean(2)
+        return self._residual
 
     def information(self) -> dict[str, torch.Tensor]:
         """The sums, by the names that `Misfit` gives them."""
@@ -102,19 +111,20 @@ class MisfitSums:
             view.replay(geometry=False).add_up(self)
         if self._buffer is None:  # of no Gaussians the background alone is seen
             by_gaussian = torch.zeros(0, _WIDTH)
-            self._residual = (background.clamp(0, 1) - self._photograph).square().mean(2)
         else:
             by_gaussian = self._buffer.torch().cpu().reshape(count, _WIDTH)
-        assert self._residual is not None  # either way
-        mask = torch.ones(self._residual.shape) if view.mask is None else view.mask.detach().float().cpu()
+        residual = self._residual_of(background)
+        mask = torch.ones(residual.shape) if view.mask is None else view.mask.detach().float().cpu()
         behind = (1 - view.opacity).clamp(min=0) * mask
-        contrast = (self._photograph - background).square().mean(2) * mask
-        return {
+        sums = {
             WEIGHTS: by_gaussian[:, 0].clone(),
             RESIDUALS: by_gaussian[:, 1].clone(),
-            BEHIND: torch.stack([behind.sum(), (behind * self._residual).sum()]),
-            CONTRAST: torch.stack([mask.sum(), contrast.sum()]),
+            BEHIND: torch.stack([behind.sum(), (behind * residual).sum()]),
         }
+        if self._photograph is not None:
+            contrast = (self._photograph - background).square().mean(2) * mask
+            sums[CONTRAST] = torch.stack([mask.sum(), contrast.sum()])
+        return sums
 
 
 class _Sink:

@@ -79,6 +79,7 @@ class ViewContext:
         mask: (H, W) in [0, 1] what the image is multiplied by; None: 1.
         number: Place of the view in a sum over views, for random images that differ between them.
         photograph: (H, W, 3) what the view should show; None: there is none, or no quantity asks for it.
+        residual: (H, W) how wrong each pixel is, where that is known; None: as far as its color is from the photograph.
         probes: Quantity -> its sums over hits that are still to be filled, or have been.
     """
 
@@ -91,10 +92,11 @@ class ViewContext:
         number: int = 0,
         opacity: torch.Tensor | None = None,
         photograph: torch.Tensor | None = None,
+        residual: torch.Tensor | None = None,
     ) -> None:
         """
         Args:
-            scene, camera, settings, mask, number, photograph: See the attributes.
+            scene, camera, settings, mask, number, photograph, residual: See the attributes.
             opacity: (H, W) float32, where it is known; None: a traversal gives it, or it is rendered.
         """
         self.scene = once_per_time(scene)
@@ -103,6 +105,7 @@ class ViewContext:
         self.mask = mask
         self.number = number
         self.photograph = photograph
+        self.residual = residual
         self.probes: dict[Quantity, HitProbes] = {}
         self._opacity = opacity
 
