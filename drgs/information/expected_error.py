@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -279,8 +279,9 @@ def _record_of(
     sphere: Sphere | None,
     left_out: Sequence[int],
     advance: Callable[[], None],
-) -> tuple[ErrorRecord, list[ErrorRecord]]:
-    """The record of views of one scene, and what all views but one of them say of misfit, for some of them.
+) -> tuple[ErrorRecord, Iterator[ErrorRecord]]:
+    """The record of views of one scene, and what all views but one of them say of misfit, for some of them: one at a
+    time, since each is as large as the record.
 
     Args:
         where: What errors begin with.
@@ -324,7 +325,7 @@ def _record_of(
         sphere=sphere,
         length=unit_length(views[0].scene, cameras),
     )
-    return record, [_without(record, place_of[number], sums) for number, sums in own_sums.items()]
+    return record, (_without(record, place_of[number], sums) for number, sums in own_sums.items())
 
 
 @alone
