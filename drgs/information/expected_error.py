@@ -508,45 +508,42 @@ def _grouped(centers: np.ndarray) -> tuple[np.ndarray, list[int]]:
 
 def _checked_residuals(where: str, residuals: Any, cameras: Sequence[Camera]) -> list[torch.Tensor]:
     """A map for each camera; `ArgumentError` for another number of them, another size, or what is no number >= 0."""
-    residuals = [residuals] if isinstance(residuals, torch.Tensor) and residuals.dim() == 2 else residuals
-    if not isinstance(residuals, list | tuple | torch.Tensor) or len(residuals) != len(cameras):
-        got = str(len(residuals)) if isinstance(residuals, list | tuple | torch.Tensor) else kind_of(residuals)
-        raise ArgumentError(
-            f"{where}: residuals must be a list with one for each of {len(cameras)} cameras, got {got}; pass theirs"
-        )
-    for index, (residual, camera) in enumerate(zip(residuals, cameras, strict=True)):
-        must_be(where, f"residuals[{index}]", residual, torch.Tensor, "(H, W) >= 0")
-        size = (camera.height, camera.width)
-        if tuple(residual.shape) != size:
-            raise ArgumentError(
-                f"{where}: residuals[{index}] must be {size} like its camera, got {tuple(residual.shape)}; resize it"
-            )
+    maps = _one_each(where, "residuals", residuals, cameras, (), "(H, W) >= 0")
+    for index, residual in enumerate(maps):
         if not residual.is_floating_point() or not bool((torch.isfinite(residual) & (residual >= 0)).all()):
             raise ArgumentError(
                 f"{where}: residuals[{index}] must be finite floats >= 0, got {residual.dtype} or others; square them"
             )
-    return list(residuals)
+    return maps
 
 
 def _checked_images(where: str, images: Any, cameras: Sequence[Camera]) -> list[torch.Tensor]:
     """An image for each camera; `ArgumentError` for another number of them, another size or what is not finite."""
-    images = [images] if isinstance(images, torch.Tensor) and images.dim() == 3 else images
-    if not isinstance(images, list | tuple | torch.Tensor) or len(images) != len(cameras):
-        got = str(len(images)) if isinstance(images, list | tuple | torch.Tensor) else kind_of(images)
-        raise ArgumentError(
-            f"{where}: images must be a list with one for each of {len(cameras)} cameras, got {got}; pass their "
-            "photographs"
-        )
-    for index, (image, camera) in enumerate(zip(images, cameras, strict=True)):
-        must_be(where, f"images[{index}]", image, torch.Tensor, "(H, W, 3) in [0, 1]")
-        size = (camera.height, camera.width, 3)
-        if tuple(image.shape) != size:
-            raise ArgumentError(
-                f"{where}: images[{index}] must be {size} like its camera, got {tuple(image.shape)}; resize either"
-            )
+    photographs = _one_each(where, "images", images, cameras, (3,), "(H, W, 3) in [0, 1]")
+    for index, image in enumerate(photographs):
         if not image.is_floating_point() or not bool(torch.isfinite(image).all()):
             raise ArgumentError(
                 f"{where}: images[{index}] must be finite floats in [0, 1], got {image.dtype} or NaN or Inf; divide "
                 "bytes by 255"
             )
-    return list(images)
+    return photographs
+
+
+def _one_each(
+    where: str, name: str, given: Any, cameras: Sequence[Camera], channels: tuple[int, ...], hint: str
+) -> list[torch.Tensor]:
+    """A tensor (H, W, *channels) for each camera, or one of a single camera by itself; `ArgumentError` for others."""
+    given = [given] if isinstance(given, torch.Tensor) and given.dim() == 2 + len(channels) else given
+    if not isinstance(given, list | tuple | torch.Tensor) or len(given) != len(cameras):
+        got = str(len(given)) if isinstance(given, list | tuple | torch.Tensor) else kind_of(given)
+        raise ArgumentError(
+            f"{where}: {name} must be a list with one for each of {len(cameras)} cameras, got {got}; pass theirs"
+        )
+    for index, (values, camera) in enumerate(zip(given, cameras, strict=True)):
+        must_be(where, f"{name}[{index}]", values, torch.Tensor, hint)
+        size = (camera.height, camera.width, *channels)
+        if tuple(values.shape) != size:
+            raise ArgumentError(
+                f"{where}: {name}[{index}] must be {size} like its camera, got {tuple(values.shape)}; resize either"
+            )
+    return list(given)
