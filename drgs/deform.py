@@ -395,7 +395,7 @@ class DynamicGaussians:
         self, fields: dict[str, torch.Tensor], lifespans: Lifespans, time: float | torch.Tensor
     ) -> None:
         """Set the mean and the opacity of the Gaussians with a limited lifespan at a time, in `fields`."""
-        index = self.has_lifespan.nonzero()[:, 0]
+        index = self.has_lifespan.nonzero()[:, 0].to(fields["means"].device)  # a call may have moved the fields alone
         limited = lifespans.take(index)
         fields["means"] = fields["means"].index_add(0, index, drift(limited, time).to(fields["means"].dtype))
         logits = fields["logit_opacities"]

@@ -417,6 +417,7 @@ def test_scores_know_masks(still, tmp_path, monkeypatch, mask, empty):
     assert all(row["parts"]["backdrop"] >= 0 for row in pick["candidates"])
 
 
+@pytest.mark.same_bits
 def test_held_out_views_are_measured_on_the_way(still, tmp_path, monkeypatch):
     """At the numbers of views that are asked for, just before the next pick: as drgs.fitting.metrics measures that
     model; the fit is the same to the bit, and one that is killed between measuring and saving ends alike.

@@ -299,6 +299,7 @@ def names_in(run: Path) -> list[str]:
     return [view["name"] for view in (*selection["start"], *selection["picks"])]
 
 
+@pytest.mark.same_bits
 def test_auto_leaves_equal_photographs_alone(even, tmp_path):
     """The same bits as with exposure off; what was found is recorded at each look, and nothing is eliminated."""
     runs = []
@@ -316,6 +317,7 @@ def test_auto_leaves_equal_photographs_alone(even, tmp_path):
     assert "nuisances" not in json.loads((runs[1].path / "selection.json").read_text())["picks"][1]
 
 
+@pytest.mark.same_bits
 def test_auto_begins_when_a_photograph_differs(even, tmp_path, capsys):
     """Of two equal photographs nobody has gains; when a darker one joins all have, and one line says since when. Killed
     after that and resumed, the fit ends in the same bits.
@@ -436,6 +438,7 @@ def test_everybody_sees_what_an_active_fit_has_refined(uneven, tmp_path, capsys)
     capsys.readouterr()
 
 
+@pytest.mark.same_bits
 def test_poses_stay_where_no_observations_are_read(uneven, tmp_path):
     """`auto` has nothing to go by before all photographs are there: the same bits as with fixed poses."""
     states = []

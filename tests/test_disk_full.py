@@ -126,6 +126,7 @@ def said(capsys) -> str:
     return line
 
 
+@pytest.mark.same_bits
 def test_a_fit_goes_on_after_a_full_disk(disk, tmp_path, capsys):
     """However little room there was, more of it lets --resume end with the bits of a fit that had enough."""
     from test_active import write_still

@@ -224,7 +224,9 @@ class Anchored(Swarm):
         for name in self.weights:
             p.pop(name)
         many = {name: torch.cat([x] * self.copies) for name, x in p.items()}
-        return Gaussians(**{**many, "means": many["means"] * torch.linspace(1, 1.5, len(many["means"]))[:, None]})
+        return Gaussians(
+            **{**many, "means": many["means"] * torch.linspace(1, 1.5, len(many["means"])).to(many["means"])[:, None]}
+        )
 
 
 def test_a_name_means_the_scene_everywhere(view):

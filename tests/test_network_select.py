@@ -71,7 +71,7 @@ def test_ratio_joins_the_groups(views, cache):
         assert found.scores[i - 1] == pytest.approx(sum(parts.values()))
     alone = pick(scene, candidates, train, cache=cache, blocks=("deformation",), criterion="eig")
     assert [list(x) for x in alone.parts] == [["grid", "mlp"]] * 3
-    assert [x["mlp"] for x in alone.parts] == [x["mlp"] for x in found.parts]
+    assert [x["mlp"] for x in alone.parts] == pytest.approx([x["mlp"] for x in found.parts], rel=1e-6)
     without = pick(scene, candidates, train, cache=cache, blocks=("geometry",))
     assert without.network is None
     assert "grid" not in without.parts[0]
@@ -110,6 +110,7 @@ def test_greedy_over_pairs_of_camera_and_time(views, cache):
     assert cache.misses < cache.hits
 
 
+@pytest.mark.same_bits
 @pytest.mark.parametrize("preset", ["fast", "exact"])
 @pytest.mark.parametrize("masked", [False, True])
 def test_one_traversal_for_geometry_and_deformation(views, monkeypatch, preset, masked):

@@ -140,6 +140,7 @@ def test_a_camera_relative_to_an_origin_sees_what_it_saw():
 # -------------------------------------------------------------------------------------------------------------- fits
 
 
+@pytest.mark.same_bits
 def test_a_fit_does_not_depend_on_where_the_world_is(dataset, tmp_path):  # noqa: F811
     """PSNR within 0.05 dB at 5e6 from 0, with poses refined and a filter; files and a resumed fit keep the origin."""
     options = config(poses="refined", filter_3d="on", skybox="off", save_every=30)

@@ -220,6 +220,7 @@ def test_outputs_are_checked_first(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "file").read_text() == "mine"
 
 
+@pytest.mark.same_bits
 @pytest.mark.parametrize("options", ["", "--views active --policy random --add 1 --every 2"], ids=["all", "active"])
 def test_two_fits_leave_the_same_checkpoint(dataset, tmp_path, monkeypatch, capsys, two_threads, options):  # noqa: F811
     """Byte for byte: what the clock says is in the log, from where a resumed fit and `load_run` have it."""

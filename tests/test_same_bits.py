@@ -16,6 +16,7 @@ pytestmark = pytest.mark.core
 ROOT = Path(__file__).parents[1]
 
 
+@pytest.mark.same_bits
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="the record is of x86-64")
 def test_results_are_those_of_the_record(tmp_path):
     """The same bits where the libraries alone give the same bits, as on most machines with AVX2; else near them."""

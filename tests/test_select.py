@@ -16,7 +16,7 @@ import pytest
 import torch
 from scenes_random import gaussians
 
-from drgs import fisher, reference
+from drgs import fisher, reference, runtime
 from drgs.cameras import Camera, intrinsics_from_fov, look_at
 from drgs.ellipsoids import Gaussians
 from drgs.gain import CRITERIA, Prior, dense, information_gain
@@ -377,7 +377,9 @@ def test_cache_keeps_kinds_apart(world):
     for options in kinds:
         found = select(g, candidates[:3], train[:1], cache=cache, **options)
         assert found.computed == 4
-        assert found.scores == pytest.approx(select(g, candidates[:3], train[:1], **options).scores, rel=1e-6)
+        # Logarithms of what a single view hardly determines are of sums whose order is not fixed on a card.
+        close = 1e-3 if runtime.backend().name == "cuda" else 1e-6
+        assert found.scores == pytest.approx(select(g, candidates[:3], train[:1], **options).scores, rel=close)
     assert len(cache) == 4 * len(kinds) + 4, "and how far away the surfaces of each view are, for the backdrop"
 
 
@@ -437,7 +439,7 @@ class _Moving:
         return self.deform(self.parameters(), time)
 
     def deform(self, parameters, time):
-        moved = parameters["means"] + parameters["speed"] * time * torch.eye(3)[0]
+        moved = parameters["means"] + parameters["speed"] * time * torch.eye(3)[0].to(parameters["means"])
         return self.g.replace(means=moved)
 
     def parameters(self):

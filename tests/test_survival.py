@@ -92,6 +92,7 @@ def test_a_kill_that_loses_something_is_seen(kills, tmp_path):
         kills.check_whole(tmp_path / "run")
 
 
+@pytest.mark.same_bits
 @pytest.mark.every(3)
 @pytest.mark.skipif(sys.platform != "linux", reason="limits and capabilities are those of Linux")
 @pytest.mark.parametrize(
