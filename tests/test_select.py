@@ -439,8 +439,9 @@ class _Moving:
         return self.deform(self.parameters(), time)
 
     def deform(self, parameters, time):
-        moved = parameters["means"] + parameters["speed"] * time * torch.eye(3)[0].to(parameters["means"])
-        return self.g.replace(means=moved)
+        means = parameters["means"]
+        x = torch.eye(3)[0].to(means)
+        return self.g.to(means.device).replace(means=means + parameters["speed"] * time * x)
 
     def parameters(self):
         return {**self.g.parameters(), "speed": self.speed}
