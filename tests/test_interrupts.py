@@ -103,7 +103,7 @@ def test_signal_ends_a_command(start, tmp_path, kind, signum, code, name):
 
 @pytest.mark.parametrize(
     ("owner", "name", "call"),
-    [(Compositor, "forward", drgs.render), (jacobian, "weighted_squares", drgs.diagonal)],
+    [(Compositor, "composited", drgs.render), (jacobian, "weighted_squares", drgs.diagonal)],
     ids=["operation", "walk"],
 )
 def test_what_is_inside_of_drjit_is_interrupted_as_python_is(monkeypatch, owner, name, call):

@@ -17,6 +17,7 @@ from drgs.settings import RenderSettings
 from drgs.tracing import tiles
 from drgs.tracing.bridge import to_drjit
 from drgs.tracing.call import Call
+from drgs.tracing.recordings import without_recordings
 from drgs.tracing.records import pack_records
 from drgs.tracing.tiles import TILE, build
 
@@ -163,7 +164,7 @@ def test_tiles_left_out_change_nothing(rng, monkeypatch, fields, anisotropy):
         g = around_camera(gaussians(rng, 40, 4, scale=0.1, anisotropy=anisotropy, opacity=2.5), cam)
         images = []
         for whole in (False, True):
-            with monkeypatch.context() as patch:
+            with monkeypatch.context() as patch, without_recordings():
                 if whole:
                     patch.setattr(tiles._Tiles, "may_hit", lambda self, x, y: self.lib.Bool(True))
                 out = render(g.detach(), cam, settings, outputs=("count", "depth"))

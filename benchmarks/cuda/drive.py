@@ -42,7 +42,7 @@ def driven(case: object, large: bool = False) -> dict:
         large: It has rows of hits that would fill this machine's memory: they are not kept, and not sorted twice.
     """
     found: dict = {}
-    sort = rows_of_hits._sort
+    sort = rows_of_hits._sort_at_once
     try:
         answers = card.Answers(_LARGE if large else None)
         on("llvm_ad_rgb")
@@ -52,7 +52,7 @@ def driven(case: object, large: bool = False) -> dict:
             case()  # type: ignore[operator]
         on("cuda_ad_rgb")
         if large:
-            rows_of_hits._sort = lambda *_: None
+            rows_of_hits._sort_at_once = lambda *_: None
         there = set(FOLDER.iterdir())
         # The Gaussians of a caller may be on either side, which changes no kernel.
         for home in ("cpu", "cuda") if os.environ.get("CARD_BOTH") else ("cpu",):
@@ -74,7 +74,7 @@ def driven(case: object, large: bool = False) -> dict:
             chain = chain.__cause__ or chain.__context__
         found["error"] = f"{type(chain).__name__}: {chain}".splitlines()[0]
     finally:
-        rows_of_hits._sort = sort
+        rows_of_hits._sort_at_once = sort
     return found
 
 

@@ -17,6 +17,7 @@ from drgs.checks.derivatives import first_only, is_functional, refuse_batched, u
 
 if TYPE_CHECKING:
     from drgs.tracing.call import Call
+    from drgs.tracing.frames import Frame
 
 __all__ = ["differentiable", "to_drjit"]
 
@@ -34,9 +35,44 @@ def differentiable(call: Call) -> dict[str, torch.Tensor]:
     if any(is_functional(x) for x in values):
         return dict(zip(call.image_names, _Functional.apply(call, *values), strict=True))
     if torch.is_grad_enabled() and any(x.requires_grad for x in values):
-        return dict(zip(call.image_names, _Reverse.apply(call, *values), strict=True))
+        bridge = _Recorded if call.is_recorded else _Reverse
+        return dict(zip(call.image_names, bridge.apply(call, *values), strict=True))
+    if call.is_recorded:
+        return {name: x.torch() for name, x in _frame(call, values, ()).images.items()}
     images = call.trace(**{name: to_drjit(call.lib, x) for name, x in call.inputs.items()})
     return {name: x.torch() for name, x in images.items()}
+
+
+class _Recorded(torch.autograd.Function):
+    """Reverse mode of a frame that is made of recorded steps."""
+
+    @staticmethod
+    def forward(ctx: Any, call: Call, *values: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        ctx.save_for_backward(*values)  # torch then refuses a second backward pass without retain_graph
+        ctx.call = call
+        ctx.needed = tuple(name for name, need in zip(call.inputs, ctx.needs_input_grad[1:], strict=True) if need)
+        frame = _frame(call, values, ctx.needed)
+        ctx.graph = runtime.Graph(frame)
+        return tuple(frame.images[name].torch() for name in call.image_names)
+
+    @staticmethod
+    @runtime.alone
+    def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        call, values = ctx.call, ctx.saved_tensors
+        frame = ctx.graph.take() or _frame(call, values, ctx.needed)
+        slopes = frame.gradients(
+            {name: _plain(call.lib, g).array for name, g in zip(call.image_names, cotangents, strict=True)}
+        )
+        gradients = tuple(
+            slopes[name].torch().view(x.shape) if name in slopes else None
+            for name, x in zip(call.inputs, values, strict=True)
+        )
+        return None, *first_only("render", gradients, (*values, *cotangents))
+
+
+def _frame(call: Call, values: Iterable[torch.Tensor], needed: tuple[str, ...]) -> Frame:
+    """The images of a call by recorded steps, with gradients by the inputs that are named."""
+    return call.frame({n: to_drjit(call.lib, x).array for n, x in zip(call.inputs, values, strict=True)}, needed)
 
 
 class _Reverse(torch.autograd.Function):

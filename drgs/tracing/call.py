@@ -15,14 +15,16 @@ from drgs.checks.derivatives import check_has_numbers, unwrapped
 from drgs.ellipsoids import DeformableScene, Gaussians
 from drgs.runtime import memory
 from drgs.settings import EPS_ALPHA, RenderSettings
-from drgs.tracing import projection
+from drgs.tracing import projection, recordings
 from drgs.tracing.arrays import UInt32
 from drgs.tracing.composite import Arguments, Composite, Compositor, compositor_of
+from drgs.tracing.frames import Frame, View
 from drgs.tracing.free_rays import FreeRays
 from drgs.tracing.lens_motion import LensMotion
 from drgs.tracing.lens_rays import lens_of
 from drgs.tracing.pose import local_directions, rigid_pose, shifted
 from drgs.tracing.primitives import Screen
+from drgs.tracing.responses import response_of
 from drgs.tracing.shutter import rolling_view
 from drgs.tracing.tiles import TILE, TileTraversal
 from drgs.tracing.unscented import unscented_boxes
@@ -39,6 +41,8 @@ OF_VIEW = (
     "mean_absolute",
     "strains",
 )  # inputs that are no parameters of the scene
+_RECORDED_INPUTS = {"means", "quats", "log_scales", "logit_opacities", "sh", "w2c"}
+_RECORDED_OUTPUTS = {"depth", "median", "count"}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -282,6 +286,34 @@ class Call:
         self.extra = compositor.extra
         self.certificate = compositor.certificate
         return images
+
+    @property
+    def is_recorded(self) -> bool:
+        """Whether frames of this kind are made of recorded steps (frames.py)."""
+        return recordings.are_on() and (
+            self.settings.traversal == "tiles"
+            and self.settings.culling != "ut"
+            and type(response_of(self.settings)).__module__.startswith("drgs.tracing.")
+            and set(self.inputs) == _RECORDED_INPUTS
+            and self.want <= _RECORDED_OUTPUTS
+            and not self.camera.is_distorted
+            and self.field is None
+            and self.table is None
+            and not self.oriented
+        )
+
+    def frame(self, inputs: dict, needed: tuple[str, ...]) -> Frame:
+        """The images by recorded steps, with gradients by the inputs that are named."""
+        s, camera = self.settings, self.camera
+        K = camera.K
+        size = camera.width, camera.height
+        plain = s if not any(s.background) else s.replace(background=(0.0, 0.0, 0.0))
+        view = View(plain, response_of(s), *size, self.coefficients, self.want, needed)
+        pinhole = tuple(float(v) for v in (K[0, 0], K[0, 1], K[0, 2], K[1, 1], K[1, 2]))
+        frame = Frame(view, s, pinhole, inputs)
+        self.extra = frame.extra
+        self.certificate = frame.certificate
+        return frame
 
     def prepare(self, inputs: dict) -> tuple[Compositor, Arguments]:
         """Project the Gaussians into the view: its `Compositor`, and the arguments of its `forward`."""

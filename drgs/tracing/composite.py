@@ -9,6 +9,7 @@ traversal writes down (weights.py) where rays walk along lists of tiles; elsewhe
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -99,6 +100,7 @@ class Compositor:
         basis: How many of the arrays that rays carry are SH basis values.
         couple: Derivatives of the feature image reach all that it depends on; else only the features.
         oriented: The features are axes that are turned towards each ray: `Channels.oriented`.
+        model: That of the settings and the traversal, if it is made already.
     Attributes:
         certificate: Numbers of rays, of redone rays and of listed entries, after `forward`.
         extra: Outputs without a derivative, after `forward`.
@@ -116,6 +118,7 @@ class Compositor:
         basis: int = 0,
         couple: bool = True,
         oriented: bool = False,
+        model: HitModel | None = None,
     ) -> None:
         self.lib = lib
         self.oriented = oriented
@@ -126,7 +129,7 @@ class Compositor:
         self.basis = basis
         self.rays = traversal.rays
         self.couple = couple
-        self.model = HitModel(lib, settings, traversal.world)
+        self.model = model or HitModel(lib, settings, traversal.world)
         self.certificate: dict = {}
         self.extra: dict = {}
 
@@ -159,14 +162,12 @@ class Compositor:
                 its hits knows all that it composites (`information.replay`).
         """
         view = self.traversal
-        self.absolute: Any = absolute
-        self.entries = len(record)
-        self.carried = carried
-        self.buffers = {"record": pack_records(self.lib, record)}
+        buffers = {"record": pack_records(self.lib, record)}
         if sh is not None:
-            self.buffers["sh"] = sh
+            buffers["sh"] = sh
         if features is not None:
-            self.buffers["features"] = features
+            buffers["features"] = features
+        self.ready(buffers, len(record), carried, absolute)
         dr.eval(self.buffers, carried)
         view.start(self.model, self.buffers["record"], carried, self.basis, keep)
         self.certificate.update(view.certificate)
@@ -178,12 +179,20 @@ class Compositor:
         share = pixels_a_lane(self.basis) if in_lists else 1
         weighed = self.width > joint
         self.parts = view.weighed(share, MATRIX // (1 + columns)) if weighed else view.parts(share)
-        out = self._composited(frozenset(self.want | ({"replay"} if keep else set())), count_of(record))
+        out = self.composited(frozenset(self.want | ({"replay"} if keep else set())), count_of(record))
         for name in ("visibility", "median", "count"):
             if name in out:
                 self.extra[name] = out.pop(name)
         dr.eval(out, self.extra)
         return out
+
+    def ready(self, buffers: dict, entries: int, carried: Sequence[Float] = (), absolute: Float | None = None) -> None:
+        """Take what hits read: the buffers, with so many columns of records; other arguments are those of `forward`."""
+        self.absolute: Any = absolute
+        self.entries = entries
+        self.carried = list(carried)
+        self.buffers = buffers
+        self.passes = [self._channels(color=True)]
 
     def again(self, features: Float, count: int) -> tuple[Channels, list[tuple[Part, list[dict]]]]:
         """Another traversal after `forward`, with the colors beside other features: as `passes` and `finals` hold it.
@@ -199,7 +208,7 @@ class Compositor:
             dr.eval(done[-1][1])  # one at a time: each has rows to sort
         return channels, done
 
-    def _composited(self, want: frozenset, count: int) -> dict:
+    def composited(self, want: frozenset, count: int = 0) -> dict:
         """Flat images, `count` visibilities among them, from all passes."""
         lib = self.lib
         out = self._images()

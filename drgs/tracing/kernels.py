@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import NamedTuple
 
 import drjit as dr
 
@@ -24,9 +25,30 @@ from drgs.tracing.primitives import Ray
 from drgs.tracing.records import RECORD, load_record
 from drgs.tracing.responses import response_of
 
-__all__ = ["Channels", "Emit", "HitModel", "Primal"]
+__all__ = ["Channels", "Emit", "HitModel", "HitNumbers", "Primal", "numbers_of"]
 
 Emit = Callable[[UInt32, int, list, Float, Mask], None]
+
+
+class HitNumbers(NamedTuple):
+    """Numbers of settings, of width 1 and opaque: another value is no other kernel."""
+
+    alpha_min: Float
+    alpha_max: Float
+    stop_at: Float
+    max_hits: UInt32
+    background: list[Float]
+
+
+def numbers_of(lib: Lib, settings: RenderSettings) -> HitNumbers:
+    """The numbers of settings that hits are compared and composited with."""
+    return HitNumbers(
+        dr.opaque(lib.Float, settings.alpha_min),
+        dr.opaque(lib.Float, settings.alpha_max),
+        dr.opaque(lib.Float, settings.least_transmittance),
+        dr.opaque(lib.UInt32, settings.max_hits or 0),
+        [dr.opaque(lib.Float, b) for b in settings.background],
+    )
 
 
 class HitModel:
@@ -37,20 +59,22 @@ class HitModel:
         world: Records are world records.
         signed: Keys that order hits along a ray may be negative: entries, and peaks behind the origin of a ray where
             these count.
+
+    Args:
+        numbers: Those of the settings, if they are held already.
     """
 
-    def __init__(self, lib: Lib, settings: RenderSettings, world: bool = False) -> None:
+    def __init__(
+        self, lib: Lib, settings: RenderSettings, world: bool = False, numbers: HitNumbers | None = None
+    ) -> None:
         self.lib = lib
         self.s = settings
         self.world = world
         self.response = response_of(settings)
         self.signed = settings.order == "entry" or (settings.order == "ray" and not self.response.front_only)
-        # Opaque: another value is no other kernel.
-        self.alpha_min = dr.opaque(lib.Float, settings.alpha_min)
-        self.alpha_max = dr.opaque(lib.Float, settings.alpha_max)
-        self.stop_at = dr.opaque(lib.Float, settings.least_transmittance)
-        self.max_hits = dr.opaque(lib.UInt32, settings.max_hits or 0)
-        self.background = [dr.opaque(lib.Float, b) for b in settings.background]
+        self.alpha_min, self.alpha_max, self.stop_at, self.max_hits, self.background = numbers or numbers_of(
+            lib, settings
+        )
         self.strength = layout.W_ALPHA if world else layout.ALPHA  # places in a record
         self.extent2 = layout.W_EXT2 if world else layout.EXT2
         self.rgb = layout.W_RGB if world else layout.RGB

@@ -22,7 +22,7 @@ from drgs.tracing.sort_keys import BEYOND, EMPTY, name_of, positive, word_of
 from drgs.tracing.walk import ListStream, Part
 from drgs.tracing.weights import PIXELS, signed
 
-__all__ = ["MemoryBudget", "SortedHits", "SortedRows"]
+__all__ = ["MemoryBudget", "SortedHits", "SortedRows", "found_hits", "sort_rows"]
 
 _TILES_PER_TASK = 64  # tiles that a thread sorts at a time; chosen
 
@@ -88,29 +88,8 @@ class SortedHits:
 
     def _sorted(self) -> tuple[Float, UInt32, UInt32]:
         """Words of the hits, and of each pixel where its row starts and how many it has."""
-        lib = self.lib
-        part = self.in_lists()
-        tiles = len(self.lengths)
-        lists: ListStream | Any = part.stream
-        slots = part.slots
-        assert slots is not None  # of a part along lists
-        share = len(slots.columns)
-        first = lists.start - slots.first
-        own = lists.end - lists.start
-        starts = [first * PIXELS + column * own for column in slots.columns]
-        words = dr.full(lib.Float64, BEYOND, slots.size)
-        lane = dr.arange(lib.UInt32, tiles * PIXELS // share)
-        cut = None if self.cut is None else dr.gather(lib.Float, self.cut, lane // (PIXELS // share))
-        dr.eval(words, starts, cut)
-        found = part.run(_Finder(part, words, starts, cut))
-        dr.eval(found, words)  # together: one kernel
-        start, count = (dr.zeros(lib.UInt32, tiles * PIXELS) for _ in range(2))
-        for column, at, state in zip(slots.columns, starts, found, strict=True):
-            pixel = lane // (PIXELS // share) * PIXELS + column
-            dr.scatter(start, at, pixel)
-            dr.scatter(count, state["count"], pixel)
-        dr.eval(start, count)
-        _sort(words.torch(), self.lengths, signed(count).view(-1, PIXELS))
+        words, start, count = found_hits(self.lib, self.in_lists(), len(self.lengths), self.cut)
+        sort_rows(words.torch(), self.lengths, signed(count).view(-1, PIXELS))
         return words, start, count
 
     def _entries(self, words: Float, start: UInt32, count: UInt32, first: UInt32, total: int) -> UInt32:
@@ -126,6 +105,35 @@ class SortedHits:
             dr.while_loop((dr.zeros(lib.UInt32, dr.width(count)),), lambda i: i < count, body)
         dr.eval(entries, first)
         return entries
+
+
+def found_hits(lib: Lib, part: Part, tiles: int, cut: Float | None) -> tuple[Float, UInt32, UInt32]:
+    """Words of the hits of a part along lists, in no order, and of each pixel where its row starts and how many it has.
+
+    Args:
+        tiles: Number of tiles.
+        cut: (tiles,) what is taken off the squared extents (`trimmed_extent2`), or None.
+    """
+    lists: ListStream | Any = part.stream
+    slots = part.slots
+    assert slots is not None  # of a part along lists
+    share = len(slots.columns)
+    first = lists.start - slots.first
+    own = lists.end - lists.start
+    starts = [first * PIXELS + column * own for column in slots.columns]
+    words = dr.full(lib.Float64, BEYOND, slots.size)
+    lane = dr.arange(lib.UInt32, tiles * PIXELS // share)
+    cut = None if cut is None else dr.gather(lib.Float, cut, lane // (PIXELS // share))
+    dr.eval(words, starts, cut)
+    found = part.run(_Finder(part, words, starts, cut))
+    dr.eval(found, words)  # together: one kernel
+    start, count = (dr.zeros(lib.UInt32, tiles * PIXELS) for _ in range(2))
+    for column, at, state in zip(slots.columns, starts, found, strict=True):
+        pixel = lane // (PIXELS // share) * PIXELS + column
+        dr.scatter(start, at, pixel)
+        dr.scatter(count, state["count"], pixel)
+    dr.eval(start, count)
+    return words, start, count
 
 
 class SortedRows(ListStream):
@@ -186,7 +194,7 @@ class _Finder:
         return out
 
 
-def _sort(words: torch.Tensor, lengths: torch.Tensor, counts: torch.Tensor) -> None:
+def sort_rows(words: torch.Tensor, lengths: torch.Tensor, counts: torch.Tensor) -> None:
     """Sort rows in place.
 
     Args:

@@ -8,8 +8,9 @@ import torch
 
 from drgs import runtime
 from drgs.tracing.arrays import Float, Lib, UInt32, UInt64
+from drgs.tracing.recordings import padded
 
-__all__ = ["BEYOND", "EMPTY", "ascending", "name_of", "positive", "push", "word_of"]
+__all__ = ["BEYOND", "EMPTY", "ascending", "compacted", "name_of", "positive", "push", "word_of"]
 
 EMPTY = -1.0  # "no hit"; order keys of hits are >= 0
 BEYOND = 1e308  # above the word of any hit
@@ -63,6 +64,28 @@ def ascending(lib: Lib, keys: UInt64) -> UInt64:
     # A third of the time of Dr.Jit's sort by digits on one thread, and none of its 24 launches, for each of which
     # threads wait on a busy machine.
     return lib.UInt64(np.sort(keys.numpy()))
+
+
+def compacted(lib: Lib, keys: UInt64, empty: int, count: int | None = None) -> tuple[UInt64, int]:
+    """The keys that are not the largest number, `empty`, in their order, and behind them as many of these as `padded`
+    says; and how many they are.
+
+    Args:
+        count: So many at the beginning are, and no others; None: it is not known.
+    """
+    if count is None:
+        kept = dr.compress(keys != empty)
+        count = dr.width(kept)
+        if not count:
+            return dr.full(lib.UInt64, empty, padded(1)), 0
+    elif padded(count) == dr.width(keys):
+        return keys, count
+    else:
+        kept = dr.arange(lib.UInt32, count)
+    found = dr.full(lib.UInt64, empty, padded(count))
+    dr.scatter(found, dr.gather(lib.UInt64, keys, kept), dr.arange(lib.UInt32, count))
+    dr.eval(found)
+    return found, count
 
 
 def _by_torch() -> bool:

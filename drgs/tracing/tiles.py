@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import drjit as dr
 import torch
@@ -27,12 +27,32 @@ from drgs.tracing.lens_rays import LensRays
 from drgs.tracing.primitives import TOLERANCE_LISTED, TOLERANCE_UNLISTED, Patch, Projected, Ray, trimmed_extent2
 from drgs.tracing.records import load_record
 from drgs.tracing.responses import response_of
-from drgs.tracing.rows import MemoryBudget, SortedHits
+from drgs.tracing.rows import MemoryBudget, SortedHits, SortedRows
 from drgs.tracing.sort_keys import ascending
 from drgs.tracing.walk import ListStream, Part, Slots, pixels_a_lane
 from drgs.tracing.weights import PIXELS, Weights, signed
 
-__all__ = ["TABLES", "TILE", "Lists", "TileTraversal", "build", "depth_order"]
+__all__ = [
+    "NO_KEY",
+    "TABLES",
+    "TILE",
+    "Lists",
+    "TileTraversal",
+    "build",
+    "check_pairs",
+    "depth_order",
+    "depth_words",
+    "is_one_band",
+    "is_tested",
+    "is_trimmed",
+    "keys_of_boxes",
+    "listed",
+    "lists_of_keys",
+    "order_bytes",
+    "remaining",
+    "screen_boxes",
+    "shorter",
+]
 
 # Pixels a side. With 4, 100,000 Gaussians in 512x512 pixels have 1.55 M entries to sort in place of 0.6 M.
 TILE = 8
@@ -47,7 +67,7 @@ _MAX_GPU_BANDS = 8
 _BYTES_PER_BAND = 10 << 30  # bytes
 # offsets, px, of the pixels that share a lane
 _LANE_PIXELS = {1: [(0, 0)], 2: [(0, 0), (0, 4)], 4: [(0, 0), (4, 0), (0, 4), (4, 4)]}
-_NO_KEY = 2**64 - 1  # key of no entry: sorted behind all others
+NO_KEY = 2**64 - 1  # key of no entry: sorted behind all others
 # bytes of the orders of all pixels that are held, because derivatives need them again; chosen
 _MAX_ORDER_BYTES = 128 << 20
 _TEST_TILES_FROM = 8  # tiles of a box, on average, from which on each tile is tested against the ellipse
@@ -68,7 +88,7 @@ class TileTraversal:
         self,
         lib: Lib,
         settings: RenderSettings,
-        projected: Projected,
+        projected: Projected | Any,
         pinhole: list[Float],
         width: int,
         height: int,
@@ -78,9 +98,7 @@ class TileTraversal:
         self.lib = lib
         self.settings = settings
         self.projected = projected
-        # Its bound is of tails of at most alpha exp(-rho^2 / 2), and a ray that ends behind so many hits counts them.
-        bounded = settings.extent is None and settings.max_hits is None and response_of(settings).at_most_alpha
-        self.trimmed = trimmed and settings.order == "ray" and bounded
+        self.trimmed = trimmed and is_trimmed(settings)
         self.width = width
         self.height = height
         self.rays = width * height
@@ -93,17 +111,22 @@ class TileTraversal:
 
     def start(self, model: HitModel, records: Float, carried: list[Float], basis: int, replayed: bool) -> None:
         """Build the lists."""
+        size = self.width, self.height
+        lists = build(self.lib, self.projected, self.settings, *size, records, self.trimmed, self.lens)
+        self.look(model, records, carried, basis, lists)
+        self.certificate["pairs"] = self.lists.pairs
+        self.budget = MemoryBudget(order_bytes() if replayed else 0)
+        if self.settings.order == "ray":
+            self.certificate |= {"rays": self.rays, "redone": 0}  # rows hold every hit
+
+    def look(self, model: HitModel, records: Float, carried: list[Float], basis: int, lists: Lists) -> None:
+        """Take lists that are built: arguments of `start`, and these."""
         self.model = model
         self.records = records
         self.carried = carried
         self.basis = basis
         self.shifted = len(carried) > basis
-        size = self.width, self.height
-        self.lists = build(self.lib, self.projected, self.settings, *size, records, self.trimmed, self.lens)
-        self.certificate["pairs"] = self.lists.pairs
-        self.budget = MemoryBudget(_room(_MAX_ORDER_BYTES) if replayed else 0)
-        if self.settings.order == "ray":
-            self.certificate |= {"rays": self.rays, "redone": 0}  # rows hold every hit
+        self.lists = lists
 
     def parts(self, share: int) -> list[Part]:
         """All pixels as one part; in `ray` order as `weighed`, for tables of two numbers."""
@@ -152,11 +175,18 @@ class TileTraversal:
         in_lists = functools.partial(self._band_in_lists, band, pixels_a_lane(self.basis))
         return self._band_in_lists(band, share, hits, in_lists, weights)
 
+    def whole_band(self, share: int, hits: SortedRows | None = None) -> Part:
+        """All pixels: along the lists of their tiles, or along rows of their own hits, which are sorted."""
+        count = self.lists.columns * self.lists.rows
+        band = _Band(0, count, 0, self.lists.pairs, torch.empty(0))
+        in_lists = None if hits is None else functools.partial(self._band_in_lists, band, pixels_a_lane(self.basis))
+        return self._band_in_lists(band, share, hits, in_lists)
+
     def _band_in_lists(
         self,
         band: _Band,
         share: int,
-        hits: SortedHits | None = None,
+        hits: SortedHits | SortedRows | None = None,
         in_lists: Callable[[], Part] | None = None,
         weights: Weights | None = None,
     ) -> Part:
@@ -181,7 +211,7 @@ class TileTraversal:
         self,
         share: int,
         tile: UInt32,
-        hits: SortedHits | None = None,
+        hits: SortedHits | SortedRows | None = None,
         slots: Slots | None = None,
         in_lists: Callable[[], Part] | None = None,
         weights: Weights | None = None,
@@ -240,6 +270,23 @@ class TileTraversal:
         return Ray(x, y, length, carried, self.basis, shifted=self.shifted)
 
 
+def is_trimmed(settings: RenderSettings) -> bool:
+    """Whether the tails of the Gaussians that a tile lists are bounded in place of those of all."""
+    # The bound is of tails of at most alpha exp(-rho^2 / 2), and a ray that ends behind so many hits counts them.
+    bounded = settings.extent is None and settings.max_hits is None and response_of(settings).at_most_alpha
+    return settings.order == "ray" and bounded
+
+
+def is_one_band(entries: int) -> bool:
+    """Whether the rows of all pixels are sorted at once, whose lists have so many entries."""
+    return entries <= _room(TABLES) // 2 // (4 * PIXELS)
+
+
+def order_bytes() -> int:
+    """Bytes of orders that may be held for derivatives."""
+    return _room(_MAX_ORDER_BYTES)
+
+
 class _Band(NamedTuple):
     """Consecutive tiles that are walked together.
 
@@ -271,6 +318,7 @@ class Lists:
         columns, rows: Tiles in x and y.
         pairs: Number of entries.
         cut: (tiles,) what is taken off the squared extent of each entry (`trimmed_extent2`); None: nothing.
+        tile: (pairs,) of each entry, while lists are built.
     """
 
     index: UInt32
@@ -280,6 +328,7 @@ class Lists:
     rows: int
     pairs: int
     cut: Float | None = None
+    tile: UInt32 | Any = None
 
 
 def build(
@@ -301,7 +350,21 @@ def build(
         trimmed: Leave tails out.
         lens: The camera's, if it is no pinhole.
     """
-    columns, rows = -(-width // TILE), -(-height // TILE)
+    seen, amount, x, y = screen_boxes(lib, projected, width, height)
+    count = dr.width(projected.key)
+    gaussian = dr.arange(lib.UInt32, count)
+    dr.eval(amount, x, y, projected.key)
+    # Emitting in depth order leaves 32 bits for the rank, so ties fall by index and nothing is quantized.
+    order = gaussian if settings.order == "ray" else depth_order(lib, projected.key, gaussian)
+    boxes_seen = int(dr.sum(dr.select(seen, lib.UInt32(1), 0))[0])
+    found = listed(lib, settings, width, height, record, order, amount, x, y, boxes_seen, lens)
+    return shorter(lib, found, settings, record, count, lens) if trimmed and found.pairs else found
+
+
+def screen_boxes(
+    lib: Lib, projected: Projected, width: int, height: int
+) -> tuple[Mask, UInt32, tuple[Int32, Int32], tuple[Int32, Int32]]:
+    """Which Gaussians are on the image, how many tiles the box of each holds, and its first and last column and row."""
     x0, y0, x1, y1 = projected.bounds
     # Pixel p has its center at p + 0.5. The clip keeps the conversion to int32 defined.
     limit = lambda v, hi: lib.Int32(dr.clip(v, -1.0, hi + 1.0))  # noqa: E731
@@ -314,21 +377,39 @@ def build(
     ty1 = dr.minimum(iy1, height - 1) // TILE
     seen &= (ix0 <= ix1) & (iy0 <= iy1)
     amount = dr.select(seen, lib.UInt32((tx1 - tx0 + 1) * (ty1 - ty0 + 1)), 0)
-    count = dr.width(projected.key)
+    return seen, amount, (tx0, tx1), (ty0, ty1)
+
+
+def listed(
+    lib: Lib,
+    settings: RenderSettings,
+    width: int,
+    height: int,
+    record: Float,
+    order: UInt32,
+    amount: UInt32,
+    x: Sequence[Int32],
+    y: Sequence[Int32],
+    boxes_seen: int,
+    lens: LensRays | None = None,
+) -> Lists:
+    """The Gaussians of each tile, in a given order, by their boxes.
+
+    Args:
+        order: (N,) Gaussians in the order of the lists.
+        amount, x, y: (N,) of `screen_boxes`, by Gaussian.
+        boxes_seen: How many boxes hold a tile.
+    """
+    columns, rows = -(-width // TILE), -(-height // TILE)
+    count = dr.width(amount)
     gaussian = dr.arange(lib.UInt32, count)
-    dr.eval(amount, tx0, tx1, ty0, ty1, projected.key)
-    order = gaussian
-    exact = settings.order == "ray"
-    if not exact:
-        # Emitting in depth order leaves 32 bits for the rank, so ties fall by index and nothing is quantized.
-        order = depth_order(lib, projected.key, gaussian)
+    if settings.order != "ray":
         amount = dr.gather(lib.UInt32, amount, order)
     start = dr.zeros(lib.UInt32, columns * rows)
     end = dr.zeros(lib.UInt32, columns * rows)
     nothing = Lists(dr.zeros(lib.UInt32, 1), start, end, columns, rows, 0)
-    x, y = ([dr.gather(lib.Int32, b, order) for b in along] for along in ((tx0, tx1), (ty0, ty1)))
+    x, y = ([dr.gather(lib.Int32, b, order) for b in along] for along in (x, y))
     boxes = _Boxes(lib, gaussian, x, y, amount)
-    boxes_seen = int(dr.sum(dr.select(seen, lib.UInt32(1), 0))[0])
     what = f"({count} Gaussians, {width}x{height} pixels)"
     # A box holds many tiles that its ellipse misses, most of all where a Gaussian reaches behind the camera. Small
     # boxes hold few, and looking for them costs more than they do.
@@ -351,37 +432,30 @@ def build(
     index = dr.gather(lib.UInt32, order, lib.UInt32(keys & 0xFFFFFFFF))
     dr.eval(tile, index)
     _ranges(lib, tile, start, end)
-    lists = Lists(index, start, end, columns, rows, pairs)
-    return _shorter(lib, lists, tile, settings, record, count, lens) if trimmed else lists
+    return Lists(index, start, end, columns, rows, pairs, tile=tile)
 
 
-def _shorter(
+def shorter(
     lib: Lib,
     lists: Lists,
-    tile: UInt32,
     settings: RenderSettings,
     record: Float,
     count: int,
-    lens: LensRays | None,
+    lens: LensRays | None = None,
 ) -> Lists:
     """Shorter lists: an extent that bounds the tails of all N Gaussians together is longer than a tile needs, which
     lists n of them. Squared extents that are less by 2 ln(N / n), but no less than the least, keep the bound for n.
 
     Args:
-        tile: (pairs,) of each entry.
         record: Flat record buffer.
         count: N.
         lens: The camera's, if it is no pinhole.
     """
-    listed = lib.Float(lists.end - lists.start)
-    more = 1 if settings.tolerance is None else TOLERANCE_LISTED / TOLERANCE_UNLISTED
-    cut = 2 * dr.log(dr.opaque(lib.Float, count * more) / dr.maximum(listed, 1))
-    loaded = load_record(lib, record, lists.index, lib.Bool(True))
-    tiles = _Tiles(lib, settings, loaded, dr.gather(lib.Float, cut, tile), lens)
-    x, y = lib.Int32(tile % lists.columns), lib.Int32(tile // lists.columns)
-    kept = dr.compress(dr.full(lib.Bool, True, lists.pairs) & tiles.may_hit(x, y))
-    start = dr.zeros(lib.UInt32, dr.width(listed))
-    end = dr.zeros(lib.UInt32, dr.width(listed))
+    tile = lists.tile
+    cut, mask = remaining(lib, lists, settings, record, count, lens)
+    kept = dr.compress(dr.full(lib.Bool, True, lists.pairs) & mask)
+    start = dr.zeros(lib.UInt32, dr.width(cut))
+    end = dr.zeros(lib.UInt32, dr.width(cut))
     if dr.width(kept) == 0:
         return Lists(lists.index, start, end, lists.columns, lists.rows, 0, cut)
     index = dr.gather(lib.UInt32, lists.index, kept)
@@ -389,6 +463,66 @@ def _shorter(
     dr.eval(index, tile, cut)
     _ranges(lib, tile, start, end)
     return Lists(index, start, end, lists.columns, lists.rows, dr.width(kept), cut)
+
+
+def remaining(
+    lib: Lib, lists: Lists, settings: RenderSettings, record: Float, count: int, lens: LensRays | None = None
+) -> tuple[Float, Mask]:
+    """What is taken off squared extents on each tile, and whether an entry is left then (arguments of `shorter`)."""
+    listed = lib.Float(lists.end - lists.start)
+    more = 1 if settings.tolerance is None else TOLERANCE_LISTED / TOLERANCE_UNLISTED
+    cut = 2 * dr.log(dr.opaque(lib.Float, count * more) / dr.maximum(listed, 1))
+    loaded = load_record(lib, record, lists.index, lib.Bool(True))
+    tiles = _Tiles(lib, settings, loaded, dr.gather(lib.Float, cut, lists.tile), lens)
+    x, y = lib.Int32(lists.tile % lists.columns), lib.Int32(lists.tile // lists.columns)
+    return cut, tiles.may_hit(x, y)
+
+
+def keys_of_boxes(
+    lib: Lib,
+    settings: RenderSettings,
+    columns: int,
+    record: Float,
+    order: UInt32,
+    amount: UInt32,
+    x: Sequence[Int32],
+    y: Sequence[Int32],
+    pairs: int,
+    is_tested: bool,
+) -> UInt64:
+    """Keys as `_Boxes.all_keys` has them, of a pinhole, for no fewer pairs than there are.
+
+    Args:
+        columns: Tiles in x.
+        record, order, amount, x, y: Arguments of `listed`.
+        is_tested: Leave out pairs without a hit.
+    """
+    gaussian = dr.arange(lib.UInt32, dr.width(amount))
+    x, y = ([dr.gather(lib.Int32, b, order) for b in along] for along in (x, y))
+    boxes = _Boxes(lib, gaussian, x, y, dr.gather(lib.UInt32, amount, order), pairs)
+    if not is_tested:
+        return boxes.all_keys(columns, None)
+    loaded = [dr.gather(lib.Float, record, order * layout.RECORD + k) for k in range(layout.RECORD)]
+    return boxes.all_keys(columns, _Tiles(lib, settings, loaded))
+
+
+def lists_of_keys(lib: Lib, keys: UInt64, order: UInt32, columns: int, rows: int) -> Lists:
+    """Lists from sorted keys, with `NO_KEY` behind them: entries there are of Gaussian 0, and in no tile."""
+    there = keys != NO_KEY
+    tile = dr.select(there, lib.UInt32(keys >> 32), columns * rows)
+    index = dr.gather(lib.UInt32, order, lib.UInt32(keys & 0xFFFFFFFF), there)
+    start = dr.zeros(lib.UInt32, columns * rows + 1)
+    end = dr.zeros(lib.UInt32, columns * rows + 1)
+    dr.eval(tile, index)
+    _ranges(lib, tile, start, end)
+    own = dr.arange(lib.UInt32, columns * rows)
+    start, end = (dr.gather(lib.UInt32, x, own) for x in (start, end))
+    return Lists(index, start, end, columns, rows, dr.width(keys), tile=tile)
+
+
+def is_tested(pairs: int, boxes: int) -> bool | None:
+    """Whether pairs of a tile and a Gaussian are tested, in how many boxes they are; None: blocks of tiles are, too."""
+    return None if pairs > _TEST_BLOCKS_FROM * boxes else pairs > _TEST_TILES_FROM * boxes
 
 
 def _ranges(lib: Lib, group: UInt32, start: UInt32, end: UInt32) -> None:
@@ -407,12 +541,17 @@ def _ranges(lib: Lib, group: UInt32, start: UInt32, end: UInt32) -> None:
 
 def depth_order(lib: Lib, key: Float, gaussian: UInt32) -> UInt32:
     """Gaussians by (key, index)."""
+    order = lib.UInt32(ascending(lib, depth_words(lib, key, gaussian)) & 0xFFFFFFFF)
+    dr.eval(order)
+    return order
+
+
+def depth_words(lib: Lib, key: Float, gaussian: UInt32) -> UInt64:
+    """Numbers that order like (key, index), the index in their lower half."""
     # IEEE bits order like unsigned integers once negative floats are flipped.
     bits = dr.reinterpret_array(lib.UInt32, key)
     bits = dr.select(bits >> 31 != 0, ~bits, bits | 0x80000000)
-    order = lib.UInt32(ascending(lib, (lib.UInt64(bits) << 32) | lib.UInt64(gaussian)) & 0xFFFFFFFF)
-    dr.eval(order)
-    return order
+    return (lib.UInt64(bits) << 32) | lib.UInt64(gaussian)
 
 
 class _Tiles:
@@ -470,19 +609,24 @@ class _Boxes:
         gaussian: (boxes,) place of the Gaussian in the order of the lists.
         x, y: First and last column, first and last row, (boxes,) each.
         amount: (boxes,) how many tiles a box holds; 0: it is none.
-    Attributes:
-        pairs: Number of tiles that all boxes hold.
+        pairs: Number of tiles that all boxes hold, or more; None: it is counted.
     """
 
     def __init__(
-        self, lib: Lib, gaussian: UInt32, x: Sequence[Int32], y: Sequence[Int32], amount: UInt32 | None = None
+        self,
+        lib: Lib,
+        gaussian: UInt32,
+        x: Sequence[Int32],
+        y: Sequence[Int32],
+        amount: UInt32 | None = None,
+        pairs: int | None = None,
     ) -> None:
         self.lib = lib
         self.gaussian = gaussian
         self.x, self.y = tuple(x), tuple(y)
         self.amount = _area(lib, x, y) if amount is None else amount
         dr.eval(self.gaussian, self.x, self.y, self.amount)
-        self.pairs = int(dr.sum(lib.UInt64(self.amount))[0])
+        self.pairs = int(dr.sum(lib.UInt64(self.amount))[0]) if pairs is None else pairs
 
     def of_blocks(self) -> _Boxes:
         """The boxes of blocks that hold these."""
@@ -494,12 +638,13 @@ class _Boxes:
         lib = self.lib
         gaussian = lib.UInt32(keys & 0xFFFFFFFF)
         block = lib.Int32(keys >> 32)
-        parts = []
+        parts: list[tuple[Int32, Int32]] = []
         for (low, high), first in zip((self.x, self.y), (block % across, block // across), strict=True):
             low, high = (dr.gather(lib.Int32, v, gaussian) for v in (low, high))
             first = first * _BLOCK
             parts.append((dr.maximum(low, first), dr.minimum(high, first + _BLOCK - 1)))
-        return _Boxes(lib, gaussian, *parts)
+        x, y = parts
+        return _Boxes(lib, gaussian, x, y)
 
     def keys(self, columns: int, tiles: _Tiles | None, what: str) -> UInt64:
         """The sort key of every pair of a tile and a Gaussian, the tile first; of those that may have a hit.
@@ -509,18 +654,17 @@ class _Boxes:
             tiles: Says which may have one; None: all.
             what: The scene and the image, as messages name them.
         """
-        lib = self.lib
-        advice = "lower extent or image size"
-        if self.pairs >= 2**32:
-            raise ValueError(
-                f"render: the tile lists must have fewer than 2^32 entries, got {self.pairs} {what}; {advice}"
-            )
-        what = f"{self.pairs} entries of tile lists {what}"
-        memory.require("render", memory.PAIR * self.pairs, what, advice, runtime.backend().name == "cuda")
+        check_pairs(self.pairs, what)
         if self.pairs == 0:
-            return dr.zeros(lib.UInt64, 0)
+            return dr.zeros(self.lib.UInt64, 0)
+        keys = self.all_keys(columns, tiles)
+        return keys if tiles is None else dr.gather(self.lib.UInt64, keys, dr.compress(keys != NO_KEY))
+
+    def all_keys(self, columns: int, tiles: _Tiles | None) -> UInt64:
+        """The keys in the order of the boxes, `NO_KEY` in place of those of pairs that have no hit, and behind them."""
+        lib = self.lib
         offset = dr.cumsum(self.amount) - self.amount
-        keys = dr.full(lib.UInt64, _NO_KEY, self.pairs)
+        keys = dr.full(lib.UInt64, NO_KEY, self.pairs)
         x0, x1 = self.x
 
         def body(k: UInt32, x: Int32, y: Int32) -> tuple[UInt32, Int32, Int32]:
@@ -535,7 +679,20 @@ class _Boxes:
         with dr.suspend_grad():  # lists have no derivative
             dr.while_loop(start, lambda k, x, y: k < self.amount, body)
         dr.eval(keys)
-        return keys if tiles is None else dr.gather(lib.UInt64, keys, dr.compress(keys != _NO_KEY))
+        return keys
+
+
+def check_pairs(pairs: int, what: str) -> None:
+    """Refuse lists that are too long for their numbers, or for the memory.
+
+    Args:
+        what: The scene and the image, as messages name them.
+    """
+    advice = "lower extent or image size"
+    if pairs >= 2**32:
+        raise ValueError(f"render: the tile lists must have fewer than 2^32 entries, got {pairs} {what}; {advice}")
+    what = f"{pairs} entries of tile lists {what}"
+    memory.require("render", memory.PAIR * pairs, what, advice, runtime.backend().name == "cuda")
 
 
 def _room(size: int) -> int:
