@@ -22,6 +22,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 import cubes  # noqa: E402
 import numpy as np  # noqa: E402
+import recordings  # noqa: E402
 import torch  # noqa: E402
 from clocks import interleaved  # noqa: E402
 from where import ran  # noqa: E402
@@ -359,6 +360,7 @@ def report(result: dict) -> str:
             f"warm: {result['second']['warm']:.3f} s."
         ),
         "",
+        *recordings.section(),
     ]
     return "\n".join(lines)
 
