@@ -194,11 +194,13 @@ Gains = dict[Unit, float]
 """Unit -> what a rule adds to Adam, dB."""
 
 
-def gains(rows: list[dict], rule: str, trained: str, scenes: Sequence[str], seen: str) -> tuple[Gains, Gains]:
-    """Of the mean, and of the worst held-out view, where both were fitted."""
+def gains(
+    rows: list[dict], rule: str, trained: str, scenes: Sequence[str], seen: str, base: str = "Adam"
+) -> tuple[Gains, Gains]:
+    """Of the mean, and of the worst held-out view, where this rule and `base` were fitted."""
     found: tuple[Gains, Gains] = ({}, {})
     for row in rows:
-        other = next((x for x in rows if all(x[k] == (row | {"rule": "Adam"})[k] for k in KEY)), None)
+        other = next((x for x in rows if all(x[k] == (row | {"rule": base})[k] for k in KEY)), None)
         if (row["rule"], row["trained"]) != (rule, trained) or row["scene"] not in scenes or other is None:
             continue
         if seen not in row["psnr"]:
@@ -210,11 +212,11 @@ def gains(rows: list[dict], rule: str, trained: str, scenes: Sequence[str], seen
     return found
 
 
-def lines(rows: list[dict], rule: str, trained: str, scenes: Sequence[str]) -> list[str]:
+def lines(rows: list[dict], rule: str, trained: str, scenes: Sequence[str], base: str = "Adam") -> list[str]:
     """Cells of a line: units, and what a rule adds in each renderer, with the interval over several scenes."""
     cells: list[str] = []
     for seen in SEEN:
-        mean, worst = gains(rows, rule, trained, scenes, seen)
+        mean, worst = gains(rows, rule, trained, scenes, seen, base)
         if not mean:
             cells.append("")
             continue
