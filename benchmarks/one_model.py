@@ -57,9 +57,9 @@ def measured(scene: str, trained: str, seed: int, offset: int, size: dict) -> di
         took.setdefault(schedule.settings_at(step), []).append(seconds)
     renderers = renderers_to_measure(names, config.settings, "all")
     psnr = psnr_by_renderer(fit.gaussians, frames_for(fit.test, config.data), renderers)
-    names_of = {RenderSettings.preset(name): name for name in PRESETS}
-    step_ms = {names_of[settings]: 1000 * statistics.median(each) for settings, each in took.items()}
-    average = sum(step_ms[names_of[settings]] * len(each) for settings, each in took.items()) / config.max_steps
+    step_ms = {settings.nearest_preset()[0]: 1000 * statistics.median(each) for settings, each in took.items()}
+    average = sum(step_ms[settings.nearest_preset()[0]] * len(each) for settings, each in took.items())
+    average /= config.max_steps
     return {
         **dict(zip(KEY, (Path(scene).name, trained, seed, offset, *size.values()), strict=True)),
         "psnr": {name: views for name, views in psnr.items() if name in ANY},

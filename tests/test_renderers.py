@@ -61,6 +61,18 @@ def test_auto_is_any_unless_settings_say_otherwise():
         assert found.settings_at(7) == settings
 
 
+def test_exact_among_others_has_a_tolerance_and_alone_none():
+    """One step of several is not worth the time of digits that the next ones undo; a fit for `exact` alone is exact."""
+    for names in (("any",), ("drgs",), ("exact", "gsplat")):
+        by_preset = {found.nearest_preset()[0]: found for found in schedule(*names).all_settings}
+        tolerance = by_preset.pop("exact").tolerance
+        assert tolerance is not None
+        assert 1e-3 < tolerance < 0.1
+        assert all(found == RenderSettings.preset(name) for name, found in by_preset.items())
+    exact = RenderSettings.preset("exact")
+    assert schedule("exact", settings=exact).all_settings == (exact,)
+
+
 def test_the_background_is_of_all():
     """Photographs are composited on it, whatever draws the Gaussians."""
     white = FAST.replace(background=(1.0, 1.0, 1.0))

@@ -34,8 +34,12 @@ VIEWERS: Preset = "gsplat"
 """The preset that viewers of PLY files draw with."""
 
 _MEANINGS: dict[str, tuple[Preset, ...]] = {"any": ANY, "drgs": ("exact", "fast"), "viewers": ("gsplat", "inria")}
-# Name -> (share of the steps from which on, presets in turn). `exact` takes about four times as long as the others, so
-# that one step of ten makes a fit about 1.3 times as long as one with `fast` alone.
+# Of steps with `exact` among other renderers, in units of colors: gradients are within 1 % (docs/tradeoff.md), in about
+# half of the time, of which steps without a tolerance take up to 0.6 (docs/one-model.md).
+_TOLERANCE = 0.01
+
+# Name -> (share of the steps from which on, presets in turn). `exact` takes three to six times as long as the others,
+# so that one step of ten makes a fit 1.2 to 1.5 times as long as one with `fast` alone.
 # `inria` differs from `gsplat` in cut-offs only, and looks right where that does.
 _CYCLES: dict[str, tuple[tuple[float, tuple[Preset, ...]], ...]] = {
     "any": ((0.0, (*("gsplat", "fast", "3dgut") * 3, "exact")),),
@@ -156,7 +160,7 @@ class RendererSchedule:
         return cls(
             max_steps,
             tuple(
-                (begin, tuple(RenderSettings.preset(name, background=background) for name in cycle))
+                (begin, tuple(_one_of_several(name).replace(background=background) for name in cycle))
                 for begin, cycle in cycles
             ),
         )
@@ -170,6 +174,11 @@ class RendererSchedule:
     def all_settings(self) -> tuple[RenderSettings, ...]:
         """All settings of its steps, each once, in the order of their first turn."""
         return tuple(dict.fromkeys(settings for _, cycle in self.stages for settings in cycle))
+
+
+def _one_of_several(name: str) -> RenderSettings:
+    """Settings of a preset that takes turns with others: `exact` has a tolerance then."""
+    return RenderSettings.preset(name, **({"tolerance": _TOLERANCE} if name == "exact" else {}))
 
 
 def _is_single(names: Sequence[str]) -> bool:
