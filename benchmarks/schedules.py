@@ -1,0 +1,360 @@
+"""What else a second of a fit could be spent on: held-out PSNR, and time, of fits whose steps see something else.
+
+    python benchmarks/schedules.py [--scenes banana ...] [--changes none "exact to 0.01" ...] [--trained any]
+        [--steps 300] [--max-pixels 12000] [--max-gaussians 8000] [--units 1] [--made FOLDER]
+    python benchmarks/schedules.py --times FITS [--scenes banana ...] [--max-pixels 130000]
+    python benchmarks/schedules.py --page   the tables of docs/one-model.md, docs/data/schedule*.csv
+
+Appends one row a fit to benchmarks/schedules.jsonl as it ends and leaves out what is there. A change is made to the
+trainer before the first step; "a + b" makes both. Seconds are those that the process computed in its steps, whatever
+ran beside it; with more `--steps`, a change that makes steps cheaper has as much time as the fit without it. One
+thread. Made scenes are folders of `--made` (docs/real-data.md has their commands).
+
+`--times` fits nothing: it takes `FITS/SCENE`, a run folder, and times rendering, loss and derivatives of two of its
+photographs in turns, by renderer and at a half and a quarter of the width and height; rows: schedule_times.jsonl. The
+steps of EQUAL_TIME are from these times: fits of this many took as long on one thread of a CPU.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+os.environ.setdefault("DRGS_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
+
+import torch  # noqa: E402
+from fits import psnr_by_renderer, split_of  # noqa: E402
+from steps import MADE, PATHS  # noqa: E402
+from studies import PAGE_DATA, write_csv  # noqa: E402
+from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
+
+from drgs.codecs.ply import load_ply  # noqa: E402
+from drgs.data import load  # noqa: E402
+from drgs.data.resampling import resize_area  # noqa: E402
+from drgs.ellipsoids import Gaussians  # noqa: E402
+from drgs.fitting.config import FitConfig  # noqa: E402
+from drgs.fitting.frames import Frame, frames_for  # noqa: E402
+from drgs.fitting.losses import LossTerm, Photometric, padded_ssim  # noqa: E402
+from drgs.fitting.resolution import Resolution  # noqa: E402
+from drgs.fitting.start import start_plain  # noqa: E402
+from drgs.fitting.trainer import Trainer  # noqa: E402
+from drgs.integrator import Output, render  # noqa: E402
+from drgs.settings import RenderSettings  # noqa: E402
+from drgs.studies.statistics import estimate  # noqa: E402
+from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
+
+ROWS = ROOT / "benchmarks" / "schedules.jsonl"
+PAGE = ROOT / "docs" / "one-model.md"
+TIMES = ROOT / "benchmarks" / "schedule_times.jsonl"
+SCENES = ("banana", "fern", "office", "still0", "room21")
+SEEN = ("exact", "fast", "gsplat", "3dgut")
+KEY = ("scene", "change", "trained", "seed", "offset", "max_steps", "max_pixels", "max_gaussians")
+
+LARGE = {"max_pixels": 130_000, "max_gaussians": 30_000}
+EQUAL_TIME = {
+    "exact to 0": 480,
+    "exact to 0.01": 700,
+    "exact to 0.01 + half until 0.5": 1000,
+    "exact to 0.01 + half until 0.7": 1200,
+    "exact to 0.01 + exact at half until 0.8": 880,
+}
+"""Steps, at `LARGE` and for `any`, that take equally long on one thread of a CPU, within 10 %."""
+PAIRS = (
+    ("exact to 0.01", "exact to 0"),
+    ("exact to 0.01 + half until 0.5", "exact to 0.01"),
+    ("exact to 0.01 + half until 0.7", "exact to 0.01 + half until 0.5"),
+    ("exact to 0.01 + exact at half until 0.8", "exact to 0.01"),
+)
+
+Change = Callable[[Trainer], None]
+
+
+def exact_to(tolerance: float | None) -> Change:
+    """Steps with `exact` among other renderers have a tolerance, or none."""
+
+    def change(trainer: Trainer) -> None:
+        schedule = trainer.renderers
+        stages = tuple(
+            (begin, tuple(x.replace(tolerance=tolerance) if x.order == "ray" else x for x in cycle))
+            for begin, cycle in schedule.stages
+        )
+        trainer.renderers = dataclasses.replace(schedule, stages=stages)
+
+    return change
+
+
+def small(num_downscales: int, until: float) -> Change:
+    """Photographs are halved so many times at first, and have the size of the fit from a share of the steps on."""
+
+    def change(trainer: Trainer) -> None:
+        resolution = Resolution(num_downscales, trainer.config.max_steps)
+        ends = [round(until * trainer.config.max_steps * (k + 1) / num_downscales) for k in range(num_downscales)]
+        resolution._ends = ends
+        trainer.resolution = resolution
+
+    return change
+
+
+def exact_small(until: float) -> Change:
+    """Steps with `exact` see photographs of half the size until a share of the steps."""
+
+    def change(trainer: Trainer) -> None:
+        schedule, last = trainer.renderers, until * trainer.config.max_steps
+
+        class Sometimes(Resolution):
+            def halvings(self, step: int) -> int:
+                return int(step < last and schedule.settings_at(step).order == "ray")
+
+        trainer.resolution = Sometimes(1, trainer.config.max_steps)
+
+    return change
+
+
+@dataclasses.dataclass(frozen=True)
+class Mixed:
+    """`Photometric`, with a part of its L1 distance replaced by one that grows faster from a share of the steps on."""
+
+    trainer: Trainer
+    before: Photometric
+    since: float
+    distance: Callable[[torch.Tensor], torch.Tensor]
+    name: str = "photometric"
+    outputs: tuple[str, ...] = ()
+
+    def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor:
+        """See `LossTerm`."""
+        if self.trainer.part < self.since:
+            return self.before(output, frame, gaussians)
+        rgb, target = output.rgb, frame.target()
+        if frame.mask is not None:
+            rgb = rgb * frame.mask[..., None]
+        ssim = dataclasses.replace(self.before)(output, frame, gaussians)
+        l1 = (1 - self.before.ssim_weight) * (rgb - target).abs().mean()
+        return ssim - l1 + (1 - self.before.ssim_weight) * self.distance(rgb - target)
+
+
+def loss(since: float, distance: Callable[[torch.Tensor], torch.Tensor]) -> Change:
+    """Another distance than L1 from a share of the steps on."""
+
+    def change(trainer: Trainer) -> None:
+        terms: list[LossTerm] = [
+            Mixed(trainer, x, since, distance) if isinstance(x, Photometric) else x for x in trainer.terms
+        ]
+        trainer.terms = terms
+
+    return change
+
+
+def ssim(weight: float) -> Change:
+    """Another weight of SSIM."""
+
+    def change(trainer: Trainer) -> None:
+        trainer.terms = [Photometric(weight) if isinstance(x, Photometric) else x for x in trainer.terms]
+
+    return change
+
+
+def falls(share: float) -> Change:
+    """All rates fall to 0 over the last `share` of the steps, linear."""
+
+    def change(trainer: Trainer) -> None:
+        def lower(optimizer: torch.optim.Optimizer, *_: object) -> None:
+            for group in optimizer.param_groups:
+                group["lr"] *= min(1.0, (1 - trainer.part) / share)
+
+        trainer.rows.optimizer.register_step_pre_hook(lower)
+
+    return change
+
+
+# Gradients of a mean of squares are those of L1 times twice the error: 10 makes both alike at an error of 0.05.
+CHANGES: dict[str, Change] = {
+    "none": lambda trainer: None,
+    "exact to 0": exact_to(None),
+    "exact to 0.01": exact_to(0.01),
+    "exact to 0.1": exact_to(0.1),
+    "exact at half": exact_small(1.0),
+    "exact at half until 0.8": exact_small(0.8),
+    "half until 0.3": small(1, 0.3),
+    "half until 0.5": small(1, 0.5),
+    "half until 0.7": small(1, 0.7),
+    "quarter until 0.5": small(2, 0.5),
+    "L2 in the last third": loss(2 / 3, lambda x: 10 * x.square().mean()),
+    "L2 from the start": loss(0.0, lambda x: 10 * x.square().mean()),
+    "Charbonnier 0.03 in the last third": loss(2 / 3, lambda x: (x.square() + 0.03**2).sqrt().mean()),
+    "SSIM 0": ssim(0.0),
+    "SSIM 0.1": ssim(0.1),
+    "SSIM 0.4": ssim(0.4),
+    "rates fall in the last 0.2": falls(0.2),
+}
+
+
+def fit(key: tuple, made: Path) -> dict:
+    """The row of one fit; `made` is the folder of the made scenes."""
+    named = dict(zip(KEY, key, strict=True))
+    scene = named["scene"]
+    dataset = load(made / scene if scene in MADE else DATA / PATHS.get(scene, scene))
+    config = FitConfig().replace(
+        renderers=(named["trained"],),
+        seed=named["seed"],
+        test_offset=named["offset"],
+        skybox="off",
+        semantics="ignore",
+        **{name: named[name] for name in KEY[5:]},
+    )
+    train, test = split_of(dataset, config)
+    frames = frames_for(train, config.data)
+    trainer = start_plain(dataset, train, frames, config)
+    for name in named["change"].split(" + "):
+        CHANGES[name](trainer)
+    took: dict[str, float] = {}
+    while trainer.step_index < config.max_steps:
+        preset = trainer.renderers.settings_at(trainer.step_index).nearest_preset()[0]
+        began = time.process_time()
+        trainer.step()
+        took[preset] = took.get(preset, 0.0) + time.process_time() - began
+    renderers = {name: RenderSettings.preset(name) for name in SEEN}
+    psnr = psnr_by_renderer(trainer.gaussians(), frames_for(test, config.data), renderers)
+    size = [frames[0].camera.width, frames[0].camera.height]
+    return {**named, "size": size, "psnr": psnr, "seconds": sum(took.values()), "seconds_by": took, **ran()}
+
+
+def times(scene: str, run: Path, max_pixels: int) -> dict:
+    """Medians over two photographs of the seconds of a step's rendering, loss and derivatives."""
+    gaussians = load_ply(run / "point_cloud.ply")
+    views = list(load(DATA / PATHS.get(scene, scene)).views)[:16:8]
+    frames = frames_for(views, FitConfig().replace(max_pixels=max_pixels).data)
+    settings = {name: RenderSettings.preset(name) for name in SEEN}
+    settings |= {f"exact, {x:g}": RenderSettings.preset("exact", tolerance=x) for x in (0.01, 0.1)}
+    took: dict[str, dict[int, list[float]]] = {name: {times: [] for times in range(3)} for name in settings}
+    for is_warm, frame in [(False, frames[0]), *((True, frame) for frame in frames)]:
+        for name, how in settings.items():
+            for halvings in range(3):
+                width, height = frame.camera.width >> halvings, frame.camera.height >> halvings
+                camera = frame.camera.resized(width, height)
+                target = torch.from_numpy(resize_area(frame.image().numpy(), width, height))
+                began = time.process_time()
+                leaves = {key: x.clone().requires_grad_() for key, x in gaussians.parameters().items()}
+                rgb = render(gaussians.replace(**leaves), camera, how, outputs=()).rgb
+                (0.8 * (rgb - target).abs().mean() - 0.2 * padded_ssim(rgb, target)).backward()
+                if is_warm:
+                    took[name][halvings].append(time.process_time() - began)
+    seconds = {name: [statistics.median(each) for each in sizes.values()] for name, sizes in took.items()}
+    size = [frames[0].camera.width, frames[0].camera.height]
+    return {"scene": scene, "size": size, "gaussians": len(gaussians), "seconds": seconds, **ran()}
+
+
+def gains(rows: list[dict], change: str, other: str, seen: str) -> dict[str, tuple[float, float]]:
+    """Scene -> what one change adds to another in equal time, dB: of the mean, and of the worst held-out view."""
+    views = {
+        (row["scene"], row["change"]): row["psnr"][seen]
+        for row in rows
+        if row["max_steps"] == EQUAL_TIME.get(row["change"]) and all(row[name] == x for name, x in LARGE.items())
+    }
+    scenes = [scene for scene, named in views if named == change and (scene, other) in views]
+    pairs = {scene: (views[scene, change], views[scene, other]) for scene in scenes}
+    return {
+        scene: (statistics.mean(now) - statistics.mean(before), min(now) - min(before))
+        for scene, (now, before) in pairs.items()
+    }
+
+
+def write_page() -> None:
+    """The tables of the page, and the data files."""
+    rows = read_rows(ROWS)
+    lines = []
+    for change, other in PAIRS:
+        by_seen = {seen: gains(rows, change, other, seen) for seen in SEEN}
+        for scene in by_seen["fast"]:
+            cells = [f"{mean:+.2f} / {worst:+.2f}" for mean, worst in (by_seen[seen][scene] for seen in SEEN)]
+            lines.append([change, other, scene, *cells])
+        if len(by_seen["fast"]) > 1:
+            cells = []
+            for found in by_seen.values():
+                means, worsts = (
+                    estimate({(scene, (), ()): pair[i] for scene, pair in found.items()}) for i in range(2)
+                )
+                cells.append(f"{means.mean:+.2f} / {worsts.mean:+.2f} [{means.low:+.2f}, {means.high:+.2f}]")
+            lines.append([change, other, f"**{len(by_seen['fast'])} captures**", *cells])
+    heads = ["steps", "instead of", "capture", *(f"`{seen}`" for seen in SEEN)]
+    write_csv(PAGE_DATA / "schedules-equal-time.csv", [heads, *lines])
+    short = [line for line in lines if line[0] == PAIRS[0][0] or line[0] == PAIRS[1][0]]
+    names = {PAIRS[0][0]: "a tolerance", PAIRS[1][0]: "half the size"}
+    fill_between(
+        PAGE,
+        "equal_time",
+        markdown_table(["with", *heads[2:]], [[names[line[0]], *line[2:]] for line in short]),
+    )
+    timed, shares = [], []
+    for row in read_rows(TIMES):
+        took, size = row["seconds"], "x".join(map(str, row["size"]))
+        timed += [[row["scene"], size, name, *(f"{1000 * x:.0f}" for x in each)] for name, each in took.items()]
+        others = [0.3 * sum(took[name][k] for name in ("fast", "gsplat", "3dgut")) for k in range(3)]
+        whole, cut = (others[0] + 0.1 * took[name][0] for name in ("exact", "exact, 0.01"))
+        half = others[1] + 0.1 * took["exact, 0.01"][1]
+        share = f"{0.1 * took['exact'][0] / whole:.2f}"
+        ratios = (whole / took["fast"][0], cut / took["fast"][0], half / cut)
+        shares.append([row["scene"], size, share, *(f"{x:.2f}" for x in ratios)])
+    write_csv(
+        PAGE_DATA / "schedule-times.csv",
+        [["capture", "size", "renderer, tolerance", "ms", "ms at half the size", "ms at a quarter"], *timed],
+    )
+    heads = ["capture", "size", "share of `exact`", "step / `fast`", "with a tolerance", "half the size"]
+    fill_between(PAGE, "step_times", markdown_table(heads, shares))
+    everything = [
+        ["change", "fitted for", "capture", "seed", "pixels", "Gaussians", "steps", "seconds", *SEEN, "machine"]
+    ]
+    for row in rows:
+        cells = [f"{statistics.mean(row['psnr'][seen]):.2f} / {min(row['psnr'][seen]):.2f}" for seen in SEEN]
+        size = (row["seed"], row["max_pixels"], row["max_gaussians"], row["max_steps"])
+        cells = [row["change"], row["trained"], row["scene"], *map(str, size), f"{row['seconds']:.0f}", *cells]
+        everything.append([*cells, row["machine"]])
+    write_csv(PAGE_DATA / "schedules.csv", everything)
+
+
+def main() -> None:
+    """The program."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", default=list(SCENES), help="names of captures")
+    parser.add_argument("--changes", nargs="+", default=["exact to 0", "exact to 0.01"], help=", ".join(CHANGES))
+    parser.add_argument("--units", type=int, default=1, help="seeds, each with other views held out")
+    parser.add_argument("--trained", default="any", help="as `drgs fit --for` takes it")
+    parser.add_argument("--steps", type=int, default=300)
+    parser.add_argument("--max-pixels", type=int, default=12_000)
+    parser.add_argument("--max-gaussians", type=int, default=8_000)
+    parser.add_argument("--made", type=Path, default=ROOT / "runs" / "made", help="folder of the made scenes")
+    parser.add_argument("--times", type=Path, help="folder of run folders, one a scene; fit nothing")
+    parser.add_argument("--page", action="store_true", help="fit nothing, write the tables of the rows that there are")
+    args = parser.parse_args()
+    if args.page:
+        write_page()
+        return
+    for scene in args.scenes if args.times else []:
+        row = times(scene, args.times / scene, args.max_pixels)
+        add_row(TIMES, row)
+        print(row, flush=True)
+    for seed, offset in [] if args.times else UNITS[: args.units]:
+        for scene in args.scenes:
+            for change in args.changes:
+                key = (scene, change, args.trained, seed, offset, args.steps, args.max_pixels, args.max_gaussians)
+                if key in {tuple(row[name] for name in KEY) for row in read_rows(ROWS)}:
+                    continue
+                row = fit(key, args.made)
+                add_row(ROWS, row)
+                mean = {name: sum(views) / len(views) for name, views in row["psnr"].items()}
+                print(scene, seed, change, *(f"{name} {x:.2f}" for name, x in mean.items()), flush=True)
+                print("   ", f"{row['seconds']:.1f} s", row["seconds_by"], flush=True)
+
+
+if __name__ == "__main__":
+    main()
