@@ -39,7 +39,7 @@ _MEANINGS: dict[str, tuple[Preset, ...]] = {"any": ANY, "drgs": ("exact", "fast"
 _TOLERANCE = 0.01
 
 # Name -> (share of the steps from which on, presets in turn). `exact` takes three to six times as long as the others,
-# so that one step of ten makes a fit 1.2 to 1.5 times as long as one with `fast` alone.
+# so that one step of ten makes a fit 1.2 to 1.4 times as long as one with `fast` alone.
 # `inria` differs from `gsplat` in cut-offs only, and looks right where that does.
 _CYCLES: dict[str, tuple[tuple[float, tuple[Preset, ...]], ...]] = {
     "any": ((0.0, (*("gsplat", "fast", "3dgut") * 3, "exact")),),
