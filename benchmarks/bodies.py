@@ -86,10 +86,10 @@ def measured(scene: str, run: Path, ground: tuple[float, ...], pictures: Path | 
     for frame in (frame for frame in everything if frame.name in names):
         at = moving.at(frame.camera.time)
         with torch.no_grad():  # looked at
-            image = render(at, frame.camera, CONFIG.settings.replace(background=ground)).rgb.clamp(0, 1)
+            image = render(at, frame.camera, CONFIG.settings.replace(background=ground)).rgb.cpu().clamp(0, 1)
             sh = torch.full((len(at), 1, 3), -0.5 / Y_00)
             sh[shown] = 0.5 / Y_00
-            found = render(at.replace(sh=sh), frame.camera, CONFIG.settings).rgb[..., 0] > 0.5
+            found = render(at.replace(sh=sh), frame.camera, CONFIG.settings).rgb[..., 0].cpu() > 0.5
         mask, truth = bodies(scene, frame), frame.image()
         neither = ~mask & ((truth - usual(everything, frame)).abs().mean(2) > CHANGES)
         union = (found & ~neither) | mask
@@ -159,11 +159,11 @@ def main() -> None:
     parser.add_argument("names", nargs="*", default=SCENES, help="scenes; default all")
     parser.add_argument("--page", action="store_true", help="measure nothing, write the page of what is there")
     parser.add_argument("--pictures", type=Path, help="where truth, image and both masks of all views are drawn")
-    parser.add_argument("--seeds", type=int, default=len(SEEDS), help="how many of them")
+    parser.add_argument("--seeds", type=int, nargs="*", default=SEEDS, help="default 0 1 2")
     parser.add_argument("--kinds", default="white:auto,white:off,black:auto,black:off", help="background:lives, ...")
     args = parser.parse_args()
     key = lambda row: tuple(row[k] for k in ("scene", "ground", "lives", "seed"))  # noqa: E731
-    for seed in () if args.page else SEEDS[: args.seeds]:
+    for seed in () if args.page else args.seeds:
         for kind in args.kinds.split(","):
             for scene in args.names:
                 ground, lives = kind.split(":")

@@ -62,6 +62,7 @@ __all__ = [
     "NewGaussians",
     "Search",
     "add_new_gaussians",
+    "agreed_trajectories",
     "checked_lifespans",
     "find_new_gaussians",
     "lifespans_of",
@@ -88,6 +89,7 @@ _CLOSED_LOGIT = -2.0  # logit of the gate of a new Gaussian: 0.12, so that the f
 # Times after which velocities, and accelerations, have moved a Gaussian as far as its mean moves in a step.
 _VELOCITY_TIMES, _ACCELERATION_TIMES = 2.0, 8.0
 _SOLID = 0.5  # opacity below which a ray meets no surface, and value of a mask below which a pixel does not count
+_TOGETHER = 256  # places whose trajectories are corrected at once, so that they need little memory
 _NO_SURFACE = 1e9  # distance in world units of a ray that meets no surface: farther than any surface, and finite
 
 
@@ -118,6 +120,7 @@ class Search:
         occluded: Part of the distance to a place below which what is rendered stands before it; 1 up to rounding.
         window: Within so many times velocities and accelerations are made to agree.
         spread: How far apart places of one thing are, in extents of the scene.
+        rounds: How often they are made to agree, each time with what is found along what they agreed on before.
         reach: What velocity and acceleration may be off by at the end of the window, in extents of the scene.
         turned: Part of its way that a thing may be off its straight path.
         far: Quantile of the distances to all Gaussians beyond which nothing is looked for.
@@ -145,8 +148,9 @@ class Search:
     enough: int = 3
     minor: float = 0.02
     occluded: float = 0.98
-    window: float = 8.0
-    spread: float = 0.025
+    window: float = 16.0
+    spread: float = 0.06
+    rounds: int = 2
     reach: float = 0.05
     turned: float = 0.25
     far: float = 0.95
@@ -512,14 +516,12 @@ def find_new_gaussians(
                     near = [comparisons[j] for j in neighbors[i]]
                     _search_round(iteration, comparison, near, far, fastest, generator, search)
                 bar.advance()
-    whole = NewGaussians.joined([_accepted(comparison, search) for comparison in comparisons])
-    whole = _with_trajectories(whole, extent, step, search)
-    count = len(whole.points)
-    if count <= most:
-        return whole
-    drawn = torch.randperm(count, generator=generator)[:most]
-    fewer = whole.take(drawn)
-    return fewer._replace(sizes=fewer.sizes * math.sqrt(count / most))
+    found = NewGaussians.joined([_accepted(comparison, search) for comparison in comparisons])
+    count = len(found.points)
+    if count > most:
+        found = found.take(torch.randperm(count, generator=generator)[:most])
+        found = found._replace(sizes=found.sizes * math.sqrt(count / most))
+    return agreed_trajectories(found, extent, step, search)
 
 
 def _accepted(comparison: _Comparison, search: Search) -> NewGaussians:
@@ -540,13 +542,27 @@ def _accepted(comparison: _Comparison, search: Search) -> NewGaussians:
     )
 
 
-def _with_trajectories(places: NewGaussians, extent: float, step: float, search: Search) -> NewGaussians:
-    """With the velocities and accelerations that places of times near theirs agree on.
+def agreed_trajectories(places: NewGaussians, extent: float, step: float, search: Search) -> NewGaussians:
+    """Places with the velocities and accelerations that those of times near theirs agree on.
 
     Each place predicts where it is at those times. What else is there then, of its color, is a measurement of how far
-    the prediction is off: offset, velocity and acceleration are fitted to all of them, least squares with priors, and
-    the offset is dropped, for what was measured is another place of the same thing.
+    the prediction is off: corrections of offset, velocity and acceleration are fitted to all of them, least squares
+    with priors, and the offset is dropped, for what was measured is another place of the same thing. The next round
+    finds what is there along the corrected trajectories.
+
+    Args:
+        places: What is known of each.
+        extent: Extent of the scene, world units.
+        step: Time between one photograph and the next.
+        search: Window, spread, rounds, reach and turned count.
     """
+    for _ in range(search.rounds):
+        places = _corrected(places, extent, step, search)
+    return places
+
+
+def _corrected(places: NewGaussians, extent: float, step: float, search: Search) -> NewGaussians:
+    """A round of `agreed_trajectories`."""
     velocities, accelerations = places.velocities.clone(), places.accelerations.clone()
     times = places.times
     late = search.window * step
@@ -554,24 +570,24 @@ def _with_trajectories(places: NewGaussians, extent: float, step: float, search:
     ratio = search.reach / search.spread
     prior = torch.tensor([1.0, ratio, ratio]).square().reciprocal().diag()
     for time in times.unique():
-        here = (times == time).nonzero()[:, 0]
         there = ((times - time).abs() < late).nonzero()[:, 0]
         part = ((times[there] - time) / late).float()
-        expected = places.points[here][:, None] + places.velocities[here][:, None] * (part * late)[None, :, None]
-        off = places.points[there][None] - expected
-        speed = places.velocities[here].norm(dim=1, keepdim=True)
-        same = off.norm(dim=2) < search.spread * extent * 2 + search.turned * speed * (part * late).abs()
-        same &= torch.cdist(places.colors[here], places.colors[there]) < 2 * search.color
+        ahead = (part * late)[:, None]
         basis = torch.stack([torch.ones_like(part), part, part.square()], 1)
-        # A time counts once: its photographs show one side of a thing, all places of which are off alike.
-        each = torch.unique(times[there], return_inverse=True)[1]
-        counted = same.float() @ torch.nn.functional.one_hot(each).float()
-        weights = same / counted[:, each].clamp(min=1)
-        weighted = weights[..., None] * basis  # (here, there, 3)
-        normal = weighted.transpose(1, 2) @ basis + prior
-        solved = torch.linalg.solve(normal, weighted.transpose(1, 2) @ off)
-        velocities[here] += solved[:, 1] / late
-        accelerations[here] = 2 * solved[:, 2] / late**2
+        each = torch.nn.functional.one_hot(torch.unique(times[there], return_inverse=True)[1])
+        for here in (times == time).nonzero()[:, 0].split(_TOGETHER):
+            bent = places.velocities[here][:, None] + 0.5 * ahead * places.accelerations[here][:, None]
+            off = places.points[there][None] - (places.points[here][:, None] + ahead * bent)  # (here, there, 3)
+            speed = places.velocities[here].norm(dim=1, keepdim=True)
+            same = off.norm(dim=2) < search.spread * extent * 2 + search.turned * speed * ahead[:, 0].abs()
+            same &= torch.cdist(places.colors[here], places.colors[there]) < 2 * search.color
+            # A time counts once: its photographs show one side of a thing, all places of which are off alike.
+            counted = same.float() @ each.float() @ each.float().T
+            weighted = (same / counted.clamp(min=1))[..., None] * basis
+            normal = weighted.transpose(1, 2) @ basis + prior
+            solved = torch.linalg.solve(normal, weighted.transpose(1, 2) @ off)
+            velocities[here] += solved[:, 1] / late
+            accelerations[here] += 2 * solved[:, 2] / late**2
     return places._replace(velocities=velocities, accelerations=accelerations)
 
 
