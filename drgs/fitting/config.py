@@ -207,6 +207,15 @@ class DensityConfig(Record):
     noise: float = option(
         0.0, "Strength of the exploration noise of MCMC; 0 is none, 5e5 is that of the paper.", within=WEIGHT, rare=True
     )
+    dropout: float | None = option(
+        None,
+        "Share of the Gaussians that a step leaves out at random, rising from 0 to this at the end; auto: 0.4 for up"
+        " to 3 photographs, else 0.",
+        within=(0.0, 0.9),
+        rare=True,
+        none="auto",
+        metavar="SHARE|auto",
+    )
     jitter: float = option(
         0.1, "Displacement of copied Gaussians, in their own standard deviations.", within=(0.0, 1e3), rare=True
     )

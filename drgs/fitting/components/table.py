@@ -25,6 +25,7 @@ COMPONENTS: Registry[type[Component]] = Registry(
         "poses": f"{_HERE}.poses:PosesComponent",
         "exposure": f"{_HERE}.exposure:ExposureComponent",
         "transients": f"{_HERE}.transients:TransientsComponent",
+        "dropout": f"{_HERE}.dropout:DropoutComponent",
         "motion": f"{_HERE}.motion:MotionComponent",
         "lifespans": f"{_HERE}.lifespans:LifespansComponent",
     },
