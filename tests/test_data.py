@@ -472,9 +472,36 @@ def test_depth_by_nerfcapture_keys(tmp_path):
 
 def test_keys_of_depths_and_masks_that_are_not_read(tmp_path, caplog):
     """Said once a file, not ignored without a word."""
-    write_transforms(tmp_path, extra={"mono_depth_path": "d.npy", "mask": 1, "mask_path": None})
+    write_transforms(tmp_path, extra={"depth": "d.npy", "mask": 1, "mask_path": None})
     load(tmp_path)
-    assert caplog.text.count("the keys 'mask', 'mono_depth_path' of frames are not read") == 1
+    assert caplog.text.count("the keys 'depth', 'mask' of frames are not read") == 1
+
+
+@pytest.mark.parametrize("key", ["confidence_file_path", "confidence_path"])
+def test_depth_of_no_confidence_is_unknown(tmp_path, key):
+    """ARKit's levels 0, 1, 2, in a map of another size; depth in meters as `.npy`."""
+    np.save(tmp_path / "d.npy", np.full((HEIGHT, WIDTH), 3.0, np.float32))
+    levels = np.repeat([0, 1, 2, 2], WIDTH // 8)[None].repeat(HEIGHT // 2, 0)
+    write_image(tmp_path / "c.png", levels.astype(np.uint8))
+    write_transforms(tmp_path, extra={"depth_file_path": "d.npy", key: "c.png"})
+    depth = load(tmp_path).views[0].depth()
+    assert (depth[:, : WIDTH // 4] == 0).all()
+    assert (depth[:, WIDTH // 4 :] == 3).all()
+
+
+def test_relative_depth_is_no_depth(tmp_path):
+    """SDFStudio's `mono_depth_path`: numbers as stored, NaN where unknown, and nothing in scene units."""
+    values = np.linspace(-1, 1, WIDTH * HEIGHT).reshape(HEIGHT, WIDTH)
+    values[3, 4] = np.inf
+    np.save(tmp_path / "m.npy", values)
+    write_transforms(tmp_path, extra={"mono_depth_path": "m.npy"})
+    view = load(tmp_path).views[0]
+    assert view.depth() is None
+    expected = np.where(np.isinf(values), np.nan, values).astype(np.float32)
+    np.testing.assert_array_equal(view.relative_depth(), expected)
+    np.save(tmp_path / "m.npy", np.ones((HEIGHT, WIDTH, 3)))
+    with pytest.raises(ValueError, match=r"m.npy: a depth map must have one channel, got shape"):
+        view.relative_depth()
 
 
 @pytest.mark.parametrize("lazy", [False, True])

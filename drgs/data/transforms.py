@@ -38,7 +38,9 @@ _LENSES = {
     "EQUIRECTANGULAR": "equirectangular",
 }
 _DEPTHS = ("depth_file_path", "depth_path")  # nerfstudio's key, and NeRFCapture's, SplaTAM's and instant-ngp's
-_FILE_KEYS = ("file_path", "mask_path", *_DEPTHS)
+_RELATIVE_DEPTHS = ("mono_depth_path",)  # SDFStudio's key
+_CONFIDENCES = ("confidence_file_path", "confidence_path")  # of converters of ARKit's captures
+_FILE_KEYS = ("file_path", "mask_path", *_DEPTHS, *_RELATIVE_DEPTHS, *_CONFIDENCES)
 _DEPTH_SCALES = ("depth_unit_scale_factor", "integer_depth_scale")
 _SHOWN = 40  # characters of a key in a message
 _MILLIMETER = 1e-3  # meters: the unit of depth images where a file states none, as in nerfstudio
@@ -70,7 +72,8 @@ def load_transforms(
     Intrinsics come from each frame or from the file: fl_x, fl_y, cx, cy, w, h, or camera_angle_x; lens from
     camera_model and k1, k2, k3, k4, p1, p2. Frames may state their `time`, and name `mask_path` and
     `depth_file_path`, or `depth_path` (z-depth; unit from `depth_unit_scale_factor`, else, for images,
-    `integer_depth_scale`, else millimeters for images and scene units for `.npy`).
+    `integer_depth_scale`, else millimeters for images and scene units for `.npy`), with `confidence_file_path`, or
+    `confidence_path` (0: unknown), and `mono_depth_path` (depth up to scale and shift).
 
     Args:
         path: The folder, or one JSON file.
@@ -243,10 +246,13 @@ def _fill(
     shared = {key: value for key, value in data.items() if key not in ("frames", "time")}
     merged = {**shared, **frame}
     camera = _camera(where, merged, _pose(where, frame.get("transform_matrix")), view.image_path, first)
-    depth = next((path for key in _DEPTHS if (path := _optional_file(folder, where, frame, key))), None)
+    depth, relative, confidence = (
+        next((path for key in keys if (path := _optional_file(folder, where, frame, key))), None)
+        for keys in (_DEPTHS, _RELATIVE_DEPTHS, _CONFIDENCES)
+    )
     view.camera = fit_to_image(camera, view.image_path, where, lazy=first is not None)
     view.mask_path = _optional_file(folder, where, frame, "mask_path")
-    view.depth_path = depth
+    view.depth_path, view.relative_depth_path, view.confidence_path = depth, relative, confidence
     view.depth_scale = _depth_scale(where, merged, depth)
     view.is_checked = first is None
     return own

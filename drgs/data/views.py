@@ -33,6 +33,8 @@ class View:
         name: Unique in the data set; the image's path below the image folder without its suffix.
         image_path, mask_path, depth_path: files, or None. Masks: white is kept. Depth: z-depth, 0
             is unknown.
+        relative_depth_path: File of a map that says depth up to scale and shift, as networks do, or None.
+        confidence_path: File of a sensor's confidence in its depth, whose lowest level, 0, is unknown depth, or None.
         empty_outside: Whether nothing is where the mask or the alpha channel keeps nothing, unless an option of the fit
             says otherwise: False where other photographs of the data set have neither, and show what is there.
         depth_scale: Scene units in one unit of the depth file.
@@ -54,6 +56,8 @@ class View:
     image_path: Path | None = None
     mask_path: Path | None = None
     depth_path: Path | None = None
+    relative_depth_path: Path | None = None
+    confidence_path: Path | None = None
     depth_scale: float = 1.0
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     split: str = ""
@@ -168,22 +172,42 @@ class View:
         return resize_area(data, *self._size(width, height)).clip(0, 1)  # averages of ones can be 1 + 1e-7
 
     def depth(self, width: int | None = None, height: int | None = None) -> np.ndarray | None:
-        """(H,W) float32 z-depth in scene units, 0 where unknown, nearest pixel; None if there is no depth map."""
-        import cv2
+        """(H,W) float32 z-depth in scene units, 0 where unknown, nearest pixel; None if there is no depth map.
 
+        Unknown are numbers that are not positive and finite, and where a map of confidence has 0.
+
+        Raises:
+            FileNotFoundError, ValueError: No such file, of several channels, or of another shape than the photo's.
+        """
         if self.depth_path is None:
             return None
-        raw = read_npy(self.depth_path) if self.depth_path.suffix == ".npy" else read_image(self.depth_path)
-        if raw.ndim == 3 and raw.shape[2] == 1:
-            raw = raw[..., 0]
-        if raw.ndim != 2:
-            raise ValueError(f"{self.depth_path}: a depth map must have one channel, got shape {raw.shape}; convert it")
         # Depths are stored as integers, or as float64 that no picture has the digits of.
-        data = raw.astype(np.float32) * np.float32(self.depth_scale)
-        data = np.where(np.isfinite(data) & (data > 0), data, np.float32(0))
-        data = self._nearest(data, self.depth_path)
+        data = _single_channel(self.depth_path, "a depth map").astype(np.float32) * np.float32(self.depth_scale)
+        data = self._nearest(np.where(np.isfinite(data) & (data > 0), data, np.float32(0)), self.depth_path)
+        if self.confidence_path is not None:
+            levels = _single_channel(self.confidence_path, "a map of confidence").astype(np.float32)
+            data = np.where(self._nearest(levels, self.confidence_path) > 0, data, np.float32(0))
+        return self._at_size(data, 0.0, width, height)
+
+    def relative_depth(self, width: int | None = None, height: int | None = None) -> np.ndarray | None:
+        """(H,W) float32 numbers m such that a m + b is the z-depth, or its inverse, for some a and b; NaN where
+        unknown, nearest pixel; None if there is no such map.
+
+        Raises:
+            FileNotFoundError, ValueError: As `depth`.
+        """
+        if self.relative_depth_path is None:
+            return None
+        data = _single_channel(self.relative_depth_path, "a depth map").astype(np.float32)
+        data = self._nearest(np.where(np.isfinite(data), data, np.float32(np.nan)), self.relative_depth_path)
+        return self._at_size(data, np.nan, width, height)
+
+    def _at_size(self, data: np.ndarray, unknown: float, width: int | None, height: int | None) -> np.ndarray:
+        """A depth map at the camera's size at another one, nearest pixel; `unknown` where the photo did not see."""
+        import cv2
+
         if (unseen := self._unseen()) is not None:
-            data = np.where(unseen, np.float32(0), data)
+            data = np.where(unseen, np.float32(unknown), data)
         # Averaging depths across an edge, or with unknown zeros, would invent surfaces.
         return cv2.resize(data, self._size(width, height), interpolation=cv2.INTER_NEAREST_EXACT)
 
@@ -252,3 +276,13 @@ class View:
             columns, rows, _ = lens_maps(self.camera)
             data = cv2.remap(data, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
         return data
+
+
+def _single_channel(path: Path, what: str) -> np.ndarray:
+    """(H,W) an image or array file of one channel, as stored."""
+    raw = read_npy(path) if path.suffix == ".npy" else read_image(path)
+    if raw.ndim == 3 and raw.shape[2] == 1:
+        raw = raw[..., 0]
+    if raw.ndim != 2:
+        raise ValueError(f"{path}: {what} must have one channel, got shape {raw.shape}; convert it")
+    return raw

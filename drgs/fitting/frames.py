@@ -19,6 +19,8 @@ from drgs.data.synchronous import late_cameras
 from drgs.display.progress import Bar
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from drgs.cameras import Camera
     from drgs.data import Dataset, View
     from drgs.fitting.config import DataConfig, FitConfig, MaskUse, UndistortUse
@@ -28,7 +30,7 @@ __all__ = ["Frame", "frames_for", "load_dataset", "load_frames", "warn_of_late_c
 _log = logging.getLogger(__name__)
 
 _Map = Callable[[], torch.Tensor]
-_Labels = Callable[[], np.ndarray]
+_Pixels = Callable[[], np.ndarray]
 
 _MOTION_SIZE = 160  # pixels of the longer side at which photographs of two times are compared; chosen, not tuned
 _FLOAT_BYTES = 2 << 30  # bytes of all photographs in float32; larger sets are kept as 8 bits, a quarter of it; chosen
@@ -49,6 +51,8 @@ class Frame:
         transient: (H, W) bool, what no other photograph shows, and the photometric term leaves out; None: nothing.
         teacher: Reads the (C, h, w) map of a teacher, which covers the view at a size of its own; None: there is none.
         labels: Reads the (H, W) int64 labels of the pixels, 0 for none; None: there are none.
+        depth: Reads the (H, W) float32 z-depth of a sensor, scene units, 0 where unknown; None: there is none.
+        relative_depth: Reads (H, W) float32 z-depth or its inverse up to scale and shift, NaN where unknown; likewise.
     """
 
     name: str
@@ -59,7 +63,9 @@ class Frame:
     alpha: torch.Tensor | None = None
     transient: torch.Tensor | None = None
     teacher: _Map | None = None
-    labels: _Labels | None = None
+    labels: _Pixels | None = None
+    depth: _Pixels | None = None
+    relative_depth: _Pixels | None = None
 
     def image(self) -> torch.Tensor:
         """(H, W, 3) float32 in [0, 1]."""
@@ -183,11 +189,18 @@ def _frames(views: list[View], max_pixels: int, mask: str, bar: Bar) -> list[Fra
                 is_object=mask == "object" or (is_empty and view.mask_path is not None),
                 alpha=store(alpha) if alpha is not None and is_empty else None,
                 teacher=cast("_Map | None", None if view.teacher_path is None else view.teacher),
-                labels=cast("_Labels | None", view.label_path and functools.partial(view.labels, width, height)),
+                labels=_reader(view.label_path, view.labels, width, height),
+                depth=_reader(view.depth_path, view.depth, width, height),
+                relative_depth=_reader(view.relative_depth_path, view.relative_depth, width, height),
             )
         )
         bar.advance()
     return frames
+
+
+def _reader(path: Path | None, read: Callable[..., Any], width: int, height: int) -> _Pixels | None:
+    """Reads a map of a view at the size of the fit, when it is called; None if there is no file."""
+    return None if path is None else functools.partial(read, width, height)
 
 
 def _as_float(pixels: torch.Tensor) -> torch.Tensor:
