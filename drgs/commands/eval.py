@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from drgs.display import tables
 from drgs.fitting.evaluation import evaluate_run
-from drgs.fitting.metrics import METRICS, MOVING, OBJECT, Lpips, renderers_table
+from drgs.fitting.metrics import DEPTH, METRICS, MOVING, OBJECT, Lpips, renderers_table
 from drgs.fitting.records import fit_record
 from drgs.fitting.resume import lock_run
 from drgs.io.run import Run
@@ -36,7 +36,7 @@ def print_table(metrics: dict, *, lpips: bool = False) -> None:
         lpips: Whether to print LPIPS, and why it is null where it is.
     """
     digits = dict.fromkeys(("psnr", "cc_psnr", *OBJECT, *MOVING), ".2f")
-    names = [name for name in (*OBJECT, *METRICS, *MOVING) if metrics["mean"].get(name) is not None]
+    names = [name for name in (*OBJECT, *METRICS, *MOVING, *DEPTH) if metrics["mean"].get(name) is not None]
     if "psnr_object" in names:
         names.remove("psnr")  # one of these two, by what says where the object is
     scale = metrics.get("scale")

@@ -16,6 +16,7 @@ import torch
 from drgs.display.pictures import file_names, write_png
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
+from drgs.fitting.depths import depth_error
 from drgs.fitting.losses import psnr
 from drgs.integrator import render
 from drgs.io.archives import check_archive
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from drgs.io.run import Run
 
 __all__ = [
+    "DEPTH",
     "METRICS",
     "MOVING",
     "OBJECT",
@@ -72,6 +74,11 @@ OBJECT = {
 """What is measured beside `METRICS` where masks or alpha say what is empty: that is easy to show, and may be most."""
 MOVING = {"psnr_moving": "as psnr, of the pixels whose label is a class that moves; of views that show one"}
 """What is measured beside `METRICS` where labels say what moves: a background that stands still hides the rest."""
+DEPTH = {
+    "depth_error": "mean of |z - z_map| / z_map over the pixels where the view's depth map knows z_map, inside the "
+    "mask; lower is better; of views that have a map"
+}
+"""What is measured beside `METRICS` where the data set has depth maps in scene units."""
 TRAIN_VIEWS = 8
 """Training photographs, at most, that are measured at the end of a fit that holds out none; chosen for its seconds."""
 VIEW_PICTURES = ("png", "semantics.png")
@@ -305,11 +312,14 @@ def _evaluated(
     if lpips is None:
         reasons["lpips"] = _NO_WEIGHTS if importlib.util.find_spec("lpips") else _NO_LPIPS
     is_cut_out = any(frame.empty() is not None for frame in frames)
+    has_depth = any(frame.depth is not None for frame in frames)
     for frame, file_name in zip(frames, file_names([frame.name for frame in frames]), strict=True):
         with torch.no_grad():  # pictures of whatever an optimizer may hold
             out = render(g if segmentation else colors_only(g, frame.camera.time), frame.camera, settings)
         row, missing = _view_metrics(out, frame, settings.background if is_cut_out else None, lpips, moving)
         reasons |= missing
+        if has_depth:
+            row["depth_error"] = depth_error(out, frame, settings)
         if segmentation and out.features is not None:
             row |= segmentation.add(frame, out.features)
             if pictures is not None:
@@ -320,13 +330,13 @@ def _evaluated(
             error = (4 * (shown - target).abs()).clamp(0, 1)
             write_png(pictures / f"{file_name}.png", torch.cat([target, shown, error], dim=1).numpy())
         bar.advance()
-    variants = DEFINITIONS | (OBJECT if is_cut_out else {}) | (MOVING if moving else {})
+    variants = DEFINITIONS | (OBJECT if is_cut_out else {}) | (MOVING if moving else {}) | (DEPTH if has_depth else {})
     mean: dict[str, float | None] = {}
     median: dict[str, float | None] = {}
     for name in variants:
         values = [row[name] for row in views if row[name] is not None]
         # Not every view shows the object or what moves; else a number that one view lacks has no average.
-        there = values and (name in OBJECT | MOVING or len(values) == len(views))
+        there = values and (name in OBJECT | MOVING | DEPTH or len(values) == len(views))
         mean[name], median[name] = (sum(values) / len(values), float(np.median(values))) if there else (None, None)
         if not views and name in DEFINITIONS:
             reasons[name] = "no view is held out"

@@ -26,6 +26,7 @@ from drgs.cameras.sizes import reduced_size
 from drgs.display.progress import Bar
 from drgs.ellipsoids import colors_only
 from drgs.fitting.components.base import Checkpoint, Component, Conflict, Fit, Setup
+from drgs.fitting.depths import axis_cosines, renders_z
 from drgs.integrator import render
 
 if TYPE_CHECKING:
@@ -258,9 +259,8 @@ def _compared(frame: Frame, gaussians: Gaussians, settings: RenderSettings) -> _
         valid &= _reduced(frame.mask[None], height, width)[0] > 0.5
     assert out.depth is not None  # an output of this rendering
     distance = out.depth.cpu()
-    if settings.planar and settings.depth_key == "z":
-        # Depths are along the axis of the camera, rays are followed along themselves.
-        distance = distance / torch.from_numpy(camera.pixel_directions() @ camera.c2w[:3, 2]).float()
+    if renders_z(settings):  # rays are followed along themselves
+        distance = distance / axis_cosines(camera)
     # Exposure and white balance of a photograph are everywhere in it, and no object.
     gains = []
     for shown, fitted in zip(image, rgb, strict=True):
