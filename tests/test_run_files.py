@@ -35,7 +35,19 @@ from drgs.train import SelectionConfig, fit
 
 _SOMETIMES = {
     "config.json": {
-        *{"begin", "frames", "absent", "semantics", "times", "poses", "exposure", "estimated", "lenses", "origin"},
+        *{
+            "begin",
+            "frames",
+            "absent",
+            "semantics",
+            "times",
+            "poses",
+            "exposure",
+            "depth",
+            "estimated",
+            "lenses",
+            "origin",
+        },
     },
     "metrics.json": {"segmentation", "motion", "transients", "dropout", "poses", "skybox", "scale"},
     "fisher.json": {"nuisances"},

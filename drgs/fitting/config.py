@@ -23,6 +23,7 @@ __all__ = [
     "DataConfig",
     "Degree",
     "DensityConfig",
+    "DepthUse",
     "Dynamics",
     "ExposureUse",
     "FeatureConfig",
@@ -61,6 +62,7 @@ PoseUse = Literal["fixed", "auto", "refined"]
 UndistortUse = Literal["auto", "on", "off"]
 SkyboxUse = Literal["off", "auto", "on"]
 TransientUse = Literal["auto", "mask", "keep"]
+DepthUse = Literal["auto", "on", "off"]
 Degree = Literal[0, 1, 2, 3]
 SemanticUse = Literal["auto", "ignore"]
 FeatureSize = Literal["image", "teacher"]
@@ -283,6 +285,25 @@ class LossConfig(Record):
         "keep",
         "Leave shadows and passers-by, which single photographs have, out of the loss: never (keep), if residuals"
         " clearly reveal some (auto), or at all suspicious pixels (mask).",
+        rare=True,
+    )
+    depth: DepthUse = option(
+        "off",
+        "Fit to the depth maps of the data set: never (off), if they agree with points that photographs triangulate"
+        " (auto), or always (on).",
+        rare=True,
+    )
+    depth_weight: tuple[float, float] = option(
+        (3.0, 0.3),
+        "First and last weight of the relative error of rendered depth, log-linear between.",
+        within=FADING,
+        rare=True,
+    )
+    depth_behind: float = option(
+        0.1,
+        "Factor of that weight where rendered depth is behind the map's, as mirror images are; 1 for geometry that is"
+        " as true as it can be.",
+        within=FRACTION,
         rare=True,
     )
     where: ClassVar[str] = "fit"

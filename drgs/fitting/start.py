@@ -86,7 +86,7 @@ def _rows_at_points(setup: Setup) -> tuple[GaussianRows, str]:
         bar.note(f"initial points: {source}")
     setup.points, setup.matches = points, None if given else matches
     _log.info("%d initial points: %s", len(points), source)
-    dense = not given and any(view.depth_path is not None for view in setup.views)
+    dense = not given and any(view.depth_path is not None for view in seen)
     kind = config.density.start_of(dense)
     made = GaussianRows.from_points(torch.from_numpy(points), torch.from_numpy(colors), *kind, dataset.origin)
     return made, source

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from drgs.fitting.frames import Frame
     from drgs.fitting.losses import LossTerm
     from drgs.fitting.networks import Network, Rate
+    from drgs.fitting.renderers import RendererSchedule
     from drgs.fitting.rows import GaussianRows
     from drgs.fitting.stages import Stage
     from drgs.information.choices import Block
@@ -143,6 +144,7 @@ class Fit(Protocol):
     frames: list[Frame]
     rows: GaussianRows
     extent: float
+    renderers: RendererSchedule
     step_index: int
     reserved: int
     generator: torch.Generator

@@ -22,6 +22,7 @@ COMPONENTS: Registry[type[Component]] = Registry(
         "filter_3d": f"{_HERE}.filter_3d:Filter3DComponent",
         "skybox": f"{_HERE}.skybox:SkyboxComponent",
         "semantics": f"{_HERE}.semantics:SemanticsComponent",
+        "depth": f"{_HERE}.depth:DepthComponent",
         "poses": f"{_HERE}.poses:PosesComponent",
         "exposure": f"{_HERE}.exposure:ExposureComponent",
         "transients": f"{_HERE}.transients:TransientsComponent",
