@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import drjit as dr
@@ -271,3 +273,43 @@ def test_padded():
     for count in range(1, 5000):
         assert count <= padded(count) <= max(1.125 * count + 16, 16)
     assert len({padded(count) for count in range(1025, 2049)}) == 8
+
+
+BESIDE = """
+import threading, time
+import drjit as dr, numpy as np, torch
+import drgs
+from drgs import runtime
+
+n = 200
+draw = torch.Generator().manual_seed(0)
+normal = torch.randn(n, 11, generator=draw)
+tensors = {"means": 0.5 * normal[:, :3], "quats": normal[:, 3:7], "log_scales": 0.3 * normal[:, 7:10] - 2.5}
+tensors |= {"logit_opacities": normal[:, 10], "sh": torch.zeros(n, 1, 3)}
+w2c = np.eye(4)
+w2c[2, 3] = 3
+camera = drgs.Camera(K=np.array([[20.0, 0, 10], [0, 20, 7], [0, 0, 1]]), w2c=w2c, width=20, height=15)
+lib, done = runtime.dr_types(), False
+
+def other():
+    while not done:
+        dr.sum(dr.sin(lib.Float(np.arange(1000, dtype=np.float32))))[0]
+
+thread = threading.Thread(target=other)
+thread.start()
+end = time.monotonic() + 4
+count = 0
+while time.monotonic() < end:
+    count = count % 100 + 1
+    own = {name: x[: 100 + count].clone().requires_grad_() for name, x in tensors.items()}
+    drgs.render(drgs.Gaussians(**own), camera, drgs.RenderSettings.preset("fast")).rgb.sum().backward()
+done = True
+thread.join()
+"""
+
+
+@pytest.mark.skipif(runtime.backend().name == "cuda", reason="Dr.Jit's threads on a card have scopes of their own")
+def test_a_thread_that_uses_dr_jit_beside_does_not_hang():
+    """Frames are recorded while another thread, which knows nothing of drgs, computes with Dr.Jit."""
+    done = subprocess.run([sys.executable, "-c", BESIDE], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr

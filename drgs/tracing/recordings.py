@@ -14,6 +14,7 @@ function of the engine, in a test, asks for `without_recordings`.
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator
 from typing import Any
@@ -81,8 +82,12 @@ def replay(step: Step, what: Hashable, arrays: dict) -> Any:
 def _recorded(step: Step, what: Hashable) -> Any:
     """A step for one purpose as a function of its arrays."""
 
+    # Dr.Jit hashes what a function closes over, under its lock: the hash of settings is Python, where the interpreter
+    # may go on with another thread, which then waits for that lock for ever. A partial is hashed by its identity.
+    whole = functools.partial(step, what)
+
     def run(arrays: dict) -> Any:
-        return step(what, arrays)
+        return whole(arrays)
 
     return dr.freeze(run, limit=_MAX_VARIANTS, warn_after=1_000_000)
 

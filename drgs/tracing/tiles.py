@@ -358,7 +358,9 @@ def build(
     order = gaussian if settings.order == "ray" else depth_order(lib, projected.key, gaussian)
     boxes_seen = int(dr.sum(dr.select(seen, lib.UInt32(1), 0))[0])
     found = listed(lib, settings, width, height, record, order, amount, x, y, boxes_seen, lens)
-    return shorter(lib, found, settings, record, count, lens) if trimmed and found.pairs else found
+    if trimmed and found.pairs:
+        return shorter(lib, found, settings, record, count, lens)
+    return dataclasses.replace(found, tile=None)  # nothing reads it any more, and lists are kept for the gradient
 
 
 def screen_boxes(
