@@ -51,6 +51,11 @@ def test_opacities_of_those_kept_stand_for_those_left_out():
     fewer(g.replace(logit_opacities=logits), torch.tensor([0, 1]), 0.5).opacities.sum().backward()
     assert torch.allclose(logits.grad[:2], 2 * torch.tensor([0.1 * 0.9, 0.3 * 0.7]), atol=1e-5)
     assert not logits.grad[2:].any()
+    faint = torch.tensor([-200.0, -95.0, 0.0, 0.0]).requires_grad_()  # opacities that are 0 in float32
+    found = fewer(g.replace(logit_opacities=faint), torch.tensor([0, 1]), 0.4).logit_opacities
+    found.sum().backward()
+    assert torch.allclose(found, torch.tensor([-199.489, -94.489]), atol=1e-3)
+    assert torch.allclose(faint.grad[:2], torch.ones(2))
 
 
 def test_the_share_rises_to_what_is_given_and_far_gaussians_stay(dataset):  # noqa: F811
