@@ -556,13 +556,14 @@ def agreed_trajectories(places: NewGaussians, extent: float, step: float, search
         step: Time between one photograph and the next.
         search: Window, spread, rounds, reach and turned count.
     """
-    for _ in range(search.rounds):
-        places = _corrected(places, extent, step, search)
+    with Bar("how it moves", search.rounds * len(places.times.unique())) as bar:
+        for _ in range(search.rounds):
+            places = _corrected(places, extent, step, search, bar)
     return places
 
 
-def _corrected(places: NewGaussians, extent: float, step: float, search: Search) -> NewGaussians:
-    """A round of `agreed_trajectories`."""
+def _corrected(places: NewGaussians, extent: float, step: float, search: Search, bar: Bar) -> NewGaussians:
+    """A round of `agreed_trajectories`; `bar` advances with each time."""
     velocities, accelerations = places.velocities.clone(), places.accelerations.clone()
     times = places.times
     late = search.window * step
@@ -588,6 +589,7 @@ def _corrected(places: NewGaussians, extent: float, step: float, search: Search)
             solved = torch.linalg.solve(normal, weighted.transpose(1, 2) @ off)
             velocities[here] += solved[:, 1] / late
             accelerations[here] += 2 * solved[:, 2] / late**2
+        bar.advance()
     return places._replace(velocities=velocities, accelerations=accelerations)
 
 
