@@ -290,7 +290,7 @@ class LossConfig(Record):
     depth: DepthUse = option(
         "off",
         "Fit to the depth maps of the data set: never (off), if they agree with points that photographs triangulate"
-        " (auto), or always (on).",
+        " (auto), or always (on; relative ones as far as points give their scale).",
         rare=True,
     )
     depth_weight: tuple[float, float] = option(
@@ -608,7 +608,8 @@ class FitConfig(Record):
     renderers: tuple[str, ...] = option(
         AUTO,
         "Renderers that the result must look right in, used in turn: any (exact, fast, inria, gsplat, 3dgut), "
-        "drgs (exact, fast), viewers (gsplat, inria), or presets; auto: any, or --preset alone if it is given.",
+        "drgs (exact, fast), viewers (gsplat, inria), or presets; exact among others with a tolerance of 0.01. auto: "
+        "any, or --preset alone if it is given.",
         heading="Rendering",
         flag="for",
         commas=True,

@@ -179,7 +179,7 @@ class DepthComponent(Component):
         self._compared: list[str] = []  # names of the photographs whose features `_matches` has, in their order
         self._matches = Matches()
         self._kept: dict[str, torch.Tensor] = {}  # name of a photograph -> z-depth
-        self._cosines: dict[str, torch.Tensor] = {}
+        self._cosines: dict[tuple, torch.Tensor] = {}  # by what they depend on: photographs of one lens share them
         self._target: torch.Tensor | None = None
         self._weight = self._behind = 0.0
 
@@ -229,6 +229,11 @@ class DepthComponent(Component):
                 metric = self.found.kind == "metric"
                 self.found = dataclasses.replace(self.found, left_out=()) if metric else self.found
                 self.used = metric or bool(self.found.lines)
+                if not self.used and not setup.is_active:
+                    raise ValueError(
+                        f"{setup.dataset.path}: --depth on must have metric depth maps, or triangulated points in view "
+                        f"of relative ones, got {self.found.points} points; add photographs, or leave --depth out"
+                    )
             bar.note(f"depth: {self.found.words()}; {self._effect()}")
         self.terms = [_DepthTerm(self)] if self.used else []
 
@@ -248,7 +253,7 @@ class DepthComponent(Component):
         """See `Component`: maps that are clearly wrong give no initial points either."""
         if self.found is None or not (self.found.left_out or self.found.has_wrong_unit):
             return views
-        every, some = self.found.has_wrong_unit and not self.used, self.found.left_out if self.used else ()
+        every, some = self.found.has_wrong_unit and not self.used, self.found.left_out
         return [dataclasses.replace(x, depth_path=None) if every or x.name in some else x for x in views]
 
     def start(self, fit: Fit, setup: Setup) -> None:
@@ -304,9 +309,11 @@ class DepthComponent(Component):
 
     def _along(self, frame: Frame, z: torch.Tensor) -> torch.Tensor:
         """(H, W) distance along rays, 0 where unknown."""
-        if frame.name not in self._cosines:
-            self._cosines[frame.name] = axis_cosines(frame.camera)
-        cosines = self._cosines[frame.name]
+        camera = frame.camera
+        lens = camera.K.tobytes(), camera.width, camera.height, camera.model, tuple(camera.distortion)
+        if lens not in self._cosines:
+            self._cosines[lens] = axis_cosines(camera)
+        cosines = self._cosines[lens]
         return torch.where(cosines > 0, z / cosines, 0.0)
 
     def loss(self, out: Output, frame: Frame) -> torch.Tensor | None:
@@ -423,7 +430,7 @@ def compare(views: Sequence[View], points: np.ndarray, shown: np.ndarray) -> Com
         points=len(every),
         agreeing=float(_is_same(every).mean()) if len(every) else 0.0,
         ratio=ratio,
-        at_ratio=float(_is_same(every / ratio).mean()) if len(every) else 0.0,
+        at_ratio=float(_is_same(every / ratio).mean()) if is_metric and len(every) else 0.0,
         left_out=tuple(left_out),
         lines=lines_of,
     )
@@ -499,9 +506,9 @@ def _of_one_time(views: Sequence[View]) -> list[View]:
 
 
 def _some(views: list[View]) -> list[View]:
-    """All of a few views with maps, else some groups of neighbors."""
+    """All of a few views with maps, else some groups of neighbors; of relative maps all, as each needs a scale."""
     views = [view for view in views if _have_maps([view])]
-    if len(views) <= _COMPARED_VIEWS:
+    if len(views) <= _COMPARED_VIEWS or all(view.depth_path is None for view in views):
         return views
     begins = np.linspace(0, len(views) - _GROUP, _COMPARED_VIEWS // _GROUP).astype(int)
     return [views[i] for i in sorted({begin + k for begin in begins for k in range(_GROUP)})]
