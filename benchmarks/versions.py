@@ -1,12 +1,17 @@
-"""What a commit gained or lost in speed: the same frames by two checkouts of drgs, in turns.
+"""What commits gained or lost: the same frames by two checkouts of drgs in turns, and fits of equal processor time.
 
     git worktree add ../before COMMIT
     python benchmarks/versions.py ../before [RUN ...] [--turns 9]   rows: benchmarks/versions.jsonl
-    python benchmarks/versions.py --page                            the table of docs/benchmarks-versions.md
+    python benchmarks/versions.py ../before --fits 60 DATA ...      rows: benchmarks/versions_fits.jsonl
+    python benchmarks/versions.py --page                            the tables of docs/benchmarks-versions.md
 
 One process a checkout, one thread each, taking turns; what counts is the median of the ratios of processor time of two
 neighboring turns, which other work on the machine changes little. Scenes are the cube of `render.py` and, of each RUN
 (a fit, at 320x240), its fifth camera. With a RUN that has 47 cameras or more a pick among 80 candidates is timed, too.
+
+With `--fits` both checkouts run `drgs fit` on each data set, side by side, one thread each, with as many steps as take
+those seconds of processor time: a fit of one step and a short one say what a step takes, for schedules are fractions of
+the steps. Held-out views are those of `drgs fit`; renderers those that metrics.json has.
 """
 
 from __future__ import annotations
@@ -18,8 +23,10 @@ import os
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 os.environ.setdefault("DRGS_THREADS", "1")
@@ -30,9 +37,15 @@ CODE = Path(os.environ.get("DRGS_CHECKOUT", ROOT))
 sys.path[:0] = [str(CODE), str(ROOT / "benchmarks")]
 
 ROWS = ROOT / "benchmarks" / "versions.jsonl"
+FIT_ROWS = ROOT / "benchmarks" / "versions_fits.jsonl"
 PAGE = ROOT / "docs" / "benchmarks-versions.md"
 CUBE = "cube"
 POSES = 80  # candidates of a pick
+LEAST = 50  # steps of a fit that compiles kernels
+PILOT = 0.2  # part of the seconds, about, of the fit that says what a step takes
+SIZES = {60: (30_000, 12_000), 300: (60_000, 20_000), 900: (130_000, 30_000)}
+"""Processor seconds of a fit -> pixels of a photograph and Gaussians, at most: what that time is enough for."""
+SEEN = ("fast", "exact", "gsplat", "3dgut")
 
 
 def frames(scene: str) -> dict[str, Callable[[], object]]:
@@ -128,8 +141,66 @@ def compared(before: Path, scene: str, turns: int) -> dict[str, list[tuple[float
     return found
 
 
+def fit_once(checkout: Path, data: Path, run: Path, steps: int, seconds: int) -> float:
+    """Processor seconds of one `drgs fit`, all of it."""
+    pixels, gaussians = SIZES[seconds]
+    environment = {**os.environ, "PYTHONPATH": str(checkout.resolve())}
+    size = ["--max-steps", str(steps), "--max-pixels", str(pixels), "--max-gaussians", str(gaussians)]
+    command = [sys.executable, "-m", "drgs", "fit", str(data), "-o", str(run), *size, "--no-report", "--quiet"]
+    process = subprocess.Popen(command, env=environment, cwd=run.parent)
+    _, status, used = os.wait4(process.pid, 0)
+    assert status == 0, f"{data}: a fit has failed"
+    return used.ru_utime + used.ru_stime
+
+
+def fit_for(checkout: Path, data: Path, seconds: int) -> dict:
+    """What a checkout's fit of these processor seconds has at held-out views."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        compiled = fit_once(checkout, data, folder / "compiled", LEAST, seconds)
+        one = fit_once(checkout, data, folder / "one", 1, seconds)
+        pilot = max(LEAST, round(PILOT * seconds * (LEAST - 1) / max(compiled - one, 1)))
+        step = (fit_once(checkout, data, folder / "pilot", pilot, seconds) - one) / (pilot - 1)
+        steps = max(LEAST, round((seconds - one) / step))
+        took = fit_once(checkout, data, folder / "run", steps, seconds)
+        metrics = json.loads((folder / "run" / "metrics.json").read_text())
+    seen = {row["name"]: [view["psnr"] for view in row["views"]] for row in metrics["renderers"]["rows"]}
+    return {"steps": steps, "took": took, "psnr": seen}
+
+
+def fits_compared(before: Path, data: Path, seconds: int) -> dict:
+    """Fits of both checkouts, side by side: other work on the machine slows both."""
+    with ThreadPoolExecutor(2) as pool:
+        old, new = pool.map(lambda checkout: fit_for(checkout, data, seconds), (before, ROOT))
+    return {"scene": data.name, "seconds": seconds, "before": old, "now": new}
+
+
+def fits_table() -> str:
+    """Held-out PSNR of the second checkout by scene and renderer, its gains on average and in the worst view."""
+    from where import read_rows
+
+    from drgs.studies.tables import markdown_table
+
+    lines, gains = [], {}
+    for row in read_rows(FIT_ROWS):
+        line = [row["scene"], str(row["seconds"]), f"{row['before']['steps']:,} to {row['now']['steps']:,}"]
+        for name in SEEN:
+            old, new = row["before"]["psnr"][name], row["now"]["psnr"][name]
+            mean, worst = statistics.mean(new) - statistics.mean(old), min(new) - min(old)
+            line.append(f"{statistics.mean(new):.2f} ({mean:+.2f} / {worst:+.2f})")
+            gains.setdefault((row["seconds"], name), []).append((mean, worst))
+        lines.append(line)
+    for seconds in dict.fromkeys(seconds for seconds, _ in gains):
+        line = ["**mean**", str(seconds), ""]
+        for name in SEEN:
+            mean, worst = (statistics.mean(x) for x in zip(*gains[seconds, name], strict=True))
+            line.append(f"{mean:+.2f} / {worst:+.2f}")
+        lines.append(line)
+    return markdown_table(["data", "seconds", "steps", *(f"`{name}`" for name in SEEN)], lines)
+
+
 def page() -> None:
-    """Write the table."""
+    """Write the tables."""
     from where import read_rows
 
     from drgs.studies.tables import fill_between, markdown_table, paragraph
@@ -151,13 +222,21 @@ def page() -> None:
         f"processor time: `python benchmarks/versions.py`, {last['machine']}, {last['date']}, other work running."
     )
     fill_between(PAGE, "versions", text + "\n\n" + markdown_table(["", *scenes], lines))
+    if FIT_ROWS.exists():
+        last = read_rows(FIT_ROWS)[-1]
+        text = paragraph(
+            f"Commit {last['commit']} beside {last['before_commit']}: `python benchmarks/versions.py --fits`, "
+            f"{last['machine']}, {last['date']}."
+        )
+        fill_between(PAGE, "fits", text + "\n\n" + fits_table())
 
 
 def main() -> None:
     """The program."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("before", nargs="?", type=Path, help="checkout that is compared with this one")
-    parser.add_argument("runs", nargs="*", help="fits")
+    parser.add_argument("runs", nargs="*", help="fits; with --fits data sets")
+    parser.add_argument("--fits", type=int, choices=SIZES, help="fit in so many seconds of processor time")
     parser.add_argument("--turns", type=int, default=9)
     parser.add_argument("--page", action="store_true", help="write the table of what is there")
     parser.add_argument("--work", metavar="SCENE", help=argparse.SUPPRESS)
@@ -174,6 +253,12 @@ def main() -> None:
 
     described = ["git", "-C", str(args.before), "rev-parse", "--short", "HEAD"]
     commit = subprocess.run(described, capture_output=True, text=True, check=True).stdout.strip()
+    if args.fits:
+        for data in args.runs:
+            row = fits_compared(args.before, Path(data).resolve(), args.fits) | {"before_commit": commit} | ran()
+            add_row(FIT_ROWS, row)
+            print(row, flush=True)
+        return
     for scene in (CUBE, *args.runs):
         for name, pairs in compared(args.before, scene, args.turns).items():
             row = {
