@@ -436,7 +436,8 @@ def test_held_out_views_are_measured_on_the_way(still, tmp_path, monkeypatch):
     assert plain.metrics["mean"] == found.metrics["mean"]
     measured = json.loads((tmp_path / "run/selection.json").read_text())["measured"]
     assert [(x["views"], x["step"]) for x in measured] == [(2, 4), (3, 8)]
-    assert set(measured[0]["mean"]) == set(measured[0]["median"]) == {*metrics.METRICS, *metrics.OBJECT}  # of masks
+    named = {*metrics.METRICS, *metrics.OBJECT, "depth_error"}  # what is of masks and of depth maps, too
+    assert set(measured[0]["mean"]) == set(measured[0]["median"]) == named
     assert [x["mean"] for x in measured] == own
 
     def killed(self, *arguments):
