@@ -2,7 +2,7 @@
 
     git worktree add ../before COMMIT
     python benchmarks/versions.py ../before [RUN ...] [--turns 9]   rows: benchmarks/versions.jsonl
-    python benchmarks/versions.py ../before --fits 60 DATA ...      rows: benchmarks/versions_fits.jsonl
+    python benchmarks/versions.py --fits 60 ../before DATA ...      rows: benchmarks/versions_fits.jsonl
     python benchmarks/versions.py --page                            the tables of docs/benchmarks-versions.md
 
 One process a checkout, one thread each, taking turns; what counts is the median of the ratios of processor time of two
