@@ -28,6 +28,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 from fits import psnr_by_renderer, split_of  # noqa: E402
+from steps import PATHS, SEEN, lines  # noqa: E402
 from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
 
@@ -37,7 +38,6 @@ from drgs.fitting.frames import Frame, frames_for  # noqa: E402
 from drgs.fitting.start import start_plain  # noqa: E402
 from drgs.fitting.trainer import Trainer  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.studies.statistics import Unit, estimate  # noqa: E402
 from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "overfitting.jsonl"
@@ -45,8 +45,6 @@ PAGE = ROOT / "docs" / "real-data.md"
 CHOOSING = ("banana", "fern", "office", "still0", "room21")
 SHOWING = ("head", "statue", "lego", "street", "watch", "still7", "room22")
 MADE = ("still0", "still7", "room21", "room22")
-PATHS = {"street": "street/sparse_dev/0"}
-SEEN = ("fast", "exact", "gsplat")
 MEASURED = 12  # views of a fit of few, at most
 ON_THE_WAY, WATCHED = 6, 4  # times, and views at most
 KEY = ("scene", "rule", "views", "trained", "seed", "offset", "max_steps", "max_pixels", "max_gaussians")
@@ -129,41 +127,10 @@ def watched(trainer: Trainer, frames: list[Frame], measured: list[Frame], fast: 
     ]
 
 
-Gains = dict[Unit, float]
-"""Unit -> what a rule adds to none, dB."""
-
-
-def gains(rows: list[dict], rule: str, views: int, steps: int, scenes: Sequence[str], seen: str) -> tuple[Gains, Gains]:
-    """Of the mean over measured views, and of the worst one, where both were fitted."""
-    found: tuple[Gains, Gains] = ({}, {})
-    by_key = {tuple(row[name] for name in KEY): row for row in rows}
-    for row in rows:
-        other = by_key.get(tuple((row | {"rule": "none"})[name] for name in KEY))
-        if (row["rule"], row["views"], row["max_steps"]) != (rule, views, steps) or row["scene"] not in scenes:
-            continue
-        if other is None or seen not in row["psnr"] or seen not in other["psnr"]:
-            continue
-        unit = (row["scene"], (8, row["offset"]), (str(row["seed"]),))
-        now, before = row["psnr"][seen], other["psnr"][seen]
-        found[0][unit] = statistics.mean(now) - statistics.mean(before)
-        found[1][unit] = min(now) - min(before)
-    return found
-
-
 def cells(rows: list[dict], rule: str, views: int, steps: int, scenes: Sequence[str]) -> list[str]:
     """Fits, and what a rule adds in each renderer, with the interval over several scenes; empty where none was made."""
-    found: list[str] = []
-    for seen in SEEN:
-        mean, worst = gains(rows, rule, views, steps, scenes, seen)
-        if not mean:
-            found.append("")
-            continue
-        effect = estimate(mean)
-        found.append(f"{effect.mean:+.2f} / {estimate(worst).mean:+.2f}")
-        if effect.scenes > 1:
-            found[-1] += f" [{effect.low:+.2f}, {effect.high:+.2f}]"
-        if seen == SEEN[0]:
-            found.insert(0, str(effect.units))
+    own = [row for row in rows if (row["views"], row["max_steps"]) == (views, steps)]
+    found = lines(own, rule, "fast", scenes, "none")
     return found if any(found) else []
 
 

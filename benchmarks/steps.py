@@ -203,7 +203,7 @@ def gains(
         other = next((x for x in rows if all(x[k] == (row | {"rule": base})[k] for k in KEY)), None)
         if (row["rule"], row["trained"]) != (rule, trained) or row["scene"] not in scenes or other is None:
             continue
-        if seen not in row["psnr"]:
+        if seen not in row["psnr"] or seen not in other["psnr"]:
             continue
         unit = (row["scene"], (8, row["offset"]), (str(row["seed"]),))
         now, before = row["psnr"][seen], other["psnr"][seen]
