@@ -275,6 +275,21 @@ def test_padded():
     assert len({padded(count) for count in range(1025, 2049)}) == 8
 
 
+def test_tails_left_out_of_recorded_lists():
+    """Lists of `exact` leave out what a tile need not look at, unless depth is wanted, as where frames are traced."""
+    normal = torch.randn(3000, 11, generator=torch.Generator().manual_seed(0))
+    shape = {"means": 0.5 * normal[:, :3], "quats": normal[:, 3:7], "log_scales": 0.3 * normal[:, 7:10] - 4}
+    own = {**shape, "logit_opacities": normal[:, 10], "sh": torch.full((3000, 1, 3), 0.3)}
+    g = drgs.Gaussians(**{name: x.clone().requires_grad_() for name, x in own.items()})
+    w2c = np.eye(4)
+    w2c[2, 3] = 3
+    camera = drgs.Camera(K=np.array([[100.0, 0, 48], [0, 100, 32], [0, 0, 1]]), w2c=w2c, width=96, height=64)
+    settings = drgs.RenderSettings.preset("exact")
+    check(g, camera, settings)
+    pairs = [frame(g, camera, settings, outputs)[1]["pairs"] for outputs in ((), ("depth",))]
+    assert 0 < pairs[0] < pairs[1]
+
+
 BESIDE = """
 import threading, time
 import drjit as dr, numpy as np, torch
