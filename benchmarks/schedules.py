@@ -105,6 +105,15 @@ def small(num_downscales: int, until: float) -> Change:
     return change
 
 
+def updates(count: int, num_downscales: int = 1) -> Change:
+    """Steps of several updates, of small photographs at first, then of quarters."""
+
+    def change(trainer: Trainer) -> None:
+        trainer.resolution = Resolution(num_downscales, trainer.config.max_steps, count)
+
+    return change
+
+
 def exact_small(until: float) -> Change:
     """Steps with `exact` see photographs of half the size until a share of the steps."""
 
@@ -189,6 +198,11 @@ CHANGES: dict[str, Change] = {
     "half until 0.5": small(1, 0.5),
     "half until 0.7": small(1, 0.7),
     "quarter until 0.5": small(2, 0.5),
+    "2 updates": updates(2),
+    "3 updates": updates(3),
+    "4 updates": updates(4),
+    "3 updates, never small": updates(3, 0),
+    "3 updates, a quarter at first": updates(3, 2),
     "L2 in the last third": loss(2 / 3, lambda x: 10 * x.square().mean()),
     "L2 from the start": loss(0.0, lambda x: 10 * x.square().mean()),
     "Charbonnier 0.03 in the last third": loss(2 / 3, lambda x: (x.square() + 0.03**2).sqrt().mean()),

@@ -136,6 +136,90 @@ def test_pictures_are_made_once_a_size_and_then_dropped(rng):
     assert Resolution(0, 12).resized(0, frames[0], 0) is frames[0]
 
 
+def test_a_step_has_several_updates_until_it_sees_whole_photographs(rng):
+    """Small ones in the first half, quarters until 0.8 of the steps; with one update a step there are no quarters."""
+    schedule, frames = Resolution(1, 20, 3), [photograph(101, 75, rng)]
+    assert [schedule.updates(step) for step in range(20)] == [3] * 16 + [1] * 4
+    assert [schedule.halvings(step) for step in range(20)] == [1] * 10 + [0] * 10
+    assert [schedule.has_parts(step) for step in range(20)] == [False] * 10 + [True] * 6 + [False] * 4
+    told = {step: events[0] for step in range(20) if (events := schedule.events(step, frames))}
+    assert {step: (e["width"], e["height"], e["updates"]) for step, e in told.items()} == {
+        0: (50, 37, 3),
+        10: (51, 38, 3),
+        16: (101, 75, 1),
+    }
+    assert schedule.describe(told[10]) == "photographs of 51x38, 3 a step"
+    assert schedule.describe(told[16]) == "photographs of 101x75"
+    assert [Resolution(0, 20, 3).has_parts(step) for step in range(20)] == [True] * 16 + [False] * 4
+    assert not any(Resolution(1, 20).has_parts(step) for step in range(20))
+
+
+@pytest.mark.parametrize("size", [(96, 64), (101, 75)], ids=["even", "odd"])
+def test_quarters_are_parts_of_the_photograph(rng, size):
+    """Pixels, mask, alpha and what is transient are those that the quarter's camera shows, and all four are drawn."""
+    width, height = size
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    place = torch.from_numpy(np.stack([x, y, 0 * x], -1).astype(np.float32))
+    plane = place[..., 0] + width * place[..., 1]
+    frame = dataclasses.replace(
+        photograph(*size, rng), pixels=place, mask=plane, alpha=plane, transient=plane.long() % 2 == 1
+    )
+    generator = torch.Generator().manual_seed(0)
+    points = rng.normal(size=(50, 3))
+    whole, depth = frame.camera.project(points)
+    corners = set()
+    for _ in range(40):
+        part = Resolution(0, 10, 2).seen(0, frame, 0, generator)
+        corner = part.pixels[0, 0, :2].tolist()
+        corners.add(tuple(corner))
+        assert part.pixels.shape == ((height + 1) // 2, (width + 1) // 2, 3)
+        assert (part.camera.height, part.camera.width) == part.pixels.shape[:2]
+        assert torch.equal(part.pixels[..., 0] + width * part.pixels[..., 1], part.mask)
+        assert torch.equal(part.alpha, part.mask)
+        assert torch.equal(part.transient, part.mask.long() % 2 == 1)
+        after, same = part.camera.project(points)
+        assert np.allclose(after + corner, whole, rtol=1e-12, atol=1e-9)
+        assert np.array_equal(same, depth)
+    assert corners == {(x, y) for x in (0, width // 2) for y in (0, height // 2)}
+
+
+def test_updates_of_a_step_see_other_photographs(dataset, seen, monkeypatch):  # noqa: F811
+    """Steps go on counting as they did: schedules, density control and renderers by step, photographs by update."""
+    made = trainer_of(dataset, config(max_steps=10, updates_per_step=3))
+    names = []
+    next_view = made._next_view
+
+    def spied() -> int:
+        names.append(next_view())
+        return names[-1]
+
+    monkeypatch.setattr(made, "_next_view", spied)
+    results = [made.step() for _ in range(10)]
+    assert made.step_index == 10
+    assert [side for side, *_ in seen] == [SIZE // 2] * 24 + [SIZE] * 2
+    count = len(made.frames)
+    assert all(sorted(names[k : k + count]) == list(range(count)) for k in range(0, 26 - count, count))
+    assert [result.view for result in results] == [made.frames[names[k]].name for k in [*range(2, 24, 3), 24, 25]]
+
+
+def test_large_photographs_have_several_updates_by_default(dataset, tmp_path, monkeypatch):  # noqa: F811
+    """Of a plain fit; config.json says so, and a fit that was stopped goes on with it, whatever is large then."""
+    monkeypatch.setattr(resolution, "LARGE", SIZE * SIZE)
+
+    def updates(folder: str, steps: int = 4, **use) -> int:
+        given = {name: use.pop(name) for name in ("resume", "begin") if name in use}
+        fit(dataset, tmp_path / folder, config(max_steps=steps, **use), progress=False, **given)
+        return Run(tmp_path / folder).config()["fit"]["data"]["updates_per_step"]
+
+    assert updates("large") == resolution.UPDATES
+    assert updates("active", 12, selection=plan()) == 1
+    assert updates("again", begin=tmp_path / "large" / "state.safetensors") == 1
+    assert updates("stated", updates_per_step=2) == 2
+    monkeypatch.setattr(resolution, "LARGE", SIZE * SIZE + 1)
+    assert updates("large", resume=True) == resolution.UPDATES
+    assert updates("small") == 1
+
+
 def test_steps_alone_see_small_pictures(dataset, tmp_path, seen):  # noqa: F811
     """Steps render 16 pixels until half of them are done, then 32; pictures and PSNR of the run, which are those of its
     Gaussians, have 32 throughout, and the log says when which size began."""
@@ -162,13 +246,16 @@ def test_without_it_nothing_is_told_or_kept(dataset):  # noqa: F811
 
 
 @pytest.mark.same_bits
-def test_a_resumed_fit_has_the_same_bits(dataset, whole_and_resumed, seen):  # noqa: F811
-    """Stopped while pictures are small, a run ends as one without a stop."""
-    runs = whole_and_resumed(dataset, config(max_steps=20, save_every=5, num_downscales=1, deterministic=True), 7)
+@pytest.mark.parametrize(("updates", "stop"), [(1, 7), (3, 12)], ids=["whole", "parts"])
+def test_a_resumed_fit_has_the_same_bits(dataset, whole_and_resumed, seen, updates, stop):  # noqa: F811
+    """Stopped while steps see small photographs, or parts of them, a run ends as one without a stop."""
+    use = {"num_downscales": 1, "updates_per_step": updates, "deterministic": True}
+    runs = whole_and_resumed(dataset, config(max_steps=20, save_every=5, **use), stop)
     states = [load_state(run.state)[0] for run in runs]
     assert states[0].keys() == states[1].keys()
     assert all(torch.equal(x, states[1][name]) for name, x in states[0].items())
-    assert [side for side, *_ in seen][:20] == [SIZE // 2] * 10 + [SIZE] * 10
+    small = 10 if updates == 1 else 16 * updates
+    assert [side for side, *_ in seen][: small + 4] == [SIZE // 2] * small + [SIZE] * 4
 
 
 @pytest.mark.slow

@@ -92,12 +92,25 @@ class DataConfig(Record):
     """
 
     max_pixels: int = option(130_000, "Images are reduced to at most this many pixels.", within=COUNT)
-    num_downscales: int = option(
-        0,
+    updates_per_step: int | None = option(
+        None,
+        "Optimizer updates of a step, each with another photograph: of half the width and height in the first half of"
+        " the steps, then a quarter of it, whole ones in the last fifth; 1: whole ones always; auto: 3, which take as"
+        " long, of photographs of 30,000 pixels and more where nothing moves, no teacher or depth map is fitted to, and"
+        " all views are there from the start.",
+        within=(1, 64),
+        rare=True,
+        none="auto",
+        metavar="N|auto",
+    )
+    num_downscales: int | None = option(
+        None,
         "Start with images of half the width and height, this many times halved; full size is reached in the "
-        "first half of the steps, and no side is below 11 pixels.",
+        "first half of the steps, and no side is below 11 pixels; auto: 1 where a step has several updates, else 0.",
         within=(0, 16),
         rare=True,
+        none="auto",
+        metavar="N|auto",
     )
     init_points: InitPoints = option(
         "auto",

@@ -1,71 +1,126 @@
-"""Coarse to fine: the first steps are fitted to photographs of half, a quarter ... of the width and height.
+"""What each step sees of the photographs: small ones at first, then parts of them, whole ones at the end.
 
-Early steps fit large structures alone, which a small photograph shows at a fraction of the cost. With n downscales
-the first steps see photographs of 1 / 2^n of the width and height, which double after equal shares of the steps, until
-from `FULL` of the steps on they have the size of the fit. What a step sees depends on its number alone. The idea is
-that of Nerfstudio's splatfacto [1], which counts steps where this has a fraction of them.
+**Coarse to fine.** Early steps fit large structures alone, which a small photograph shows at a fraction of the cost.
+With n downscales the first steps see photographs of 1 / 2^n of the width and height, which double after equal shares of
+the steps, until from `FULL` of the steps on they have the size of the fit. The idea is that of Nerfstudio's splatfacto
+[1], which counts steps where this has a fraction of them.
 
-Only steps see small photographs. Whatever measures, compares, samples or chooses has those of the fit: metrics and
-previews, transients, the 3D filter, reach and information of poses, active views.
+**Mini-batches.** On a CPU a step takes as long as it has pixels, and what a short fit lacks is optimizer updates: so a
+step can be several of them, each with a small photograph, or with a quarter of one of full size, drawn at random.
+Averaging over all pixels of a photograph pays at the end, from `WHOLE` of the steps on. gsplat's trainer has crops, too
+(`patch_size`, [2]), a step each.
 
-Reference:
+Only steps see parts and small photographs. Whatever measures, compares, samples or chooses has those of the fit:
+metrics and previews, transients, the 3D filter, reach and information of poses, active views.
+
+References:
     [1] Tancik et al., "Nerfstudio: A Modular Framework for Neural Radiance Field Development", SIGGRAPH 2023.
+    [2] Ye et al., "gsplat: An Open-Source Library for Gaussian Splatting", JMLR 2025.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import statistics
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
 
+from drgs.cameras.sizes import cropped
 from drgs.data.resampling import resize_area
 
 if TYPE_CHECKING:
+    from drgs.fitting.components.base import Setup
+    from drgs.fitting.config import FitConfig
     from drgs.fitting.frames import Frame
 
-__all__ = ["FULL", "Resolution", "halved_size"]
+__all__ = ["FULL", "LARGE", "UPDATES", "WHOLE", "Resolution", "default_updates", "halved_size"]
 
 FULL = 1 / 2
 """Fraction of the steps from which on photographs have the size of the fit; chosen (docs/one-model.md has its gain)."""
+
+WHOLE = 0.8
+"""Fraction of the steps from which on an update sees a whole photograph: density control ends there, too."""
+
+LARGE = 30_000
+"""Pixels of a photograph, the median, from which on a step of a plain fit is several updates (docs/one-model.md)."""
+
+UPDATES = 3
+"""Updates of such a step: of half the width and height, or of a quarter, they take as long as one of all pixels."""
 
 _LEAST = 11  # pixels of the shorter side: the window of SSIM (losses.py) is as wide
 
 
 class Resolution:
-    """The size of the photographs in each step.
+    """How many updates a step has, and what each sees of its photograph.
 
     Attributes:
-        num_downscales: How many times they are halved at the start.
+        num_downscales: How many times photographs are halved at the start.
     """
 
-    def __init__(self, num_downscales: int, max_steps: int) -> None:
+    def __init__(self, num_downscales: int, max_steps: int, updates: int = 1) -> None:
         """
         Args:
             num_downscales: How many times photographs are halved at the start.
             max_steps: Steps of the fit.
+            updates: Updates of a step that does not see whole photographs.
         """
         self.num_downscales = num_downscales
+        self._updates = updates
         self._ends = [round(FULL * max_steps * (k + 1) / num_downscales) for k in range(num_downscales)]
+        self._parts_end = round(WHOLE * max_steps) if updates > 1 else 0
         self._kept: dict[int, tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]] = {}
         self._kept_at = 0
+
+    @classmethod
+    def of(cls, config: FitConfig) -> Resolution:
+        """That of a fit."""
+        updates = config.data.updates_per_step or 1
+        halved = config.data.num_downscales
+        return cls(int(updates > 1) if halved is None else halved, config.max_steps, updates)
 
     def halvings(self, step: int) -> int:
         """How many times photographs are halved in a step (from 0); those that are small already, less often."""
         return sum(step < end for end in self._ends)
 
+    def has_parts(self, step: int) -> bool:
+        """Whether the updates of a step (from 0) see quarters of photographs."""
+        return step < self._parts_end and not self.halvings(step)
+
+    def updates(self, step: int) -> int:
+        """Updates of a step (from 0)."""
+        return self._updates if self.halvings(step) or self.has_parts(step) else 1
+
     def events(self, step: int, frames: list[Frame]) -> list[dict]:
-        """What is to be logged before a step: the size, of the first photograph, that it begins to have at this one."""
-        halvings = self.halvings(step)
-        if step and halvings == self.halvings(step - 1) or not self.num_downscales:
+        """What is to be logged before a step: what it begins to see, of the first photograph."""
+        kind = (self.halvings(step), self.has_parts(step))
+        before = (self.halvings(step - 1), self.has_parts(step - 1)) if step else (0, False)
+        if kind == before:
             return []
-        width, height = halved_size(frames[0].camera.width, frames[0].camera.height, halvings)
-        return [{"event": "resolution", "halvings": halvings, "width": width, "height": height}]
+        width, height = halved_size(frames[0].camera.width, frames[0].camera.height, kind[0])
+        if kind[1]:
+            width, height = _half_up(width), _half_up(height)
+        updates = {"updates": self.updates(step)} if self._updates > 1 else {}
+        return [{"event": "resolution", "halvings": kind[0], "width": width, "height": height, **updates}]
 
     def describe(self, event: Mapping[str, Any]) -> str | None:
         """The line on stderr for an event of its own; None for others."""
-        return f"photographs of {event['width']}x{event['height']}" if event["event"] == "resolution" else None
+        if event["event"] != "resolution":
+            return None
+        updates = event.get("updates", 1)
+        return f"photographs of {event['width']}x{event['height']}" + (f", {updates} a step" if updates > 1 else "")
+
+    def seen(self, index: int, frame: Frame, step: int, generator: torch.Generator) -> Frame:
+        """What an update sees of a photograph.
+
+        Args:
+            index: Index of the photograph among those of the fit.
+            frame: The photograph at the size of the fit, whose camera may have a pose that is fitted.
+            step: The step, from 0.
+            generator: Draws the quarter.
+        """
+        return _quarter(frame, generator) if self.has_parts(step) else self.resized(index, frame, step)
 
     def resized(self, index: int, frame: Frame, step: int) -> Frame:
         """A photograph at the size of a step: area averages of pixels, mask and alpha, with the camera of that size.
@@ -100,11 +155,43 @@ class Resolution:
         )
 
 
+def default_updates(setup: Setup) -> int:
+    """`updates_per_step` of a fit that states none: several where photographs are large, in fits of the kind that this
+    was measured in: nothing moves, no teacher or depth map is fitted to, all views are fitted to from the start, and it
+    begins with points.
+    """
+    config = setup.config
+    pixels = [frame.camera.width * frame.camera.height for frame in setup.frames]
+    is_plain = not (setup.modes & {"selection", "begin"} or setup.times or config.loss.depth != "off")
+    is_plain = is_plain and all(frame.teacher is None for frame in setup.frames)
+    return UPDATES if is_plain and statistics.median(pixels) >= LARGE else 1
+
+
 def halved_size(width: int, height: int, times: int) -> tuple[int, int]:
     """(width, height) of an image halved so many times, rounded down, or as often as the window of SSIM fits in."""
     while times and min(width, height) >> times < _LEAST:
         times -= 1
     return width >> times, height >> times
+
+
+def _half_up(side: int) -> int:
+    """Pixels of a half of a side, rounded up: halves of an odd one share a pixel."""
+    return (side + 1) // 2
+
+
+def _quarter(frame: Frame, generator: torch.Generator) -> Frame:
+    """One of the four quarters of a photograph, with the camera that shows it."""
+    whole = frame.camera
+    width, height = _half_up(whole.width), _half_up(whole.height)
+    right, low = torch.randint(2, (2,), generator=generator).tolist()
+    x, y = right * (whole.width - width), low * (whole.height - height)
+    pixels, mask, alpha, transient = (
+        None if values is None else values[y : y + height, x : x + width].contiguous()
+        for values in (frame.pixels, frame.mask, frame.alpha, frame.transient)
+    )
+    assert pixels is not None
+    camera = cropped(whole, x, y, width, height)
+    return dataclasses.replace(frame, camera=camera, pixels=pixels, mask=mask, alpha=alpha, transient=transient)
 
 
 def _averaged(values: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:

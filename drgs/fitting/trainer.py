@@ -45,12 +45,12 @@ _RESERVED = {"parameter", "adam", "rng", "queue", "policy_rng"}
 
 @dataclasses.dataclass(frozen=True)
 class StepResult:
-    """Result of one step.
+    """Result of one step, of its last update where it has several.
 
     Attributes:
-        loss: Loss of its view, before the step, as all of these.
+        loss: Loss of its view, before the update, as all of these.
         terms: Terms of the loss by name, those that this view has.
-        psnr: PSNR of this view in dB, at the size that the step saw it; None where it is not finite.
+        psnr: PSNR of this view in dB, of what the update saw of it; None where it is not finite.
         view: Its name.
         events: What is to be logged.
     """
@@ -109,7 +109,7 @@ class Trainer:
         self.extent = extent
         self.components = components_of() if components is None else components
         self.renderers = RendererSchedule.of(config.renderers, config.settings, config.max_steps)
-        self.resolution = Resolution(config.data.num_downscales, config.max_steps)
+        self.resolution = Resolution.of(config)
         self.step_index = self.bad_steps = self._bad_in_a_row = 0
         self._bad: str | None = None  # what was not finite first
         self.generator = torch.Generator().manual_seed(config.seed)
@@ -242,7 +242,7 @@ class Trainer:
             raise ValueError(f"fit: steps must be more than the {self.step_index} done, got {max_steps}; ask for more")
         self.config = self.config.replace(max_steps=max_steps)
         self.renderers = RendererSchedule.of(self.config.renderers, self.config.settings, max_steps)
-        self.resolution = Resolution(self.config.data.num_downscales, max_steps)
+        self.resolution = Resolution.of(self.config)
 
     def trial(self, config: FitConfig, frames: list[Frame], rows: GaussianRows, component: Component) -> Trainer:
         """See `Fit`."""
@@ -252,22 +252,29 @@ class Trainer:
     # ------------------------------------------------------------------------------------------------------- a step
 
     def step(self) -> StepResult:
-        """One view, one optimizer step, and what is due at it.
+        """What is due at a step, and its optimizer updates: one, with one view, or several (resolution.py).
 
         Raises:
-            ValueError: After 10 steps in a row without a finite loss and gradient.
+            ValueError: After 10 updates in a row without a finite loss and gradient.
         """
         done = self.step_index
         events = [event for component in self.components for event in component.before_density(self)]
         events += self.resolution.events(done, self.frames)
         events += self._prepare(done)
         events += [event for component in self.components for event in component.before_step(self)]
+        for _ in range(self.resolution.updates(done)):
+            result = self._update(done, events)
+        self.step_index += 1
+        return result
+
+    def _update(self, done: int, events: list[dict]) -> StepResult:
+        """One view, one optimizer update; `events` gets what is to be logged."""
         index = self._next_view()
         frame = self.frames[index]
         gaussians = self._scene().at(frame.camera.time)
         for component in self.components:
             frame = component.frame(self, frame)
-        frame = self.resolution.resized(index, frame, done)
+        frame = self.resolution.seen(index, frame, done, self.generator)
         out = self.as_photograph(self._rendered(gaussians, frame), frame)
         loss, values = self._loss(out, frame, gaussians)
         networks = self.networks
@@ -288,7 +295,6 @@ class Trainer:
             self._explore(done)
         else:
             events.append(self._skip(bad, frame))
-        self.step_index += 1
         psnr = psnr_of(mse) if math.isfinite(mse) else None
         return StepResult(float(loss.detach()), values, psnr, frame.name, events)  # logged, not optimized
 
@@ -395,6 +401,9 @@ class Trainer:
         before = FitConfig.from_json(header["config"])
         if config.renderers == AUTO and config.settings == before.settings:
             config = config.replace(renderers=before.renderers)  # `auto` keeps the renderers that the fit began with
+        for name in ("updates_per_step", "num_downscales"):
+            if getattr(config.data, name) is None:
+                config = config.replace(**{name: getattr(before.data, name)})  # likewise
         if other := config.difference(before):
             name, now, was = other
             raise ValueError(

@@ -55,7 +55,8 @@ _LEAST_NOISE = 0.01  # of a log color: a byte's rounding at mid-gray
 _SHARED_POINTS = 8  # points that two photographs must share for their gains to be compared; chosen, not tuned
 _RATE = 1e-3  # learning rate of natural log gains: a factor of e in 1,000 steps; chosen
 _CLEAR_STOPS = 0.1  # stops: three times what two sets of points of one capture differ by in what they say
-_TRIAL = {"max_steps": 200, "max_gaussians": 8_000, "num_downscales": 0}  # of a short fit that tries gains
+# Of a short fit that tries gains.
+_TRIAL = {"max_steps": 200, "max_gaussians": 8_000, "updates_per_step": 1, "num_downscales": 0}
 _TRIAL_PIXELS = 12_000  # of its photographs; two such fits take 10 to 20 s on one core
 _TRIAL_EVERY = 5  # photographs of which it holds one out
 _LEAST_LOWERED = 0.05  # of the error of held-out halves, at least; captures of one exposure have up to 0.02, by chance
