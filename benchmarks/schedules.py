@@ -7,12 +7,10 @@
 
 Appends one row a fit to benchmarks/schedules.jsonl as it ends and leaves out what is there. A change is made to the
 trainer before the first step; "a + b" makes both. Seconds are those that the process computed in its steps, whatever
-ran beside it; with more `--steps`, a change that makes steps cheaper has as much time as the fit without it. One
-thread. Made scenes are folders of `--made` (docs/real-data.md has their commands).
+ran beside it. One thread. Made scenes are folders of `--made` (docs/real-data.md has their commands).
 
 `--times` fits nothing: it takes `FITS/SCENE`, a run folder, and times rendering, loss and derivatives of two of its
-photographs in turns, by renderer and at a half and a quarter of the width and height; rows: schedule_times.jsonl. The
-steps of EQUAL_TIME are from these times: fits of this many took as long on one thread of a CPU.
+photographs in turns, by renderer and at a half and a quarter of the width and height; rows: schedule_times.jsonl.
 """
 
 from __future__ import annotations
@@ -59,22 +57,6 @@ TIMES = ROOT / "benchmarks" / "schedule_times.jsonl"
 SCENES = ("banana", "fern", "office", "still0", "room21")
 SEEN = ("exact", "fast", "gsplat", "3dgut")
 KEY = ("scene", "change", "trained", "seed", "offset", "max_steps", "max_pixels", "max_gaussians")
-
-LARGE = {"max_pixels": 130_000, "max_gaussians": 30_000}
-EQUAL_TIME = {
-    "exact to 0": 480,
-    "exact to 0.01": 700,
-    "exact to 0.01 + half until 0.5": 1000,
-    "exact to 0.01 + half until 0.7": 1200,
-    "exact to 0.01 + exact at half until 0.8": 880,
-}
-"""Steps, at `LARGE` and for `any`, that take equally long on one thread of a CPU, within 10 %."""
-PAIRS = (
-    ("exact to 0.01", "exact to 0"),
-    ("exact to 0.01 + half until 0.5", "exact to 0.01"),
-    ("exact to 0.01 + half until 0.7", "exact to 0.01 + half until 0.5"),
-    ("exact to 0.01 + exact at half until 0.8", "exact to 0.01"),
-)
 
 Change = Callable[[Trainer], None]
 
@@ -268,47 +250,51 @@ def times(scene: str, run: Path, max_pixels: int) -> dict:
     return {"scene": scene, "size": size, "gaussians": len(gaussians), "seconds": seconds, **ran()}
 
 
-def gains(rows: list[dict], change: str, other: str, seen: str) -> dict[str, tuple[float, float]]:
-    """Scene -> what one change adds to another in equal time, dB: of the mean, and of the worst held-out view."""
-    views = {
-        (row["scene"], row["change"]): row["psnr"][seen]
-        for row in rows
-        if row["max_steps"] == EQUAL_TIME.get(row["change"]) and all(row[name] == x for name, x in LARGE.items())
-    }
-    scenes = [scene for scene, named in views if named == change and (scene, other) in views]
-    pairs = {scene: (views[scene, change], views[scene, other]) for scene in scenes}
-    return {
-        scene: (statistics.mean(now) - statistics.mean(before), min(now) - min(before))
-        for scene, (now, before) in pairs.items()
-    }
+def gain(pairs: list[tuple[dict, dict]], seen: str) -> str:
+    """What fits have over others in a renderer, dB: of the mean, and of the worst held-out view, with an interval."""
+    units = [(row["scene"], (8, row["offset"]), (str(row["seed"]),)) for row, _ in pairs]
+    effects = [
+        estimate(
+            {
+                unit: of(row["psnr"][seen]) - of(other["psnr"][seen])
+                for unit, (row, other) in zip(units, pairs, strict=True)
+            }
+        )
+        for of in (statistics.mean, min)
+    ]
+    interval = f" [{effects[0].low:+.2f}, {effects[0].high:+.2f}]" if effects[0].scenes > 2 else ""
+    return f"{effects[0].mean:+.2f} / {effects[1].mean:+.2f}{interval}"
+
+
+def updates_table(rows: list[dict]) -> list[list[str]]:
+    """Lines: what several updates a step add in as many steps, by kind of fit and by capture, and the time."""
+    whole = {tuple(row[name] for name in KEY): row for row in rows if row["change"] == "none"}
+    kinds: dict[tuple, list[tuple[dict, dict]]] = {}
+    for row in rows:
+        other = whole.get(tuple((row | {"change": "none"})[name] for name in KEY))
+        if "updates" in row["change"] and other is not None:
+            kinds.setdefault(tuple(row[name] for name in ("change", "max_pixels", "max_steps")), []).append(
+                (row, other)
+            )
+    lines = []
+    for (change, pixels, steps), pairs in sorted(kinds.items()):
+        scenes = list(dict.fromkeys(row["scene"] for row, _ in pairs))
+        for some in [*([scene] for scene in scenes), *([scenes] if len(scenes) > 1 else [])]:
+            own = [pair for pair in pairs if pair[0]["scene"] in some]
+            name = some[0] if len(some) == 1 else f"**these {len(some)}**"
+            ratio = statistics.mean(row["seconds"] / other["seconds"] for row, other in own)
+            cells = [gain(own, seen) for seen in SEEN]
+            lines.append([change, f"{pixels:,}", f"{steps:,}", name, *cells, f"{ratio:.2f}"])
+    return lines
 
 
 def write_page() -> None:
     """The tables of the page, and the data files."""
     rows = read_rows(ROWS)
-    lines = []
-    for change, other in PAIRS:
-        by_seen = {seen: gains(rows, change, other, seen) for seen in SEEN}
-        for scene in by_seen["fast"]:
-            cells = [f"{mean:+.2f} / {worst:+.2f}" for mean, worst in (by_seen[seen][scene] for seen in SEEN)]
-            lines.append([change, other, scene, *cells])
-        if len(by_seen["fast"]) > 2:  # an interval of two is none
-            cells = []
-            for found in by_seen.values():
-                means, worsts = (
-                    estimate({(scene, (), ()): pair[i] for scene, pair in found.items()}) for i in range(2)
-                )
-                cells.append(f"{means.mean:+.2f} / {worsts.mean:+.2f} [{means.low:+.2f}, {means.high:+.2f}]")
-            lines.append([change, other, f"**{len(by_seen['fast'])} captures**", *cells])
-    heads = ["steps", "instead of", "capture", *(f"`{seen}`" for seen in SEEN)]
-    write_csv(PAGE_DATA / "schedules-equal-time.csv", [heads, *lines])
-    short = [line for line in lines if line[0] == PAIRS[0][0] or line[0] == PAIRS[1][0]]
-    names = {PAIRS[0][0]: "a tolerance", PAIRS[1][0]: "half the size"}
-    fill_between(
-        PAGE,
-        "equal_time",
-        markdown_table(["with", *heads[2:]], [[names[line[0]], *line[2:]] for line in short]),
-    )
+    heads = ["a step has", "pixels", "steps", "capture", *(f"`{seen}`" for seen in SEEN), "time"]
+    lines = updates_table(rows)
+    write_csv(PAGE_DATA / "schedules-updates.csv", [heads, *lines])
+    fill_between(PAGE, "updates", markdown_table(heads[1:], [line[1:] for line in lines if line[0] == "3 updates"]))
     timed, shares = [], []
     for row in read_rows(TIMES):
         took, size = row["seconds"], "x".join(map(str, row["size"]))
