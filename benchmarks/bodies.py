@@ -31,6 +31,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
+from pages import fill_between  # noqa: E402
 from studies import write_csv  # noqa: E402
 from where import DATA, add_row, ran, read_rows  # noqa: E402
 
@@ -42,7 +43,7 @@ from drgs.fitting.frames import Frame, load_frames  # noqa: E402
 from drgs.fitting.metrics import psnr  # noqa: E402
 from drgs.fitting.records import load_run  # noqa: E402
 from drgs.integrator import render  # noqa: E402
-from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
+from drgs.studies.tables import markdown_table  # noqa: E402
 from drgs.train import fit  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "bodies.jsonl"

@@ -16,6 +16,7 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from pages import fill_between
 from studies import PAGE_DATA, ROOT, write_csv
 
 from drgs.studies.rows import read_study
@@ -29,7 +30,7 @@ from drgs.studies.statistics import (
     values_of,
     view_counts,
 )
-from drgs.studies.tables import fill_between, markdown_table
+from drgs.studies.tables import markdown_table
 
 Rows = Sequence[dict[str, Any]]
 

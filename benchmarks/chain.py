@@ -20,6 +20,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks"), str(ROOT / "tests")]
 import dense_jacobian  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
+from pages import fill_between  # noqa: E402
 from scenes_random import camera, gaussians  # noqa: E402
 from studies import rank_correlation, read_rows, write_csv, write_rows  # noqa: E402
 from where import ran  # noqa: E402
@@ -27,7 +28,7 @@ from where import ran  # noqa: E402
 from drgs import reference  # noqa: E402
 from drgs.gain import dense  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.studies.tables import fill_between, markdown_table, paragraph  # noqa: E402
+from drgs.studies.tables import markdown_table, paragraph  # noqa: E402
 
 RESULTS = ROOT / "benchmarks" / "chain.json"
 DATA = ROOT / "docs" / "data" / "criteria.csv"

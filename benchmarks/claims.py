@@ -21,6 +21,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: tor
 import numpy as np
 import studies
 import torch
+from pages import fill_between
 from studies import ROOT
 from where import ran
 
@@ -39,7 +40,7 @@ from drgs.lab.accuracy import (
     squares,
 )
 from drgs.settings import RenderSettings
-from drgs.studies.tables import fill_between, markdown_table, paragraph
+from drgs.studies.tables import markdown_table, paragraph
 
 RESULTS = ROOT / "benchmarks" / "claims.json"
 PAGE = ROOT / "docs" / "numerics.md"

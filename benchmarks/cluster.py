@@ -24,6 +24,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: torch's threads shall not spin
 
 import numpy as np  # noqa: E402
+from pages import fill_between  # noqa: E402
 from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
@@ -32,7 +33,6 @@ from drgs.cluster.connect import opened  # noqa: E402
 from drgs.cluster.payloads import Payload  # noqa: E402
 from drgs.io.outputs import write_json  # noqa: E402
 from drgs.select import Selection, select  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
 
 KNOWN = 4
 SIZE = 160, 120

@@ -26,6 +26,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
+from pages import fill_between  # noqa: E402
 from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
@@ -35,7 +36,7 @@ from drgs.commands.options import Share  # noqa: E402
 from drgs.commands.share import shared_of  # noqa: E402
 from drgs.integrator import render  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
+from drgs.studies.tables import markdown_table  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "codecs.jsonl"
 PAGE = ROOT / "docs" / "files.md"

@@ -24,6 +24,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: tor
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from clocks import interleaved  # noqa: E402
+from pages import fill_between  # noqa: E402
 from studies import PAGE_DATA, rank_correlation, write_csv  # noqa: E402
 from where import ran  # noqa: E402
 
@@ -36,7 +37,7 @@ from drgs.files import Run  # noqa: E402
 from drgs.fisher import SemanticMetric  # noqa: E402
 from drgs.fitting.records import load_run  # noqa: E402
 from drgs.gain import information_gain  # noqa: E402
-from drgs.studies.tables import fill_between, paragraph  # noqa: E402
+from drgs.studies.tables import paragraph  # noqa: E402
 
 Preset = drgs.RenderSettings.preset
 GEOMETRY = ("means", "rotations", "log_scales", "logit_opacities")

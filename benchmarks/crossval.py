@@ -35,6 +35,7 @@ from pathlib import Path
 
 import studies
 import torch
+from pages import fill_between  # noqa: E402
 from studies import DATA, ROOT
 
 import sys  # isort: skip
@@ -55,7 +56,7 @@ from drgs.lab.crossval import VERDICTS, Result, crops, crossval  # noqa: E402
 from drgs.lab.parameters import PARAMETERS, POSE_END, raw_of, with_pose  # noqa: E402
 from drgs.lab.rasterizers import cotangents, function, load_rasterizer  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
+from drgs.studies.tables import markdown_table  # noqa: E402
 from drgs.testing import random_scene  # noqa: E402
 
 BACKGROUND = (0.3, 0.6, 0.2)

@@ -30,6 +30,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: tor
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from clocks import interleaved  # noqa: E402
+from pages import fill_between  # noqa: E402
 from studies import rank_correlation, write_csv  # noqa: E402
 from where import ran  # noqa: E402
 
@@ -39,7 +40,7 @@ from drgs.cameras import Camera, orbit  # noqa: E402
 from drgs.deform import DeformationField, DynamicGaussians, FieldConfig  # noqa: E402
 from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.gain import Information, information_gain  # noqa: E402
-from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
+from drgs.studies.tables import markdown_table  # noqa: E402
 
 FAST = drgs.RenderSettings.preset("fast")
 COUNTS = (1, 2, 4, 8, 16)

@@ -31,6 +31,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 import numpy as np  # noqa: E402
 from fits import psnr_by_renderer, split_of  # noqa: E402
+from pages import fill_between  # noqa: E402
 from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
 
@@ -43,7 +44,7 @@ from drgs.fitting.metrics import evaluate  # noqa: E402
 from drgs.fitting.start import start  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.studies.statistics import Unit, estimate  # noqa: E402
-from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
+from drgs.studies.tables import markdown_table  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "depths.jsonl"
 PAGE = ROOT / "docs" / "real-data.md"

@@ -31,6 +31,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: tor
 import cubes  # noqa: E402
 import torch  # noqa: E402
 from clocks import interleaved  # noqa: E402
+from pages import fill_between  # noqa: E402
 from studies import write_csv  # noqa: E402
 from where import ran  # noqa: E402
 
@@ -47,7 +48,7 @@ from drgs.fitting.records import load_run  # noqa: E402
 from drgs.fitting.rows import GaussianRows  # noqa: E402
 from drgs.fitting.trainer import Trainer  # noqa: E402
 from drgs.select import Scoring, select  # noqa: E402
-from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
+from drgs.studies.tables import markdown_table  # noqa: E402
 
 TIMES = 40
 CAMERAS = 15

@@ -23,12 +23,13 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: tor
 
 import torch  # noqa: E402
 from clocks import interleaved  # noqa: E402
+from pages import fill_between  # noqa: E402
 from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
 from drgs.cameras import Camera, orbit  # noqa: E402
 from drgs.ellipsoids import Gaussians  # noqa: E402
-from drgs.studies.tables import fill_between, markdown_table, paragraph  # noqa: E402
+from drgs.studies.tables import markdown_table, paragraph  # noqa: E402
 
 MITSUBA = drgs.RenderSettings.preset("mitsuba")
 OFF = 1e-3

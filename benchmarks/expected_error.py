@@ -23,6 +23,7 @@ os.environ.setdefault("DRGS_THREADS", "1")
 import numpy as np
 import studies
 import torch
+from pages import fill_between
 from studies import ROOT
 from where import add_row, ran, read_rows
 
@@ -33,7 +34,7 @@ from drgs.fitting.frames import Frame, frames_for, load_dataset
 from drgs.fitting.records import load_run
 from drgs.gain import Prior, variances
 from drgs.information.expected_error import PARTS, error_parts, error_record
-from drgs.studies.tables import fill_between, markdown_table, paragraph
+from drgs.studies.tables import markdown_table, paragraph
 
 CHOOSING = ("banana", "fern", "office", "still0", "room21")
 MADE = ("still0", "room21", "still7", "room22")

@@ -29,10 +29,11 @@ import cubes  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from clocks import in_turns  # noqa: E402
+from pages import fill_between  # noqa: E402
 from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
-from drgs.studies.tables import fill_between, paragraph  # noqa: E402
+from drgs.studies.tables import paragraph  # noqa: E402
 from drgs.tracing import weights  # noqa: E402
 from drgs.tracing.tiles import TileTraversal  # noqa: E402
 

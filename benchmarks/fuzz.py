@@ -37,10 +37,11 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 from clocks import processor_seconds  # noqa: E402
 from fuzz_targets import TARGETS, Bench  # noqa: E402
 from fuzz_worker import SLOW  # noqa: E402
+from pages import fill_between  # noqa: E402
 from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import ran  # noqa: E402
 
-from drgs.studies.tables import fill_between, paragraph  # noqa: E402
+from drgs.studies.tables import paragraph  # noqa: E402
 
 COUNTS = ROOT / "benchmarks" / "fuzz.json"
 PAGE = ROOT / "docs" / "reliability.md"

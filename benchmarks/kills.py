@@ -26,12 +26,12 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 import torch  # noqa: E402
+from pages import fill_between  # noqa: E402
 from where import ran  # noqa: E402
 
 from drgs.files import Run, load_ply, load_state  # noqa: E402
 from drgs.io import atomic  # noqa: E402
 from drgs.scenes import kitchen, room, still_life  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
 
 SIZE = {"width": 48, "height": 36, "spp": 2, "seed": 1}
 MAPS = {"teacher_width": 12, "teacher_height": 9}

@@ -38,6 +38,7 @@ os.environ.setdefault("DRGS_THREADS", "1")
 
 import numpy as np
 import studies
+from pages import fill_between
 from policies import Rows
 from studies import DIFFERENCE, ROOT, difference
 
@@ -45,7 +46,7 @@ from drgs.studies import experiments
 from drgs.studies.cells import Study
 from drgs.studies.rows import read_study
 from drgs.studies.statistics import FEWEST_UNITS, coverage, differences, estimate, unit_of, values_of
-from drgs.studies.tables import fill_between, markdown_table, paragraph
+from drgs.studies.tables import markdown_table, paragraph
 
 PAGE = ROOT / "docs" / "dynamic.md"
 DATA = ROOT / "docs" / "data"

@@ -24,6 +24,7 @@ import numpy as np
 import studies
 import torch
 from expected_error import ause
+from pages import fill_between
 from studies import ROOT
 from where import add_row, ran, read_rows
 
@@ -35,7 +36,7 @@ from drgs.fitting.frames import Frame, frames_for, load_dataset
 from drgs.fitting.records import LoadedRun, load_run
 from drgs.fitting.semantic_errors import feature_record, feature_residual, label_record, wrong_label
 from drgs.gain import Prior, variances
-from drgs.studies.tables import fill_between, markdown_table, paragraph
+from drgs.studies.tables import markdown_table, paragraph
 
 CHOOSING = ("room21",)
 ROWS = ROOT / "benchmarks" / "label_errors.jsonl"

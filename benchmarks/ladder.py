@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import studies
+from pages import fill_between
 from studies import ROOT
 
 import drgs
@@ -35,7 +36,7 @@ from drgs.fitting.records import fit_record
 from drgs.lab.ladder import Pictures, ladder
 from drgs.lab.parameters import PARAMETERS
 from drgs.settings import RenderSettings
-from drgs.studies.tables import fill_between, markdown_table, paragraph
+from drgs.studies.tables import markdown_table, paragraph
 
 FOVS = (20, 45, 70, 95, 120)
 STARTS = ("inria", "gsplat")

@@ -23,13 +23,14 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: torch's threads shall not spin
 
 import numpy as np  # noqa: E402
+from pages import fill_between  # noqa: E402
 from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
 from drgs.cameras import Camera, intrinsics_from_fov, look_at  # noqa: E402
 from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.select import Cache, select  # noqa: E402
-from drgs.studies.tables import fill_between, paragraph  # noqa: E402
+from drgs.studies.tables import paragraph  # noqa: E402
 
 KNOWN = 2
 CANDIDATES = 24

@@ -32,6 +32,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 import numpy as np  # noqa: E402
 from fits import Fit, fitted  # noqa: E402
+from pages import fill_between  # noqa: E402
 from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
@@ -41,7 +42,7 @@ from drgs.meshing.extraction import TriangleMesh, deviations_of, mesh_of_depths 
 from drgs.meshing.options import MeshOptions  # noqa: E402
 from drgs.scenes import room, still_life  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
+from drgs.studies.tables import markdown_table  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "mesh.jsonl"
 PAGE = ROOT / "docs" / "mesh.md"

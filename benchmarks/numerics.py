@@ -18,13 +18,14 @@ from typing import Any
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: torch's threads shall not spin
 
 import studies
+from pages import fill_between
 from studies import ROOT
 from where import ran
 
 from drgs.commands.stress import COLUMNS, markdown
 from drgs.lab.extremes import CASES, REFUSALS
 from drgs.lab.stress import BOUNDS, rows
-from drgs.studies.tables import fill_between, markdown_table, paragraph
+from drgs.studies.tables import markdown_table, paragraph
 
 RESULTS = ROOT / "benchmarks" / "numerics.json"
 PAGE = ROOT / "docs" / "numerics.md"

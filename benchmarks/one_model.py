@@ -26,6 +26,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 from fits import fitted, psnr_by_renderer  # noqa: E402
+from pages import fill_between  # noqa: E402
 from studies import PAGE_DATA, table_lines, write_csv  # noqa: E402
 from where import UNITS, add_row, ran, read_rows  # noqa: E402
 
@@ -34,7 +35,7 @@ from drgs.fitting.frames import frames_for  # noqa: E402
 from drgs.fitting.renderers import ANY, RendererSchedule, renderers_to_measure  # noqa: E402
 from drgs.settings import PRESETS, RenderSettings  # noqa: E402
 from drgs.studies.statistics import Unit, estimate  # noqa: E402
-from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
+from drgs.studies.tables import markdown_table  # noqa: E402
 
 SHOWN = tuple(name for name in ANY if name != "inria")  # on the pages; of `inria` there is one seed
 ROWS = ROOT / "benchmarks" / "one_model.jsonl"

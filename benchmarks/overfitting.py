@@ -28,6 +28,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 from fits import psnr_by_renderer, split_of  # noqa: E402
+from pages import fill_between  # noqa: E402
 from steps import PATHS, SEEN, lines  # noqa: E402
 from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
@@ -38,7 +39,7 @@ from drgs.fitting.frames import Frame, frames_for  # noqa: E402
 from drgs.fitting.start import start_plain  # noqa: E402
 from drgs.fitting.trainer import Trainer  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
+from drgs.studies.tables import markdown_table  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "overfitting.jsonl"
 PAGE = ROOT / "docs" / "real-data.md"

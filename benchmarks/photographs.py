@@ -26,13 +26,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
+from pages import fill_between  # noqa: E402
 from studies import PAGE_DATA, table_lines, write_csv  # noqa: E402
 from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
 
 from drgs.data import load  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.studies.statistics import estimate  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
 from drgs.train import fit  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "photographs.jsonl"

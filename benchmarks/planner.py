@@ -35,13 +35,14 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks"), str(ROOT / "examples")]
 import dataclasses  # noqa: E402
 
 import numpy as np  # noqa: E402
+from pages import fill_between  # noqa: E402
 from plan_views import depth_of, psnr  # noqa: E402
 from studies import rank_correlation  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
 import drgs  # noqa: E402
 from drgs.runtime.machine import peak_memory  # noqa: E402
-from drgs.studies.tables import fill_between, markdown_table, paragraph  # noqa: E402
+from drgs.studies.tables import markdown_table, paragraph  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "planner.jsonl"
 PAGE = ROOT / "docs" / "planner.md"

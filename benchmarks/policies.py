@@ -16,13 +16,14 @@ from typing import Any
 
 import numpy as np
 import studies
+from pages import draw_curves, fill_between
 from studies import ROOT
 
 from drgs.fitting.config import FitConfig
 from drgs.studies.cells import Metric, Study
 from drgs.studies.rows import read_study
 from drgs.studies.statistics import FEWEST_UNITS, at_views, differences, estimate, unit_of, values_of, view_counts
-from drgs.studies.tables import draw_curves, fill_between, markdown_table
+from drgs.studies.tables import markdown_table
 
 Rows = Sequence[dict[str, Any]]
 

@@ -46,6 +46,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 import drjit as dr  # noqa: E402
 import torch  # noqa: E402
+from pages import fill_between  # noqa: E402
 from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import DATA, add_row, ran, read_rows  # noqa: E402
 
@@ -61,7 +62,7 @@ from drgs.information.quantity import ViewContext  # noqa: E402
 from drgs.integrator import render  # noqa: E402
 from drgs.pruning import fit_on, prune  # noqa: E402
 from drgs.settings import PRESETS, RenderSettings  # noqa: E402
-from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
+from drgs.studies.tables import markdown_table  # noqa: E402
 from drgs.tracing.sums import add_row as add_sums  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "prune.jsonl"

@@ -26,6 +26,7 @@ import cubes  # noqa: E402
 import drjit as dr  # noqa: E402
 import torch  # noqa: E402
 from fits import split_of  # noqa: E402
+from pages import fill_between  # noqa: E402
 from where import DATA, add_row, ran, read_rows  # noqa: E402
 
 import drgs  # noqa: E402
@@ -33,7 +34,7 @@ from drgs.data import load  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.fitting.frames import frames_for  # noqa: E402
 from drgs.fitting.start import start_plain  # noqa: E402
-from drgs.studies.tables import fill_between, paragraph  # noqa: E402
+from drgs.studies.tables import paragraph  # noqa: E402
 from drgs.tracing.recordings import without_recordings  # noqa: E402
 
 ROWS = HERE / "recordings.jsonl"

@@ -24,6 +24,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 import numpy as np  # noqa: E402
+from pages import fill_between  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
 from drgs.cameras import Camera  # noqa: E402
@@ -32,7 +33,7 @@ from drgs.commands.scene_input import SceneInput  # noqa: E402
 from drgs.commands.viewpoints import known_views, views_to_compare  # noqa: E402
 from drgs.select import Refine, Scoring, select  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.studies.tables import fill_between, paragraph  # noqa: E402
+from drgs.studies.tables import paragraph  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "refining.jsonl"
 PAGE = ROOT / "docs" / "information.md"

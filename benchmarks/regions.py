@@ -29,6 +29,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
+from pages import draw_curves, fill_between  # noqa: E402
 from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import DATA, add_row, ran, read_rows  # noqa: E402
 
@@ -52,7 +53,7 @@ from drgs.selection.spread import farthest  # noqa: E402
 from drgs.studies.cells import FAILURES, Metric  # noqa: E402
 from drgs.studies.cells import Study as StudyOfFits  # noqa: E402
 from drgs.studies.statistics import FEWEST_UNITS, at_views, coverage, differences, estimate, over_views, unit_of  # noqa: E402
-from drgs.studies.tables import draw_curves, fill_between, markdown_table, paragraph  # noqa: E402
+from drgs.studies.tables import markdown_table, paragraph  # noqa: E402
 from drgs.train import fit  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "regions.jsonl"

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from pages import fill_between
 from studies import DIFFERENCE, PAGE_DATA, ROOT, difference, write_csv
 
 from drgs.studies.cells import Study
@@ -20,7 +21,7 @@ from drgs.studies.experiments import EXPERIMENTS, Experiment, study_of
 from drgs.studies.results import results_rows
 from drgs.studies.rows import read_study
 from drgs.studies.statistics import differences, estimate
-from drgs.studies.tables import fill_between, markdown_table
+from drgs.studies.tables import markdown_table
 
 PAGE = ROOT / "docs" / "results.md"
 TABLES = ("static", "dynamic", "prior", "blocks")

@@ -16,10 +16,11 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
+from pages import fill_between  # noqa: E402
 from studies import PAGE_DATA, write_csv  # noqa: E402
 
 from drgs.files import Run, load_state  # noqa: E402
-from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
+from drgs.studies.tables import markdown_table  # noqa: E402
 
 IMAGE = {"psnr": "PSNR, dB", "psnr_moving": "of moving pixels, dB", "ssim": "SSIM", "flip": "FLIP"}
 LABELS = {

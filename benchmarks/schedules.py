@@ -32,6 +32,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 import torch  # noqa: E402
 from fits import psnr_by_renderer, split_of  # noqa: E402
+from pages import fill_between  # noqa: E402
 from steps import MADE, PATHS  # noqa: E402
 from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
@@ -49,7 +50,7 @@ from drgs.fitting.trainer import Trainer  # noqa: E402
 from drgs.integrator import Output, render  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.studies.statistics import estimate  # noqa: E402
-from drgs.studies.tables import fill_between, markdown_table  # noqa: E402
+from drgs.studies.tables import markdown_table  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "schedules.jsonl"
 PAGE = ROOT / "docs" / "one-model.md"

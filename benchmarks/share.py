@@ -28,6 +28,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
+from pages import fill_between  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
 from drgs.cameras import Camera  # noqa: E402
@@ -40,7 +41,6 @@ from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.integrator import render  # noqa: E402
 from drgs.pages.sharing.write import write_page  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "share.jsonl"
 PAGE = ROOT / "docs" / "share.md"

@@ -21,6 +21,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
+from pages import fill_between  # noqa: E402
 from where import DATA, ran  # noqa: E402
 
 from drgs.data import load, scene_extent  # noqa: E402
@@ -34,7 +35,6 @@ from drgs.sfm.points import initial_points  # noqa: E402
 from drgs.studies.cells import Metric, Study, run_cells  # noqa: E402
 from drgs.studies.rows import append_row, read_study  # noqa: E402
 from drgs.studies.statistics import differences, estimate, unit_of, values_of  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
 
 __all__ = [
     "DATA",

@@ -26,6 +26,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 import exact  # noqa: E402
 import torch  # noqa: E402
 from clocks import in_turns  # noqa: E402
+from pages import fill_between  # noqa: E402
 from render import Preset, backward, forward  # noqa: E402
 from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
@@ -33,7 +34,7 @@ from where import add_row, ran, read_rows  # noqa: E402
 import drgs  # noqa: E402
 from drgs.cameras import Camera  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.studies.tables import fill_between, markdown_table, paragraph  # noqa: E402
+from drgs.studies.tables import markdown_table, paragraph  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "tolerance.jsonl"
 PAGE = ROOT / "docs" / "tradeoff.md"

@@ -17,6 +17,7 @@ import numpy as np
 import studies
 import torch
 from cubes import cube
+from pages import fill_between
 from studies import ROOT
 
 import drgs
@@ -24,7 +25,7 @@ from drgs import fisher
 from drgs.cameras import Camera, look_at
 from drgs.gain import Prior, information_gain
 from drgs.lab.tradeoff import scaled_diagonal
-from drgs.studies.tables import fill_between, markdown_table, paragraph
+from drgs.studies.tables import markdown_table, paragraph
 
 Preset = drgs.RenderSettings.preset
 PRIOR = Prior(1e-3, relative=True)

@@ -201,9 +201,10 @@ def fits_table() -> str:
 
 def page() -> None:
     """Write the tables."""
+    from pages import fill_between
     from where import read_rows
 
-    from drgs.studies.tables import fill_between, markdown_table, paragraph
+    from drgs.studies.tables import markdown_table, paragraph
 
     rows = read_rows(ROWS)
     last = rows[-1]

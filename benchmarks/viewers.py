@@ -56,6 +56,7 @@ import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from fits import split_of  # noqa: E402
+from pages import fill_between  # noqa: E402
 from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
@@ -68,7 +69,6 @@ from drgs.fitting.records import load_run  # noqa: E402
 from drgs.fitting.renderers import ANY  # noqa: E402
 from drgs.integrator import render  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.studies.tables import fill_between  # noqa: E402
 from drgs.viewing.client import ClientGaussians, pose_of  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "viewers.jsonl"

@@ -34,7 +34,11 @@ from drgs.studies.statistics import (
     unit_of,
     view_counts,
 )
-from drgs.studies.tables import draw_curves, explained, fill_between, study_report
+from drgs.studies.tables import explained
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
+
+from pages import draw_curves, fill_between, study_report
 
 METRICS = (
     Metric("psnr", "PSNR", 2),

@@ -275,7 +275,7 @@ def main() -> int:
     parser.add_argument("--page", action="store_true", help="write the table of docs/cuda.md, and nothing else")
     args = parser.parse_args()
     if args.page:
-        from drgs.studies.tables import fill_between
+        from pages import fill_between
 
         fill_between(ROOT / "docs" / "cuda.md", "measured", "\n".join(page()))
         return 0

@@ -257,9 +257,8 @@ def main() -> int:
     lines = table(kernels, cases)
     print("\n".join(lines))
     if not args.check:
+        from pages import fill_between
         from where import ran
-
-        from drgs.studies.tables import fill_between
 
         if not args.old and _DATA.exists():
             before = json.loads(_DATA.read_text()).get("old", [])
