@@ -12,22 +12,6 @@ from drgs.cameras.lenses import LENS_MODELS
 from drgs.cameras.shutters import SHUTTERS
 from drgs.checks.arguments import ArgumentError, kind_of
 
-__all__ = [
-    "IMAGE_MAX",
-    "as_numpy",
-    "check_distance",
-    "check_handedness",
-    "check_proportions",
-    "check_shutter",
-    "check_turn",
-    "checked_distortion",
-    "checked_intrinsics",
-    "checked_pose",
-    "checked_time",
-    "is_tensor",
-    "read_only",
-]
-
 _ROTATION_TOLERANCE = 1e-4  # of R R^T: what four digits a number leave; more is a scale or a shear
 _ROW_TOLERANCE = 1e-6  # of the row 0 0 0 1, which only rounding may have touched
 # Beyond these, which no camera reaches, squares and ratios of float64 lose their meaning.

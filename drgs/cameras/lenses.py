@@ -15,20 +15,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-__all__ = [
-    "LENS_MODELS",
-    "Guide",
-    "LensModel",
-    "angle_polynomial",
-    "angle_polynomial_inverse",
-    "distort_opencv",
-    "distorted",
-    "equirectangular",
-    "fisheye_polynomial",
-    "linear_part",
-    "undistort_opencv",
-]
-
 _NEWTON_STEPS = 30  # Newton steps, at most; each squares the error, so far fewer are usual
 _MIN_SLOPE = 1e-6  # smallest slope of a Newton step; `Camera` warns of a result that does not project back
 _CONVERGED_ANGLE = 1e-14  # radians; the next step of Newton's is far below the rounding of float64

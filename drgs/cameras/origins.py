@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["FAR", "check_origin", "decimals", "origin_near", "origin_of_text", "origin_text", "rounding"]
-
 FAR = 10.0
 """Extents of a scene that its middle may be from 0 with an origin of 0: float32 rounds by 6e-7 of the extent there,
 which is a thousandth of a pixel of a picture 1,600 pixels wide."""

@@ -14,8 +14,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-__all__ = ["BY_COLUMN", "FORWARD", "SHUTTERS", "line_poses", "line_times", "points_in_moving_camera", "turn_between"]
-
 SHUTTERS = (
     "global",
     "rolling_top_to_bottom",

@@ -13,8 +13,6 @@ from drgs.cameras.shutters import BY_COLUMN, FORWARD
 if TYPE_CHECKING:
     from drgs.cameras import Camera
 
-__all__ = ["at_most", "by_share", "cropped", "reduced_size", "resized_alike"]
-
 
 def reduced_size(camera: Camera, max_pixels: int) -> tuple[int, int]:
     """(width, height) of a camera's image at no more than `max_pixels` pixels, and never larger than it is."""

@@ -36,19 +36,6 @@ from drgs.sfm.pairing import MAX_EXHAUSTIVE
 if TYPE_CHECKING:
     from drgs.data import Dataset, View
 
-__all__ = [
-    "FEWEST_STEPS",
-    "FitPlan",
-    "Pacer",
-    "PosePlan",
-    "Stopwatch",
-    "plan_fit",
-    "plan_frames",
-    "plan_poses",
-    "planned_poses",
-    "seconds_of_budget",
-]
-
 FEWEST_STEPS = 100
 """Least number of steps of a fit, however little time is left: fewer give no usable picture. Chosen."""
 

@@ -26,8 +26,6 @@ from drgs.runtime import memory
 if TYPE_CHECKING:
     from drgs.data import Dataset
 
-__all__ = ["Capture", "CaptureOptions", "Clock", "Photographs"]
-
 SCENE = "scene"
 """Folder of the data set that structure from motion makes, in that of the capture."""
 

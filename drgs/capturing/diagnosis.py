@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from drgs.data import Dataset, View
     from drgs.sfm.reconstruction import SfmSummary
 
-__all__ = ["of_exposure", "of_photographs", "of_poses", "of_views"]
-
 _SHARPNESS_SIZE = 640  # pixels of the longer side at which sharpness is measured: noise of single pixels is gone
 _COMPARED = 3  # photographs on each side that say how sharp one should be: they show much the same
 _BLURRED = 0.3  # of the sharpness of its neighbors: below it a photograph is blurred

@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from drgs.information.expected_error import ErrorRecord
     from drgs.io.run import Run
 
-__all__ = ["findings_of", "of_expected_error"]
-
 _Any = TypeVar("_Any")
 
 _MOST_RESIDUALS = 24  # photographs whose residuals stand for those of all, as in the report; chosen for its seconds

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from drgs.sfm.findings import Finding
     from drgs.train import FitResult
 
-__all__ = ["fit_photographs"]
-
 NEW_FIT_SHARE = 0.5
 """Of the photographs before, as many that join: beyond, the fit begins anew, since what was fitted to too few
 photographs is in the wrong places. Of six that joined ten and two that joined fourteen, benchmarks/batches.py measures

@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.fitting.records import LoadedRun
 
-__all__ = ["pinhole_of", "rank_next", "reachable_places"]
-
 _INFORMATION_PIXELS = 20_000  # pixels of a view whose information is compared: a ranking takes many views
 _SOLID_OPACITY = 0.3  # opacity of Gaussians that one does not walk through
 _MOST_OBSTACLES = 20_000  # of these, that paths are compared with

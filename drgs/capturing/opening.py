@@ -10,8 +10,6 @@ from drgs.capturing.capture import SCENE, CaptureOptions
 from drgs.capturing.record import FOLDER, Batch, CaptureRecord, inputs_of
 from drgs.fitting.records import is_run
 
-__all__ = ["new_files", "open_record"]
-
 
 def new_files(
     options: CaptureOptions,

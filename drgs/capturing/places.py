@@ -20,8 +20,6 @@ import numpy as np
 from drgs.cameras import Camera, look_at
 from drgs.data.camera_layout import level_frame
 
-__all__ = ["Place", "meters_of", "places_around", "length_in_words"]
-
 # (right, up, ahead) from a photograph, in shares of its way to what it shows.
 _MOVES = (
     (-1 / 3, 0.0, 0.0),

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from drgs.capturing.capture import Capture
     from drgs.sfm.findings import Finding
 
-__all__ = ["Outcome", "add_poses", "find_poses", "given_poses"]
-
 Outcome: TypeAlias = "tuple[str, list[Finding]]"
 """Result of a step: the line that is printed, and findings about the capture."""
 

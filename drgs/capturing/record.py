@@ -12,8 +12,6 @@ from drgs.io.json_files import check_json, read_json
 from drgs.io.outputs import write_json
 from drgs.sfm.findings import Finding
 
-__all__ = ["FOLDER", "Batch", "CaptureRecord", "DoneStep", "inputs_of"]
-
 FOLDER = "capture"
 """Folder in the run with the photographs, their data set and `capture.json`."""
 _FILE = "capture.json"

@@ -46,8 +46,6 @@ if TYPE_CHECKING:
     from drgs.data import Dataset
     from drgs.fitting.config import FitConfig
 
-__all__ = ["Report", "run_capture"]
-
 Report = Callable[[Run, Path, "Dataset"], None]
 """Writes the report of a run to a file; the data set has the cameras as fitted."""
 

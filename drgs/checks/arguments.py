@@ -12,8 +12,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-__all__ = ["ArgumentError", "check_fields", "check_path", "kind_of", "must_be"]
-
 
 class ArgumentError(TypeError, ValueError):
     """An argument of the wrong kind: a TypeError, and a ValueError, which the command line prints as one line."""

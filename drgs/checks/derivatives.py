@@ -14,17 +14,6 @@ import torch
 from drgs.checks.arguments import ArgumentError
 from drgs.checks.torch_func import is_batched, is_wrapped, without_wrappers
 
-__all__ = [
-    "check_has_numbers",
-    "check_unbatched",
-    "ends_of",
-    "first_only",
-    "is_functional",
-    "refuse_batched",
-    "refuse_meta",
-    "unwrapped",
-]
-
 _Result = TypeVar("_Result")
 
 Derivatives = tuple[torch.Tensor | None, ...]

@@ -7,8 +7,6 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-__all__ = ["imported_function", "modules_of"]
-
 
 def modules_of(package: str) -> Callable[[str], Any]:
     """The `__getattr__` of a room whose modules are imported at first access, as `drgs.features.query`.

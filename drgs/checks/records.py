@@ -19,26 +19,6 @@ from typing import Any, ClassVar, Self
 
 from drgs.checks.arguments import ArgumentError, check_fields, kind_of, must_be
 
-__all__ = [
-    "TRANSIENT",
-    "Option",
-    "Record",
-    "Spec",
-    "check_ranges",
-    "first_difference",
-    "hints_of",
-    "nearest",
-    "nested",
-    "one_of",
-    "option",
-    "options_in",
-    "part",
-    "part_of",
-    "same_option",
-    "stated",
-    "ways_of",
-]
-
 TRANSIENT: Mapping[str, Any] = {"transient": True}
 """Metadata of a field that is computed at run time: no file holds it, and it is no option."""
 

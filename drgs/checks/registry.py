@@ -14,8 +14,6 @@ from drgs.checks.imports import imported_function
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-__all__ = ["Registry"]
-
 T = TypeVar("T")
 
 

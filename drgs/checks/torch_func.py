@@ -15,8 +15,6 @@ from typing import TypeVar
 
 import torch
 
-__all__ = ["is_batched", "is_wrapped", "without_wrappers"]
-
 _Result = TypeVar("_Result")
 
 

@@ -16,8 +16,6 @@ from typing import Any
 from drgs import runtime
 from drgs.runtime import machine
 
-__all__ = ["Disagreement", "check_agreement", "statement", "this_worker", "worker_name", "worker_statement"]
-
 _PACKAGES = ("dask", "distributed", "torch", "drjit", "mitsuba", "numpy")
 _ADVICE = {
     "drgs": "install the same on both",

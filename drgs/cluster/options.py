@@ -5,8 +5,6 @@ from __future__ import annotations
 import importlib.util
 import re
 
-__all__ = ["check_address", "check_options"]
-
 _MAX_WORKERS = 1024  # local workers; chosen: more is a mistake
 _ADDRESS = re.compile(r"(?:tcp://)?(\[[0-9a-fA-F:.]+\]|[^\s:/\[\]]+):(\d{1,5})")
 

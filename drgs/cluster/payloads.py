@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 import torch
 
-__all__ = ["Missing", "Payload", "keep", "opened_payload"]
-
 _MAX_PAYLOADS = 4  # payloads that a worker keeps: a scene, the quantities of its views, and a few of the call before
 _MAX_UNFINISHED = 8  # payloads of which pieces are missing, at most; chosen
 _PIECE_BYTES = 64 << 20  # bytes of a message; chosen: none blocks the scheduler for long

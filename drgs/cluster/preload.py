@@ -7,8 +7,6 @@ import signal
 
 from drgs.cluster.agreement import statement
 
-__all__ = ["dask_setup"]
-
 
 def dask_setup(worker: object) -> None:
     """Called by Dask in the main thread of the new process, before its first task."""

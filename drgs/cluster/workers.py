@@ -44,8 +44,6 @@ if TYPE_CHECKING:
     from drgs.selection.pool import ViewRequest
     from drgs.settings import RenderSettings
 
-__all__ = ["WORKER_SECONDS", "Cluster", "compute_view"]
-
 WORKER_SECONDS = 60.0
 """Time that a cluster may be without any worker."""
 

@@ -13,8 +13,6 @@ import numpy as np
 
 from drgs.io.foreign import is_file
 
-__all__ = ["Archive", "GzipReader", "gzip_comment", "gzipped", "pixels_of_webp", "unzstd", "webp_of_pixels"]
-
 _DAMAGED = "it is truncated or damaged, copy it again"
 # characters of names, and of what libraries say
 _NAME = 200

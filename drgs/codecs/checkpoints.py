@@ -25,8 +25,6 @@ from drgs.codecs.values import SH_COUNTS, check_count
 from drgs.ellipsoids import Gaussians
 from drgs.io.archives import check_archive
 
-__all__ = ["CHECKPOINT", "load_checkpoint"]
-
 _GSPLAT = {
     "means": "means",
     "quats": "quats",

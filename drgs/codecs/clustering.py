@@ -10,8 +10,6 @@ import numpy as np
 
 from drgs.display.progress import Bar
 
-__all__ = ["codebook", "morton_order", "palette"]
-
 _BINS = 1 << 16  # of a histogram: 256 to an entry of the codebook
 _CODEBOOK_STEPS = 40  # of Lloyd's algorithm, on the histogram
 _PALETTE_STEPS = 6  # of the same, on all rows, which takes most of the time of writing

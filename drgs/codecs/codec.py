@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["Codec"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Codec:

@@ -13,8 +13,6 @@ import re
 import zipfile
 from pathlib import Path
 
-__all__ = ["cameras_of_model", "file_of_folder", "is_checkpoint", "names_in_archive", "nerfstudio_run"]
-
 _ITERATION = re.compile(r"iteration_(\d{1,18})")
 _GSPLAT_STEP = re.compile(r"ckpt_(\d{1,18})(?:_rank0)?\.pt")
 _NERFSTUDIO_STEP = re.compile(r"step-(\d{1,18})\.ckpt")

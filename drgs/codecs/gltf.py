@@ -30,8 +30,6 @@ from drgs.io.json_files import check_json, parse_json
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["GLB", "encode_glb", "load_glb"]
-
 _AXES = (-1, -1, 1)  # signs of x, y and z between glTF and PLY
 _NAME = "KHR_gaussian_splatting"
 _FLOAT = 5126  # component type of float32 in glTF (GL_FLOAT)

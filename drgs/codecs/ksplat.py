@@ -28,8 +28,6 @@ from drgs.codecs.values import SH_COUNTS, assembled, check_count, dc_of_colors, 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["KSPLAT", "load_ksplat"]
-
 _HEADER_BYTES = 4096  # bytes of the header of a file
 _SECTION_BYTES = 1024  # bytes of the header of a section
 _LEAST_HALF = 2.0**-26  # the middle of what rounds to 0 as a half float

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from drgs.codecs.ply_headers import PlyElement
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["PACKED_PLY", "encode_packed_ply", "load_packed_ply"]
-
 _log = logging.getLogger(__name__)
 
 _CHUNK_GAUSSIANS = 256  # Gaussians that share one range of values, as SuperSplat's format has it

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["load_ply", "note_antialiased", "note_offset", "save_ply"]
-
 _log = logging.getLogger(__name__)
 
 _COLUMNS = {

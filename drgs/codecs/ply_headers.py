@@ -14,17 +14,6 @@ import numpy as np
 
 from drgs.cameras.origins import origin_of_text, origin_text
 
-__all__ = [
-    "EXTRA",
-    "PlyElement",
-    "extra_kind",
-    "is_antialiased",
-    "offset_line",
-    "ply_offset",
-    "ply_source",
-    "read_ply_header",
-]
-
 EXTRA = ("uncertainty_", "label")
 """Beginnings of columns that `drgs.save_ply` adds, and viewers leave out."""
 

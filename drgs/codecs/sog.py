@@ -37,8 +37,6 @@ from drgs.io.json_files import check_json, parse_json
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["SOG", "load_sog"]
-
 _log = logging.getLogger(__name__)
 _MAX_META_BYTES = 4 << 20  # bytes
 # of log scales below the largest: fits make disks whose thickness is 1e-9, and 256 entries are few

@@ -19,8 +19,6 @@ from drgs.ellipsoids import Y_00
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["LEAST_FLOAT", "SPLAT", "encode_splat", "load_splat"]
-
 _log = logging.getLogger(__name__)
 
 LEAST_FLOAT = float(np.finfo(np.float32).tiny)

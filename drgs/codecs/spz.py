@@ -40,8 +40,6 @@ from drgs.codecs.values import SH_COUNTS, assembled, check_count, flipped, logit
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["SPZ", "encode_spz", "load_spz"]
-
 _AXES = (1, -1, -1)  # signs of x, y and z between SPZ and PLY
 _COLOR_SCALE = 0.15  # the format holds the DC coefficient times 0.15
 _ANTIALIASED, _EXTENDED = 1, 2  # flags

@@ -17,21 +17,6 @@ from drgs.cameras.origins import origin_near
 from drgs.ellipsoids import LOGIT_ENDS, Y_00, Gaussians
 from drgs.runtime.memory import require
 
-__all__ = [
-    "SH_COUNTS",
-    "assembled",
-    "check_count",
-    "dc_of_colors",
-    "flipped",
-    "log_of_scales",
-    "logits_of_bytes",
-    "logits_of_opacities",
-    "note_lost",
-    "quats_of_smallest",
-    "recentered",
-    "spread",
-]
-
 SH_COUNTS = (1, 4, 9, 16)
 """Coefficients of a color up to degree 0, 1, 2 and 3."""
 # Step of float32 at the middle of a scene, in its size: a tenth of a pixel of a picture 1,000 wide is lost from there.

@@ -19,8 +19,6 @@ from drgs.fitting.config import FitConfig
 if TYPE_CHECKING:
     from drgs.commands.options import Capture
 
-__all__ = ["capture_photographs", "run"]
-
 
 def run(args: Capture) -> None:
     """`drgs capture PATH... -o RUN`, with `--add` further photographs, and `drgs capture --more -o RUN`."""

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from drgs.fitting.records import FitRecord
     from drgs.settings import RenderSettings
 
-__all__ = ["cited", "run"]
-
 
 class _Used(NamedTuple):
     """What a run did, as far as it says what to cite.

@@ -28,8 +28,6 @@ from drgs.fitting.renderers import AUTO
 from drgs.io.json_files import read_json, read_toml
 from drgs.settings import RenderSettings
 
-__all__ = ["HEADINGS", "command_list", "config_fields", "help_page", "parsed_options", "words_of", "written"]
-
 HEADINGS = ("Run", "Data", "Views", "Quality", "Features", "Motion", "Rendering", "Machine")
 """Headings of help, in their order."""
 

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from drgs.commands.options import Convert
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["label_column", "run", "still", "uncertainty_columns"]
-
 
 def run(args: Convert) -> None:
     """`drgs convert IN OUT`."""

@@ -23,8 +23,6 @@ from drgs.lab.report import html
 if TYPE_CHECKING:
     from drgs.commands.options import Crossval
 
-__all__ = ["run"]
-
 
 def run(args: Crossval) -> int:
     """`drgs crossval SCENE`: 1 if a gradient or a path is wrong, with --strict if anything differs."""

@@ -42,8 +42,6 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.train import FitResult
 
-__all__ = ["Plan", "make_demo", "run"]
-
 _PRESETS = {
     "exact": "exact order along every ray, nothing cut off above 1e-5",
     "fast": "one depth a Gaussian, cut at 3 sigma",

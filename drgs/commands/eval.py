@@ -14,8 +14,6 @@ from drgs.io.run import Run
 if TYPE_CHECKING:
     from drgs.commands.options import Eval
 
-__all__ = ["print_table", "run"]
-
 
 def run(args: Eval) -> None:
     """`drgs eval RUN`."""

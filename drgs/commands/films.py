@@ -24,22 +24,6 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Scene
     from drgs.settings import RenderSettings
 
-__all__ = [
-    "Film",
-    "at_times",
-    "check_flight_options",
-    "check_panorama",
-    "film_of",
-    "flight_cameras",
-    "level_panorama",
-    "named_view",
-    "panorama_size",
-    "ply_names",
-    "up_of",
-    "write_plys",
-]
-
-
 _DEFAULT_FRAMES = 60  # frames of an orbit, 2.5 s at 24 frames a second; chosen
 _DEFAULT_FPS = 24.0  # frames a second, as in the cinema
 _MOST_FRAMES = 100_000  # frames, more than an hour: a typing error

@@ -60,9 +60,6 @@ if TYPE_CHECKING:
     from drgs.io.outputs import LockedFolder
     from drgs.settings import RenderSettings
 
-__all__ = ["InformationMaps", "KINDS", "map_weights", "run"]
-
-
 KINDS = ("variance", "share")  # of maps
 _log = logging.getLogger(__name__)
 

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from drgs.data import Dataset
     from drgs.fitting.config import FitConfig
 
-__all__ = ["run"]
-
 _log = logging.getLogger(__name__)
 
 

@@ -36,8 +36,6 @@ from drgs.integrator import render
 from drgs.io.json_files import check_json, read_json
 from drgs.settings import RenderSettings
 
-__all__ = ["DATAPARSER_TRANSFORMS", "in_frame_of_data"]
-
 DATAPARSER_TRANSFORMS = "dataparser_transforms.json"
 """File of a nerfstudio run, to be put beside the splat that was exported of it."""
 _ROTATION_ERROR = 1e-3  # largest error of R R^T that float32 and text explain: more is no rotation

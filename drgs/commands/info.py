@@ -11,8 +11,6 @@ from drgs import runtime
 if TYPE_CHECKING:
     from drgs.commands.options import Info
 
-__all__ = ["run"]
-
 
 def run(args: Info) -> None:
     """`drgs info`: exit code 2 when nothing can be rendered here."""

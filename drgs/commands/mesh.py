@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from drgs.commands.options import Mesh
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["run"]
-
 
 def run(args: Mesh) -> None:
     """`drgs mesh SCENE -o FILE`."""

@@ -28,46 +28,6 @@ from drgs.studies.protocols import ExperimentName, ProtocolName, StudyScale
 if TYPE_CHECKING:
     from drgs.cluster.workers import Cluster
 
-__all__ = [
-    "COMMANDS",
-    "SIDE",
-    "Orbits",
-    "Capture",
-    "Cite",
-    "Workers",
-    "Common",
-    "ComparedViews",
-    "Convert",
-    "Crossval",
-    "Data",
-    "Demo",
-    "Eval",
-    "Fisher",
-    "Fit",
-    "Info",
-    "Information",
-    "Lenses",
-    "Mesh",
-    "SceneTimes",
-    "Prune",
-    "Query",
-    "Render",
-    "Report",
-    "Reproduce",
-    "Scene",
-    "SampledViews",
-    "Select",
-    "Settings",
-    "Sfm",
-    "Share",
-    "Stress",
-    "Teach",
-    "TimedData",
-    "Tradeoff",
-    "View",
-    "Views",
-]
-
 Split = Literal["all", "train", "test"]
 
 SIDE = (1, 16_384)  # pixels; a mistyped size shall not ask for terabytes

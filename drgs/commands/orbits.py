@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from drgs.commands.options import Orbits
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["OrbitShape", "capture_orbit", "dome", "scene_orbit"]
-
 # Chosen, not tuned.
 _DEFAULT_ELEVATION = 20.0  # degrees above the center, from which tables and objects are usually seen
 _DEFAULT_FOV = 45.0  # degrees, horizontal, about that of a normal lens

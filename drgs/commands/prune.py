@@ -41,8 +41,6 @@ if TYPE_CHECKING:
     from drgs.pruning import Pruned
     from drgs.settings import RenderSettings
 
-__all__ = ["run"]
-
 _COPIED = ("config.json", "env.json", "log.jsonl", SELECTION, EMBEDDINGS, CAMERAS)
 """Files of a run that hold for it with fewer Gaussians, too."""
 

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from drgs.features.decoder import Decoder
     from drgs.settings import RenderSettings
 
-__all__ = ["read_embeddings", "run"]
-
 
 def run(args: Query) -> None:
     """`drgs query SCENE`."""

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from drgs.commands.viewpoints import Source
     from drgs.settings import RenderSettings
 
-__all__ = ["region_of"]
-
 
 def region_of(
     command: str, args: Any, given: SceneInput, source: Source, cameras: Sequence[Camera], settings: RenderSettings

@@ -57,9 +57,6 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians, Scene
     from drgs.settings import RenderSettings
 
-__all__ = ["forecast", "render_views", "run"]
-
-
 _log = logging.getLogger(__name__)
 
 _FORECAST_PIXELS = 500_000  # pixels of all views; for fewer, a forecast takes as long as rendering

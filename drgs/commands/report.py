@@ -26,9 +26,6 @@ if TYPE_CHECKING:
     from drgs.commands.options import Report
     from drgs.data import Dataset
 
-__all__ = ["fit_command", "report_of", "run"]
-
-
 _log = logging.getLogger(__name__)
 
 

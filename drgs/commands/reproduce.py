@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from drgs.cluster.workers import Cluster
     from drgs.commands.options import Reproduce
 
-__all__ = ["run"]
-
 # of all experiments in one folder: they share cells
 _ROWS = "rows.jsonl"
 _GIVEN = "data.json"

@@ -15,8 +15,6 @@ from drgs.display.progress import Bar
 if TYPE_CHECKING:
     from drgs.commands.options import Scene
 
-__all__ = ["maker_of", "run"]
-
 _ONLY = {  # options that not every scene has
     "--views": ("capture", "room", "still_life"),
     "--cameras": ("kitchen", "hall"),

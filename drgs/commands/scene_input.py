@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     # They have options that name a data set.
     _Placed = Crossval | Fisher | Prune | Query | Render | Select | Share | Tradeoff | View
 
-__all__ = ["SELECTION", "SceneInput", "ranking_of"]
-
 SELECTION = "selection.json"
 """File of a run that chose its views: their scores."""
 

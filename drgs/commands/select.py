@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from drgs.commands.viewpoints import Known
     from drgs.information.scoring import Scoring
 
-__all__ = ["print_picks", "run"]
-
 _SHORT = {
     "rotations": "rot.",
     "log_scales": "scales",

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
     from drgs.integrator import Output
 
-__all__ = ["OPAQUE", "PICTURE_KINDS", "PictureFunction", "picture_functions"]
-
 PICTURE_KINDS = ("features", "labels", "overlay")
 OPAQUE = 0.5
 """Opacity from which on a pixel has a label: more of it is Gaussians than background."""

@@ -11,8 +11,6 @@ from drgs.sfm.reconstruction import SfmOptions, run_sfm
 if TYPE_CHECKING:
     from drgs.commands.options import Sfm
 
-__all__ = ["run"]
-
 
 def run(args: Sfm) -> None:
     """`drgs sfm PATH... -o OUT`."""

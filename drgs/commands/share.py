@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.fitting.records import FitRecord
 
-__all__ = ["is_page", "run", "shared_of"]
-
 _DEFAULT_SIZE = 960, 640  # pixels of the first view of a scene without photographs: about the shape of a screen; chosen
 
 _log = logging.getLogger(__name__)

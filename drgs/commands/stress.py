@@ -18,8 +18,6 @@ from drgs.lab.stress import BOUNDS, StressRow, rows
 if TYPE_CHECKING:
     from drgs.commands.options import Stress
 
-__all__ = ["COLUMNS", "markdown", "run"]
-
 COLUMNS = {
     "image": "image",
     "gradient": "gradient",

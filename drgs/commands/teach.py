@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from drgs.commands.options import Teach
     from drgs.data import View
 
-__all__ = ["run"]
-
 _FOLDER = TEACHER_FOLDERS[0]
 _RECORD = f"{_FOLDER}/teach.json"
 _EMBEDDINGS = "text_embeddings.npy"

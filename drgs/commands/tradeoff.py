@@ -57,8 +57,6 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.commands.options import Tradeoff
 
-__all__ = ["run"]
-
 
 def run(args: Tradeoff) -> None:
     """`drgs tradeoff SCENE`."""

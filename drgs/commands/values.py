@@ -10,8 +10,6 @@ from typing import Any
 
 from drgs.settings import RenderSettings
 
-__all__ = ["ORBIT_KEYS", "UP", "check_color", "override", "parsed", "parsed_orbit", "parsed_size"]
-
 UP = {
     "x": (1.0, 0.0, 0.0),
     "y": (0.0, 1.0, 0.0),

@@ -42,9 +42,6 @@ if TYPE_CHECKING:
     from drgs.information.expected_error import ErrorRecord
     from drgs.viewing.server import Viewer
 
-__all__ = ["run", "subject_of", "watched_files"]
-
-
 _POLL_SECONDS = 2.0  # seconds between two looks at the files; chosen
 _STOP_SECONDS = 0.5  # seconds that a running computation gets to end; chosen
 

@@ -43,22 +43,6 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.settings import RenderSettings
 
-__all__ = [
-    "Known",
-    "Source",
-    "captured_cameras",
-    "check_lenses",
-    "views_to_render",
-    "evenly",
-    "frame_size",
-    "held_out_views",
-    "known_views",
-    "views_to_compare",
-    "views_to_sample",
-    "warn_of_unseen",
-    "with_times",
-]
-
 _DEFAULT_PIXELS = 130_000  # pixels of a view without a run, as `max_pixels` of a fit
 # At most so many are checked for whether cameras see any of the scene at all; chosen for their seconds.
 _CHECKED_GAUSSIANS = 20_000

@@ -18,17 +18,6 @@ if TYPE_CHECKING:
 
     from drgs.cameras import Camera
 
-__all__ = [
-    "REFERENCE_EXTENT",
-    "Focus",
-    "level_frame",
-    "middle_camera",
-    "path",
-    "scene_extent",
-    "scene_origin",
-    "upright",
-]
-
 # Angles and shares are chosen by hand, so that orbits, forward-facing captures, walks and drives of the data sets in
 # tests/test_orbits.py are classified rightly; no study varied them.
 _REWEIGHTINGS = 30  # rounds of reweighting, at most; the median of lines settles in about ten

@@ -21,8 +21,6 @@ from drgs.data.checks import inverse_pose
 from drgs.io.json_files import check_json, read_json
 from drgs.io.outputs import atomic_write
 
-__all__ = ["camera_from_json", "camera_to_json", "is_camera_list", "load_cameras_json", "save_cameras_json"]
-
 _CAMERA_JSON = {
     "name": str,
     "width": int,

@@ -34,8 +34,6 @@ from drgs.data.checks import check_last_row, inverse_pose
 from drgs.io.journal import SCHEMA
 from drgs.io.json_files import check_json, read_json
 
-__all__ = ["CameraPath", "Keyframe", "camera_path_json", "quaternion_of", "read_camera_path", "rotation_of"]
-
 _TINY = 1e-12  # radians: below, an arc and its chord are the same to rounding
 
 

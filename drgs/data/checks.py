@@ -23,18 +23,6 @@ from drgs.cameras.checks import check_distance
 from drgs.io.foreign import is_file, refuse_foreign
 from drgs.runtime import memory
 
-__all__ = [
-    "check_last_row",
-    "check_npz",
-    "file_inside",
-    "inverse_pose",
-    "local_names",
-    "read_npy",
-    "read_npz",
-    "read_text",
-    "repaired_pose",
-]
-
 _MAX_NPY_HEADER = 65536  # bytes: a dtype of many fields takes a few hundred
 _DEFLATE = 1032  # bytes that one byte of deflate can become
 _MAX_NAME = 1024  # characters, folders included

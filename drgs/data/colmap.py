@@ -22,8 +22,6 @@ from drgs.data.view_checks import make_names_unique, report_missing_images
 from drgs.data.views import View
 from drgs.io.foreign import is_file
 
-__all__ = ["COLMAP", "MODEL_FOLDERS", "find_model", "image_folder", "load_colmap", "point_ply"]
-
 MODEL_FOLDERS = (
     *("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap/0", "colmap"),
     *("colmap_sparse/0", "colmap_sparse", "colmap_text"),

@@ -15,8 +15,6 @@ from drgs.cameras import Camera, intrinsics
 from drgs.io.atomic import temporary_folder
 from drgs.io.foreign import refuse_foreign
 
-__all__ = ["MODEL_FILES", "MODEL_SUFFIXES", "model_camera", "model_points", "model_suffix", "read_model"]
-
 MODEL_FILES = ("cameras", "rigs", "frames", "images", "points3D")
 MODEL_SUFFIXES = (".bin", ".txt")
 # COLMAP's model numbers and parameter counts, for the camera models that drgs renders.

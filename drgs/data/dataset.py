@@ -18,8 +18,6 @@ from drgs.io.outputs import write_json
 if TYPE_CHECKING:
     from drgs.data.semantics import Semantics
 
-__all__ = ["Dataset", "HELD_OUT", "SplitRule", "apply_held_out", "write_held_out"]
-
 
 @dataclasses.dataclass
 class Dataset:

@@ -10,8 +10,6 @@ from typing import Any
 
 from drgs.data.dataset import Dataset
 
-__all__ = ["Format"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Format:

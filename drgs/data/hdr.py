@@ -20,8 +20,6 @@ import numpy as np
 
 from drgs.display.srgb import srgb_from_linear
 
-__all__ = ["HDR", "HdrReader", "hdr_transfer", "in_srgb"]
-
 HDR = {16: "PQ", 18: "HLG"}
 """Names of the transfer characteristics that are converted, by their numbers in ITU-T H.273."""
 

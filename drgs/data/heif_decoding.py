@@ -20,8 +20,6 @@ from drgs.data.hdr import HDR, in_srgb
 from drgs.data.reader_process import serve
 from drgs.runtime import memory
 
-__all__ = ["encoded_jpeg", "pixels", "size"]
-
 _SIDE = 1 << 15  # pixels, libheif's own limit; a compressed byte stands for any number of them
 _BYTES = 12  # a pixel: planes as decoded, interleaved, turned, and the copy that is answered
 # EXIF: the tag of the orientation, the header in a JPEG, and the bytes that a JPEG segment holds at most

@@ -27,23 +27,6 @@ from drgs.data.reader_process import Child
 from drgs.io.foreign import refuse_foreign
 from drgs.runtime import memory
 
-__all__ = [
-    "IMAGE_SUFFIXES",
-    "MissingReader",
-    "can_hold",
-    "heif_as_jpeg",
-    "image_size",
-    "is_damaged",
-    "is_heif",
-    "is_whole",
-    "list_images",
-    "native_stderr",
-    "png_has_alpha",
-    "read_image",
-    "stated_size",
-    "unit_range",
-]
-
 HEIF_SUFFIXES = (".heic", ".heif", ".hif", ".avif")
 _BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1", b"avif", b"avis")
 

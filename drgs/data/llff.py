@@ -19,8 +19,6 @@ from drgs.data.videos import list_videos
 from drgs.data.view_checks import make_names_unique
 from drgs.data.views import View
 
-__all__ = ["LLFF", "POSES_BOUNDS", "load_llff", "pose_rows", "row_camera"]
-
 POSES_BOUNDS = "poses_bounds.npy"
 
 

@@ -9,8 +9,6 @@ import numpy as np
 from drgs.data.images import IMAGE_SUFFIXES, read_image, unit_range
 from drgs.io.foreign import is_file
 
-__all__ = ["MASK_KEEP", "mask_file", "read_mask"]
-
 MASK_KEEP = 0.5
 """Weight in a mask from which on a pixel counts."""
 

@@ -24,8 +24,6 @@ from drgs.data.formats import Format
 from drgs.data.images import list_images
 from drgs.data.synchronous import CAMERA_NAME, Recording, evenly_spaced, synchronous
 
-__all__ = ["CAMERA_FOLDERS", "add_model_points", "frame_folders", "frames_of", "load_cameras"]
-
 _NUMBER = re.compile(r"(?<!\d)(\d{1,20})$")  # at the end of a name
 _MODEL = "sparse_"  # where 4DGaussians has it
 _SAME_POSE = 1e-2  # of the cameras' extent, and between the axes

@@ -18,8 +18,6 @@ from drgs.data.synchronous import Recording, evenly_spaced, synchronous
 from drgs.data.videos import VIDEO_SUFFIXES, VideoFile, list_videos, read_video
 from drgs.display.progress import Bar
 
-__all__ = ["NEU3D", "NEU3D_FRAMES", "load_neu3d"]
-
 _log = logging.getLogger(__name__)
 
 

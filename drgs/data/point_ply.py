@@ -9,8 +9,6 @@ import numpy as np
 from drgs.codecs.ply_headers import ply_offset, ply_source
 from drgs.io.foreign import is_file, refuse_foreign
 
-__all__ = ["read_point_ply"]
-
 _MAX_PLY_HEADER = 65536  # bytes in which a header must end: that of 3DGS takes some 1,500
 _SHOWN = 200  # characters of a reader's own message
 _PLY_BYTES = {

@@ -26,8 +26,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Child", "serve"]
-
 _ERRORS: dict[str, type[Exception]] = {kind.__name__: kind for kind in (ValueError, FileNotFoundError, MemoryError)}
 
 _SHOWN = 120  # characters of a library's own message

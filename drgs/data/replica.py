@@ -24,8 +24,6 @@ from drgs.data.formats import Format
 from drgs.data.images import IMAGE_SUFFIXES, image_size
 from drgs.data.views import View
 
-__all__ = ["POSES", "REPLICA", "load_replica"]
-
 POSES = "traj_w_c.txt"
 _FIELD_OF_VIEW = 90.0  # degrees across the width
 _MILLIMETER = 1e-3  # meters, in which Replica has its scenes

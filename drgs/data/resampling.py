@@ -17,16 +17,6 @@ if TYPE_CHECKING:
 
     from drgs.cameras import Camera
 
-__all__ = [
-    "ASPECT_TOLERANCE",
-    "fit_to_image",
-    "lens_maps",
-    "nearest_resized",
-    "resize_area",
-    "resized_to",
-    "undistorted_map",
-]
-
 ASPECT_TOLERANCE = 0.01  # of the shape of an image against that of its camera
 
 

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.features.segmentation import Classes
 
-__all__ = ["CLASS_FILES", "NO_CLASS", "SEGMENTS", "Semantics", "plain_labels", "read_class_names"]
-
 SEGMENTS = "seg"
 """Folder of Dynamic 3D Gaussians' labels, in which 1 is what moves."""
 _NUMBERS = 1 << 16  # what a pixel of a label image can say

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from drgs.data.dataset import Dataset
     from drgs.data.views import View
 
-__all__ = ["LABEL_FOLDERS", "TEACHER_FOLDERS", "attach"]
-
 TEACHER_FOLDERS = ("rgb_feature_langseg", "sam_embeddings")
 LABEL_FOLDERS = ("semantic_class", "semantic", "labels")
 _EMBEDDINGS = "text_embeddings.npy"

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
     from drgs.cameras import Camera
 
-__all__ = ["CAMERA_NAME", "LateCamera", "Recording", "evenly_spaced", "late_cameras", "synchronous"]
-
 # What folders of synchronous cameras are called.
 CAMERA_NAME = re.compile(r"cam[a-z_-]*\d{1,9}", re.IGNORECASE)
 

@@ -22,8 +22,6 @@ from drgs.data.formats import Format
 from drgs.data.synchronous import Recording, evenly_spaced, synchronous
 from drgs.io.json_files import check_json, read_json
 
-__all__ = ["TRAIN_META", "load_train_meta"]
-
 _META = "train_meta.json"
 _TEST = "test_meta.json"
 _POINTS = "init_pt_cld.npz"

@@ -25,8 +25,6 @@ from drgs.data.views import View
 from drgs.io.foreign import is_file
 from drgs.io.json_files import check_json, read_json
 
-__all__ = ["TRANSFORMS", "load_transforms"]
-
 _SPLITS = ("train", "val", "test")
 _LENSES = {
     "PINHOLE": "pinhole",

@@ -25,8 +25,6 @@ from drgs.data.reader_process import serve
 from drgs.display.pictures import shrunk
 from drgs.runtime import memory
 
-__all__ = ["frame", "gray", "walk"]
-
 _MAX_PIXELS = 2**31  # of a frame: what an int of OpenCV holds
 _MAX_FRAMES = 10**7  # four days at 30 a second; a time stamp of each is held
 _MISSING = (0.02, 8)  # share or number of frames that a header may claim too many, where it states a duration alone

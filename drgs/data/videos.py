@@ -12,8 +12,6 @@ from drgs.data.reader_process import Child
 from drgs.display.progress import Bar
 from drgs.io.foreign import refuse_foreign
 
-__all__ = ["VIDEO_SUFFIXES", "VideoFile", "VideoFrame", "list_videos", "read_video"]
-
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi")
 
 _decoder = Child("drgs.data.video_decoding", "a video that can be decoded", "convert it with ffmpeg, or leave it out")

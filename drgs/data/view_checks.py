@@ -21,17 +21,6 @@ if TYPE_CHECKING:
     from drgs.data.dataset import Dataset
     from drgs.data.views import View
 
-__all__ = [
-    "check_cameras",
-    "check_parallax",
-    "check_times",
-    "drop_duplicates",
-    "default_background",
-    "report_missing_images",
-    "make_names_unique",
-    "mark_partial_masks",
-]
-
 # of cameras that film what moves (docs/dynamic-data.md, Layouts)
 _FEW_PLACES = 4
 _ENOUGH_PLACES = 6

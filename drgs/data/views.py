@@ -21,8 +21,6 @@ from drgs.data.videos import VideoFrame
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["View"]
-
 
 @dataclass
 class View:

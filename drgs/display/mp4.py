@@ -15,8 +15,6 @@ import numpy as np
 from drgs.display.pictures import to_bytes
 from drgs.io import outputs
 
-__all__ = ["Mp4", "need_mp4"]
-
 _QUALITY = "18"  # x264's constant rate factor: differences that are hardly seen
 
 

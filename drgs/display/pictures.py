@@ -20,23 +20,6 @@ import numpy as np
 from drgs.io import outputs
 from drgs.io.outputs import atomic_write
 
-__all__ = [
-    "Video",
-    "caption",
-    "depth_colors",
-    "depth_picture",
-    "file_names",
-    "inferno",
-    "map_colors",
-    "map_picture",
-    "png_bytes",
-    "shrunk",
-    "to_bytes",
-    "write_exr",
-    "write_jpg",
-    "write_png",
-]
-
 _INK = (235, 235, 235)  # RGB of text on pictures; chosen by eye
 _NO_DEPTH_GRAY = 0.25  # gray of depth where nothing is
 _ZERO_GRAY = 64  # gray of pixels whose value is 0

@@ -15,8 +15,6 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-__all__ = ["Bar", "duration", "quietly"]
-
 FIRST = 1.0  # seconds after which a stage is worth its first line
 EVERY = 10.0  # seconds between two lines at first; they become rarer, up to LEAST_OFTEN
 LEAST_OFTEN = 30.0  # seconds between two lines of a long stage

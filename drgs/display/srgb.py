@@ -6,8 +6,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["linear_from_srgb", "srgb_from_linear"]
-
 # Up to these the function is a straight line.
 _STRAIGHT = 0.04045  # of the sRGB value
 _STRAIGHT_LIGHT = 0.0031308  # of the light

@@ -6,8 +6,6 @@ import shutil
 import textwrap
 from collections.abc import Sequence
 
-__all__ = ["lines", "show"]
-
 _GAP = "  "
 _MIN_TEXT_WIDTH = 10  # columns of text, however many numbers there are
 

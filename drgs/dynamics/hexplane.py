@@ -16,8 +16,6 @@ from typing import Any
 
 import torch
 
-__all__ = ["SPACE_PAIRS", "TIME_AXES", "Corners", "HexPlane", "corners_of", "features", "product"]
-
 SPACE_PAIRS = ((0, 1), (0, 2), (1, 2))  # columns and rows of the planes of space
 TIME_AXES = 3  # planes with a time, a column along each axis
 

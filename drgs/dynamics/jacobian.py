@@ -14,8 +14,6 @@ import torch
 
 from drgs.ellipsoids import DeformableScene
 
-__all__ = ["SceneJacobian", "TorchJacobian", "scene_jacobian"]
-
 
 class SceneJacobian(Protocol):
     """J, the derivative of a scene's Gaussians at one time by some of its parameters.

@@ -20,8 +20,6 @@ from typing import NamedTuple
 
 import torch
 
-__all__ = ["LASTING", "LIFESPAN_PARAMETERS", "Lifespans", "drift", "is_limited", "logit_at"]
-
 LASTING = 10.0
 """Widths, in spans of time, from which on a Gaussian is always there: its opacity at the ends would be 0.995 times that
 in the middle."""

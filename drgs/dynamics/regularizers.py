@@ -19,8 +19,6 @@ import torch
 from drgs.checks.derivatives import first_only
 from drgs.dynamics.hexplane import HexPlane, levels
 
-__all__ = ["plane_smoothness", "time_l1", "time_smoothness"]
-
 
 def time_smoothness(grid: HexPlane) -> torch.Tensor:
     """Mean squared second difference along the time of the planes (t, x), (t, y), (t, z): what moves does so evenly.

@@ -20,8 +20,6 @@ from drgs.io.archives import check_archive
 from drgs.io.foreign import refuse_foreign
 from drgs.io.outputs import atomic_write
 
-__all__ = ["Decoder", "load_decoder", "save_decoder"]
-
 _KEYS = ("conv.weight", "conv.bias")
 
 

@@ -29,8 +29,6 @@ import torch
 
 from drgs.io.json_files import check_json, read_json
 
-__all__ = ["MAP_NORM", "SCALES", "TEMPLATES", "ClipEncoder"]
-
 SCALES = (0.75, 1.0, 1.5)
 TEMPLATES = ("a photo of a {}.", "a photo of the {}.", "a {} in a scene.", "{}")
 MAP_NORM = 4.0

@@ -15,8 +15,6 @@ import torch
 from drgs.display.pictures import to_bytes
 from drgs.features.decoder import Decoder
 
-__all__ = ["NO_LABEL", "FeatureColors", "label_colors", "label_picture", "mask_picture", "overlay", "with_legend"]
-
 NO_LABEL = (40, 40, 40)
 """Color of pixels without a label."""
 _PERCENTILES = 1.0, 99.0  # of each component, which become 0 and 255: outliers do not take the range

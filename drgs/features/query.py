@@ -23,8 +23,6 @@ import torch
 from drgs.features.decoder import Decoder
 from drgs.features.segmentation import Classes, cosines, unit_rows
 
-__all__ = ["TEMPERATURE", "TextQuery"]
-
 TEMPERATURE = 0.01
 """1 / 100, CLIP's own (Radford et al. 2021, section 2.5)."""
 _SAME_MEANING = 0.999  # cosine from which on a class means the same as a positive, and is no negative; chosen

@@ -24,8 +24,6 @@ from drgs.io.foreign import refuse_foreign
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["check_finite", "map_name", "read_map", "read_tensor", "used_map"]
-
 # `CxHxW` are the letters in the files of Feature 3DGS; numbers in their place must agree with the tensor.
 _NAME = re.compile(r"(.+)_fmap_(CxHxW|(\d+)x(\d+)x(\d+))\.pt")
 _ZIP = b"PK\x03\x04"

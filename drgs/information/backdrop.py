@@ -36,19 +36,6 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Scene
     from drgs.information.semantics import SemanticMetric
 
-__all__ = [
-    "BACKDROP",
-    "CELLS",
-    "Backdrop",
-    "ComputeViews",
-    "Sphere",
-    "SurfaceDepths",
-    "backdrop_cells",
-    "backdrop_sphere",
-    "backdrop_variance",
-    "painted_opacity",
-]
-
 BACKDROP = "backdrop"  # the group of its information
 _OPACITY, _TAKEN = "opacity", "taken"  # names of what is computed of one view
 _CELLS_PER_EDGE = 16  # cells along an edge of the cube, of 4 to 6 degrees; chosen

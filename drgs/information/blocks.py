@@ -39,16 +39,6 @@ if TYPE_CHECKING:
     from drgs.information.backdrop import ComputeViews
     from drgs.information.choices import Block, NetworkEstimate
 
-__all__ = [
-    "BACKDROP_BLOCK",
-    "DEFORMATION_BLOCK",
-    "GEOMETRY_BLOCK",
-    "MAP_PRIOR",
-    "SEMANTIC_BLOCK",
-    "ImageBlock",
-    "SceneBlocks",
-]
-
 MAP_PRIOR = Prior(1.0)
 """lambda with which a map of the variance follows the error best, of 1e-6, 1e-2 and 1 (docs/active-static.md)."""
 

@@ -13,31 +13,6 @@ from typing import Any, Literal
 from drgs.checks.registry import Registry
 from drgs.information.criteria import criterion_named
 
-__all__ = [
-    "BLOCKS",
-    "BLOCK_NAMES",
-    "COMBINES",
-    "ESTIMATES",
-    "METHODS",
-    "NETWORK_SCORES",
-    "NETWORK_ESTIMATES",
-    "Block",
-    "Combine",
-    "CRITERION_NAMES",
-    "Criterion",
-    "Estimate",
-    "GAUSSIAN_GROUPS",
-    "Method",
-    "NetworkScore",
-    "NetworkEstimate",
-    "POLICIES",
-    "POLICY_NAMES",
-    "Policy",
-    "check_combined",
-    "check_named",
-    "checked_blocks",
-]
-
 Criterion = Literal["v_opt", "eig", "logdet", "trace_cov", "block_logdet"]
 """The names of `drgs.information.criteria` that are this package's; views are chosen by the first by default."""
 

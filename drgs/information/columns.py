@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from drgs.information.quantity import ViewContext
     from drgs.settings import RenderSettings
 
-__all__ = ["BATCH", "PoseInformation", "jacobian_columns"]
-
 BATCH = 16  # tangents of one traversal; chosen: bounds memory
 
 

@@ -28,8 +28,6 @@ import dataclasses
 
 import torch
 
-__all__ = ["Eliminated", "remaining"]
-
 _NULL = 1e-8
 """Eigenvalue of the nuisances' information, scaled to a diagonal of 1, below which a direction is none: what rounding
 of float32 images leaves of a direction that changes nothing (1e-6 of what each unknown alone does), squared, is 1e-12.

@@ -14,8 +14,6 @@ from drgs.checks.registry import Registry
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["CRITERIA", "ViewCriterion", "criterion_named"]
-
 
 @dataclasses.dataclass(frozen=True)
 class ViewCriterion:

@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Scene
     from drgs.information.quantity import ViewContext
 
-__all__ = ["Coverage", "DenseBlocks", "Diagonal"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Diagonal(Quantity):

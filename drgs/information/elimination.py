@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from drgs.information.semantics import SemanticMetric
     from drgs.information.sums import Information
 
-__all__ = ["BLOCK_INPUTS", "ViewRows", "backdrop_taken", "eliminated_of"]
-
 
 @torch.no_grad()  # information is a number
 def eliminated_of(call: Call, scales: torch.Tensor, nuisances: Nuisances) -> Eliminated:

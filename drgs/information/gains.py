@@ -28,20 +28,6 @@ from drgs.information.criteria import criterion_named
 from drgs.information.prior import Prior
 from drgs.information.sums import Information
 
-__all__ = [
-    "BLOCK_LAYOUT",
-    "DENSE",
-    "Chain",
-    "Gain",
-    "block_gain",
-    "check",
-    "dense",
-    "information_gain",
-    "scorer",
-    "shares_of",
-    "variances",
-]
-
 BLOCK_LAYOUT = {
     "means": slice(0, 3),
     "rotations": slice(3, 6),

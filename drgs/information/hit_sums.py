@@ -25,8 +25,6 @@ from drgs.tracing.sums import add_row
 if TYPE_CHECKING:
     from drgs.information.replay import Replay, Walk
 
-__all__ = ["HitSums"]
-
 _WIDTH = packed_size(GEOMETRY)  # floats of an image and a Gaussian
 _NOWHERE = 0xFFFFFFFF  # place of a Gaussian that is not wanted
 

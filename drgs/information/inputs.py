@@ -11,8 +11,6 @@ import torch
 from drgs.cameras import Camera
 from drgs.checks.arguments import ArgumentError, kind_of, must_be
 
-__all__ = ["Masks", "mask_list", "three_weights"]
-
 Masks = Sequence[torch.Tensor | None] | None
 """Masks of several cameras: (H, W) in [0, 1] each, by which an image is multiplied before it is compared, or None."""
 

@@ -26,8 +26,6 @@ from drgs.tracing.records import load_packed, pack, packed_size
 from drgs.tracing.responses import Response
 from drgs.tracing.sums import add_row
 
-__all__ = ["GEOMETRY", "BlockSums", "RemovalSums", "SquareSums", "Rows", "SeveralSums", "VarianceSums", "extras"]
-
 GEOMETRY = 10  # means 3, rotations 3, log-scales 3, logit-opacity 1: the order of every row
 # entries of `extras`: d log strength / dlogit, dc/dmu (9), then the response's
 _OPACITY = 0

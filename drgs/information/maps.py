@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from drgs.information.semantics import SemanticMetric
     from drgs.settings import RenderSettings
 
-__all__ = ["fisherrf_map", "moments_map", "variance_map"]
-
 
 def variance_map(
     view: ViewContext,

@@ -65,8 +65,6 @@ if TYPE_CHECKING:
     from drgs.information.semantics import SemanticMetric
     from drgs.settings import RenderSettings
 
-__all__ = ["NetworkInformation", "NetworkProbes"]
-
 _FLOATS = 1 << 23  # of the tangents that one traversal carries, or of images and what is summed up along them: 32 MiB
 _BATCH = 16  # tangents of one traversal; chosen: bounds memory
 

@@ -16,8 +16,6 @@ from drgs.ellipsoids import DeformableScene
 if TYPE_CHECKING:
     from drgs.ellipsoids import Scene
 
-__all__ = ["NETWORK_GROUPS", "network_groups", "network_lengths"]
-
 NETWORK_GROUPS = {"grid": "phi.grid.", "mlp": "phi.mlp."}
 """Group -> what the names of its parameters begin with."""
 

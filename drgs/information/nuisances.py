@@ -10,8 +10,6 @@ from typing import ClassVar, Literal
 
 from drgs.checks.records import Record, option
 
-__all__ = ["NO_NUISANCES", "NUISANCES", "Nuisance", "Nuisances"]
-
 Nuisance = Literal["exposure", "pose"]
 """Unknowns of a photograph: three log gains of its channels, and the six numbers of its camera's pose."""
 

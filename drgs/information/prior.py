@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Scene
 
-__all__ = ["Prior", "unit_length"]
-
 _POSITIONS = "means"  # the group whose parameters are lengths
 _USUAL_EXTENT = 5.6  # world units: median of `scene_extent` over eight captures, as COLMAP and LLFF scale them
 _ONE_PLACE = 1e-8  # of coordinates, and of 1: more than cameras differ by that `scene_extent` takes as of one place

@@ -10,8 +10,6 @@ import torch
 from drgs.tracing.bridge import to_drjit
 from drgs.tracing.call import Call
 
-__all__ = ["Pullback"]
-
 
 class Pullback:
     """J^T of one view: slopes of inputs along cotangents of its images, any number of times after one traversal."""

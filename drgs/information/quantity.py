@@ -41,18 +41,6 @@ if TYPE_CHECKING:
     from drgs.information.replay import Replay, WalkSums
     from drgs.information.semantics import SemanticMetric
 
-__all__ = [
-    "HitProbes",
-    "Joint",
-    "Quantity",
-    "ViewContext",
-    "checked_views",
-    "once_per_time",
-    "opacity_of",
-    "original",
-    "sum_over_views",
-]
-
 
 class HitProbes(Protocol):
     """A quantity's sums over the hits of a view, which a traversal of the view for another quantity may fill.

@@ -35,16 +35,6 @@ if TYPE_CHECKING:
     from drgs.features.segmentation import Classes
     from drgs.settings import RenderSettings
 
-__all__ = [
-    "REGION_FORMS",
-    "NothingOfRegion",
-    "Region",
-    "RegionShares",
-    "RegionText",
-    "check_masks",
-    "masked_photographs",
-]
-
 REGION_FORMS = ("box:X0,Y0,Z0,X1,Y1,Z1", "sphere:X,Y,Z,R", "masks:FOLDER", "class:NAME")
 """How the text of a region is written."""
 

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from drgs.information.quantity import ViewContext
     from drgs.settings import RenderSettings
 
-__all__ = ["REMOVAL", "RemovalError", "seen_through"]
-
 REMOVAL = "removal"
 """Name of what `RemovalError` computes."""
 

@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     from drgs.tracing.kernels import Channels
     from drgs.tracing.walk import Part
 
-__all__ = ["Replay", "WalkSums"]
-
 _TABLED_CHANNELS = 4  # channels whose tables are worth their memory
 _SEMANTIC_CHANNELS = 16  # semantic channels of one traversal, besides the colors
 _FLOAT_MAX = torch.finfo(torch.float32).max

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians, Scene
     from drgs.information.semantics import SemanticMetric
 
-__all__ = ["Scoring"]
-
 _EXACT = RenderSettings.preset("exact")  # made once: every record of options has a `Scoring`
 
 

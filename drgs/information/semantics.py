@@ -33,8 +33,6 @@ from drgs.information.choices import ESTIMATES, Estimate
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["SemanticMetric"]
-
 _RANK_TOLERANCE = 1e-12  # of the largest eigenvalue: below, float64 rounding of W^T W
 # Gaussians that the directions in which features differ are computed from: any directions are right, these have little
 # variance

@@ -6,8 +6,6 @@ from collections.abc import Mapping
 
 import torch
 
-__all__ = ["Information", "add", "together"]
-
 Information = Mapping[str, torch.Tensor]
 """Group of parameters -> tensor with one entry a parameter, as `drgs.fisher.diagonal` returns it."""
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import zipfile
 from pathlib import Path
 
-__all__ = ["check_archive"]
-
 _SHOWN = 120  # characters of an entry's name in a message
 
 

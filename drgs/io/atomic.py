@@ -14,18 +14,6 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = [
-    "PATTERN",
-    "check_room",
-    "delete",
-    "delete_all",
-    "hidden_file",
-    "is_full",
-    "is_left_over",
-    "named",
-    "temporary_folder",
-]
-
 PATTERN = re.compile(r"\.drgs\..+\.[a-z0-9_]{8}\.tmp(\.[a-z0-9]+)?")
 """What they are called, and nothing else is."""
 

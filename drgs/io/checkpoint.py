@@ -18,8 +18,6 @@ from drgs.io.outputs import atomic_write, json_form
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["load_state", "save_state", "state_header"]
-
 
 def save_state(path: str | os.PathLike, tensors: dict[str, torch.Tensor], header: dict) -> None:
     """Write a checkpoint: tensors, and a JSON header to which the schema version is added."""

@@ -11,8 +11,6 @@ import zipfile
 import zlib
 from pathlib import Path
 
-__all__ = ["is_file", "refuse_foreign"]
-
 _HEAD_BYTES = 4096  # bytes from the start of a file, enough for every mark that is looked for
 _SPLATS = {
     ".spz": "an SPZ file (Niantic's compressed Gaussians)",

@@ -15,18 +15,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
-__all__ = [
-    "Terminated",
-    "at_once",
-    "between_steps",
-    "exit_code",
-    "handled",
-    "in_native_code",
-    "interruption",
-    "leave",
-    "reinstall",
-]
-
 _SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 # seconds that the main thread is given to return from native code; a command ends within two. Chosen
 _ANSWER_SECONDS = 0.7

@@ -21,8 +21,6 @@ from drgs.io.atomic import named
 from drgs.io.json_files import parse_json
 from drgs.io.locks import exclusive
 
-__all__ = ["SCHEMA", "Journal", "check_schema"]
-
 SCHEMA = 1
 """Version of journals, checkpoints and reports that commands write; raised when a reader must change."""
 

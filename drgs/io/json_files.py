@@ -11,8 +11,6 @@ from typing import Any
 
 from drgs.io.foreign import refuse_foreign
 
-__all__ = ["check_json", "parse_json", "read_json", "read_toml"]
-
 _MAX_JSON_BYTES = 1 << 29  # bytes; ten thousand photographs with all their fields take some 20 MB
 _MAX_TOML_BYTES = 1 << 20  # bytes; a file of all options has some 10 KB
 _INT64 = 1 << 63  # integers beyond are no 64-bit ones

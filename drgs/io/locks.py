@@ -18,8 +18,6 @@ from pathlib import Path
 
 from drgs.io.json_files import parse_json
 
-__all__ = ["NAME", "InUse", "acquire", "exclusive", "host_of", "release"]
-
 NAME = ".drgs.lock"
 """Name of the lock in the folder that is being written."""
 

@@ -26,18 +26,6 @@ from drgs.io import atomic, locks
 from drgs.io.atomic import named
 from drgs.io.journal import Journal
 
-__all__ = [
-    "LockedFolder",
-    "atomic_write",
-    "check_file",
-    "lock_folder",
-    "clean",
-    "json_form",
-    "release_all",
-    "replacing",
-    "write_json",
-]
-
 JOURNAL = ".drgs.jsonl"
 _MAX_JSON = 64 << 20  # bytes; a longer file is none that a command wrote as its report
 _KEEP_HASH_BYTES = 1 << 20  # bytes that take long enough to hash that the result is kept

@@ -11,8 +11,6 @@ from drgs.io.journal import SCHEMA, Journal, check_schema
 from drgs.io.json_files import read_json
 from drgs.io.outputs import json_form, write_json
 
-__all__ = ["CONFIG_SCHEMA", "Run"]
-
 CONFIG_SCHEMA = 2
 """Version of config.json. Of version 1, which is read too, the fields of a fit stand beside each other, those of its
 selection under `active`; of version 2 they are nested by subject."""

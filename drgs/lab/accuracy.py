@@ -18,27 +18,6 @@ from drgs.ellipsoids import Gaussians
 from drgs.integrator import Output, render, render_jvp
 from drgs.settings import RenderSettings
 
-__all__ = [
-    "FIELDS",
-    "Errors",
-    "Oracle",
-    "compare",
-    "entry_error",
-    "gradients",
-    "inner",
-    "jacobian",
-    "leaves",
-    "pose_gradient",
-    "random_camera",
-    "random_gaussians",
-    "relative",
-    "rotation",
-    "squares",
-    "turn",
-    "twist_basis",
-    "weight_of",
-]
-
 FIELDS = ("rgb", "alpha", "depth", "features")
 _LEAST_ALPHA = 1e-3  # of rays whose depth is compared: 100 times what an image may be off by
 _JACOBIAN_ENTRIES = 1 << 22  # entries of an intermediate of the dense Jacobian that are held at once: 32 MB

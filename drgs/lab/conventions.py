@@ -26,8 +26,6 @@ from drgs.lab.parameters import COLORS, gaussians_of, image_of, posed
 from drgs.oracle import activate, float64, rolling_poses, screen_rows
 from drgs.settings import RenderSettings
 
-__all__ = ["BETWEEN", "DISTORTIONS", "LEAST", "ORDERS", "Finding", "SearchResult", "ReferenceModel", "find"]
-
 ORDERS = ("rgb", "bgr", "rbg", "grb", "gbr", "brg")
 BETWEEN = "to the mean, from between both poses"  # as gsplat has it
 # What may be made of OpenCV's (k1, k2, p1, p2, k3, ...): name -> the coefficients that it amounts to.

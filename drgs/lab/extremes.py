@@ -20,8 +20,6 @@ from drgs.integrator import render
 from drgs.lab.accuracy import random_camera, random_gaussians
 from drgs.settings import RenderSettings
 
-__all__ = ["CASES", "REFUSALS", "SIZE", "ExtremeCase", "Refusal"]
-
 SIZE = (9, 7)
 """Width and height of the images, unless a case says otherwise."""
 

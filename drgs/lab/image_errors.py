@@ -17,8 +17,6 @@ import numpy as np
 
 from drgs.display.srgb import linear_from_srgb, srgb_from_linear
 
-__all__ = ["OFF", "PATTERNS", "ErrorRow", "Pattern", "error_line", "error_row", "pattern_of"]
-
 PATTERNS = {
     "flipped": "mirrored, or turned by half a turn",
     "channels": "its channels are in another order",

@@ -13,23 +13,6 @@ from drgs.ellipsoids import Gaussians
 from drgs.oracle import float64
 from drgs.splats import color_of
 
-__all__ = [
-    "BACKGROUNDS",
-    "COLORS",
-    "POSE",
-    "MOTIONS",
-    "POSE_END",
-    "PARAMETERS",
-    "around_origin",
-    "depth_of",
-    "gaussians_of",
-    "image_of",
-    "posed",
-    "raw_of",
-    "with_colors",
-    "with_pose",
-]
-
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh")  # raw, as crossval and the ladder compare them
 POSE = "viewmats"  # (6,) of one view, 0: see `posed`
 POSE_END = "viewmats_rs"  # (6,) of the pose at the end of a rolling shutter, likewise

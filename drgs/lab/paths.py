@@ -29,8 +29,6 @@ from drgs.lab.rasterizers import Dump, Rasterizer, cotangents, one_line
 from drgs.lab.verdicts import VERDICTS, Case, Compared, GroupRow, compared, gradient_row, judge
 from drgs.oracle import float64
 
-__all__ = ["PATHS", "PathRow", "Status", "path_rows", "status_of"]
-
 Status = Literal["agrees", "wrong", "not tested"]
 
 PATHS = (

@@ -44,21 +44,6 @@ from drgs.lab.parameters import (
 from drgs.oracle import float64
 from drgs.settings import PRESETS, RenderSettings
 
-__all__ = [
-    "SUFFIXES",
-    "Dump",
-    "Rasterizer",
-    "is_along_rays",
-    "cotangents",
-    "export",
-    "function",
-    "is_export",
-    "load_rasterizer",
-    "one_line",
-    "ours",
-    "read_dump",
-]
-
 
 @dataclasses.dataclass(frozen=True)
 class Rasterizer:

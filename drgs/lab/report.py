@@ -10,8 +10,6 @@ import numpy as np
 from drgs.display import pictures
 from drgs.lab.image_errors import ErrorRow, error_line
 
-__all__ = ["html"]
-
 _MEANING = {
     "agreement": "The image and the gradients are the model's.",
     "known deviation": "Gradients differ by choices that are documented.",

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from drgs.lab.extremes import ExtremeCase, Refusal
     from drgs.settings import RenderSettings
 
-__all__ = ["BOUNDS", "StressRow", "Truth", "row_of", "refused", "rows", "truth_of"]
-
 BOUNDS = {"image": 1e-5, "gradient": 1e-4, "forward": 1e-4, "duality": 1e-4, "fisher": 1e-4}
 """What `exact` claims; every case here is held to it, whatever its settings, but where `bvh` rounds or warns."""
 

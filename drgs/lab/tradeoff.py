@@ -42,35 +42,6 @@ if TYPE_CHECKING:
     from drgs.integrator import Output
     from drgs.settings import RenderSettings
 
-__all__ = [
-    "CLOCKS",
-    "TRADEOFF_VARIANTS",
-    "USES",
-    "Advice",
-    "FullSize",
-    "FullTime",
-    "GradientError",
-    "GroupInformation",
-    "ImageError",
-    "InformationError",
-    "Interval",
-    "Measured",
-    "TradeoffRow",
-    "Variant",
-    "WorstErrors",
-    "clocked",
-    "interval",
-    "leaders",
-    "measure",
-    "measure_full",
-    "placed",
-    "plot",
-    "recommend",
-    "rows_of",
-    "scaled_diagonal",
-    "why_skipped",
-]
-
 CLOCKS = ("forward", "forward_backward", "fisher")
 """What is timed: an image; an image and its gradients; the Fisher diagonal of a view."""
 

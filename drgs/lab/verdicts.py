@@ -24,24 +24,6 @@ from drgs.lab.parameters import MOTIONS
 from drgs.lab.rasterizers import Dump, Rasterizer
 from drgs.oracle import float64
 
-__all__ = [
-    "VERDICTS",
-    "AlphaRow",
-    "Case",
-    "Compared",
-    "Differences",
-    "GroupRow",
-    "OwnRow",
-    "ViewRow",
-    "WorstGaussian",
-    "WorstPixel",
-    "central",
-    "compared",
-    "gradient_row",
-    "judge",
-    "with_errors",
-]
-
 VERDICTS = ("gradient bug", "undecided", "model difference", "other convention", "known deviation", "agreement")
 
 

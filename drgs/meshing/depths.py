@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.meshing.options import DepthKind
 
-__all__ = ["DepthView", "depth_views", "footprint", "seen_distance"]
-
 _SURFACE_ALPHA = 0.5  # alpha from which on a pixel shows a surface: the median of its depth exists
 _LEAST_COSINE = 0.05  # between a ray and a surface; beyond 87 degrees the normal of a depth image says nothing
 _PROBE_PIXELS = 2_500  # pixels of the picture whose depths say how far away the subject is; chosen for its seconds

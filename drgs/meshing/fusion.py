@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.meshing.depths import DepthView
 
-__all__ = ["bricks_of", "distances", "sampled", "surface"]
-
 _SNAP_DISTANCE = 1e-4  # of a cell: a vertex nearer to a lattice point than that is put on it; chosen
 _RAY_SAMPLES = 9  # samples of each ray, from `trunc` before its surface to `trunc` behind: a voxel apart at the default
 _MOST_BRICKS = 1 << 20  # bricks along an axis to either side, so that three numbers fit into 64 bits

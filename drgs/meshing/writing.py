@@ -21,8 +21,6 @@ from drgs.io.outputs import replacing
 if TYPE_CHECKING:
     from drgs.meshing.extraction import TriangleMesh
 
-__all__ = ["MESH_SUFFIXES", "save_mesh"]
-
 MESH_SUFFIXES = (".ply", ".glb", ".obj")
 """Of the formats that are written."""
 _TURN = np.array([-1.0, -1.0, 1.0])  # half a turn about z: no mirror, so that triangles keep their order

@@ -39,8 +39,6 @@ from drgs.settings import EPS_ALPHA
 if TYPE_CHECKING:
     from drgs.settings import RenderSettings
 
-__all__ = ["ReferenceOutput", "render"]
-
 _TILE = 16  # pixels; both rasterizers' tile size
 _FLOAT32 = 2.0**-23  # of a coordinate: twice what rounding it to float32 changes
 _FLOAT64 = 2.0**-50  # as much, of the few operations that a pose takes

@@ -22,8 +22,6 @@ from torch.utils.checkpoint import checkpoint
 from drgs.oracle import OracleScene, activate, check_oracle, cull_near, float64, sh_colors, view_rays, within
 from drgs.settings import EPS_ALPHA, RenderSettings
 
-__all__ = ["Volume", "render_volume"]
-
 _MIN_OPTICAL_DEPTH = 1e-12  # optical depth on a ray below which a Gaussian is left out of it
 _NEGLIGIBLE_DEPTH = 1e-16  # optical depth inside an interval that is taken for 0
 _SUPPORT_SIGMA = 8.5  # sigma; beyond lies 1e-17 of a Gaussian

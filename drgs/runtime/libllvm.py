@@ -15,16 +15,6 @@ import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-__all__ = [
-    "MINIMUM_LLVM",
-    "Library",
-    "dotted",
-    "find_libraries",
-    "library_version",
-    "prepare",
-    "require_llvm",
-]
-
 MINIMUM_LLVM = 17
 """Major version: Dr.Jit 1.5 aborts with 15 and 16, and does not load older ones."""
 

@@ -17,8 +17,6 @@ import re
 import sys
 from pathlib import Path
 
-__all__ = ["LANES", "Target", "compile_for", "compiled_for", "missing_features"]
-
 LANES = (4, 8, 16)  # what Mitsuba's ray tracing on a CPU, Embree, takes
 # Without FMA LLVM has no instruction for Dr.Jit's fused products, calls a function that nothing provides, and Dr.Jit
 # aborts the process at the first kernel. All else that an older processor lacks LLVM replaces.

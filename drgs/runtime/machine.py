@@ -7,8 +7,6 @@ import platform
 import sys
 from pathlib import Path
 
-__all__ = ["commit", "cpu_model", "forget_peak_memory", "gpu_name", "peak_memory"]
-
 
 def cpu_model() -> str:
     """Name of the processor, as the system gives it."""

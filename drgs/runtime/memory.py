@@ -6,8 +6,6 @@ import os
 import resource
 from pathlib import Path
 
-__all__ = ["PAIR", "PICTURES", "TANGENT", "available", "frame_bytes", "is_out_of_memory", "of_card", "require"]
-
 # Measured: what a frame of 1024^2 to 4096^2 pixels adds to the resident set of a fresh process (LLVM, one thread; rgb,
 # alpha and depth of 1,000 Gaussians), divided by its pixels; the constants are the least of them. Tiles: 61 to 67 bytes
 # a pixel in the order of centers, in that of rays as much and their rows; bvh: 156 to 172; gradients: 54 to 61 more.

@@ -9,8 +9,6 @@ from typing import Any
 from drgs.data.colmap_bindings import pycolmap
 from drgs.data.reader_process import serve
 
-__all__ = ["extract_features", "ready"]
-
 _MASKED_CONTRAST = 0.002  # a third of COLMAP's: an object alone has few features, and weak ones match as well
 # of which COLMAP's own handlers print a stack on stderr
 _CRASHES = (signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGABRT)

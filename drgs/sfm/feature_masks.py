@@ -15,8 +15,6 @@ from drgs.data.resampling import nearest_resized
 if TYPE_CHECKING:
     from drgs.sfm.matching import Progress
 
-__all__ = ["ALPHA_MASKS", "find_masks", "write_masked_photos"]
-
 ALPHA_MASKS = "alpha"  # in place of a folder: the photographs' own alpha channel
 _SHOWN = 3  # photographs without a mask that a message names
 

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.sfm.matching import Progress
 
-__all__ = ["Features", "Matches", "Triangulated", "detect"]
-
 # Chosen by hand; on two views 70 degrees apart, where matching over the whole picture finds nothing, they give 582
 # points (commit 6bf76a85). No study varied them.
 _MAX_FEATURES = 6000  # features of a picture, the strongest

@@ -24,18 +24,6 @@ from drgs.sfm.findings import Finding
 from drgs.sfm.photo_files import entry_fault, leave_out, link_or_copy, usable_photos
 from drgs.sfm.video_frames import Picked, examine
 
-__all__ = [
-    "FRAMES",
-    "ImageFolder",
-    "fill_image_folder",
-    "make_image_folder",
-    "joined_frames",
-    "named_files",
-    "recorded_frames",
-    "usable_files",
-    "write_frames",
-]
-
 FRAMES = "frames.json"
 """Beside the pictures: which of them are of which video, and of which moment."""
 _QUALITY = 97  # of JPEG: what a video's own compression has left is kept

@@ -21,8 +21,6 @@ from drgs.io.atomic import check_room
 from drgs.runtime import thread_count
 from drgs.sfm.matching import Progress
 
-__all__ = ["MappingProgress", "PhotoGroups", "map_photos", "posed_names", "name_ranges", "write_model"]
-
 _EVERY = 0.25  # seconds between two looks at the log
 _FEW_FEATURES = 200  # with fewer of its own a photograph is blurred, dark or blank, or its mask is small
 _ADVISED = 3  # gaps that are named

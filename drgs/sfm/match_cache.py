@@ -25,8 +25,6 @@ from drgs.data.views import View
 from drgs.io.atomic import hidden_file, is_left_over
 from drgs.sfm.guided import Triangulated
 
-__all__ = ["cached"]
-
 _LARGEST = 256 << 20  # bytes of all files; those of a hundred photographs have about 5 MiB
 _CHUNK = 1 << 20  # bytes that are hashed at once
 _OURS = re.compile(r"[0-9a-f]{40}\.npz")

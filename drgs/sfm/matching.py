@@ -18,17 +18,6 @@ from drgs.io.atomic import check_room, temporary_folder
 from drgs.runtime import thread_count
 from drgs.sfm.photo_files import own_file
 
-__all__ = [
-    "FeatureOptions",
-    "extract",
-    "match",
-    "nearby_pairs",
-    "quiet",
-    "sequential_pairs",
-    "start_extraction",
-    "restore_focal_lengths",
-]
-
 Progress = Callable[[str, int, int], None]
 _PAIRS_A_STEP = 16  # a thread: all of them are busy, and progress is seen
 # Bytes on the disk: a feature of SIFT has 128 of its descriptor and 24 of its place, a match 8 when it is found and 8

@@ -17,8 +17,6 @@ import numpy as np
 
 from drgs.sfm.matching import sequential_pairs
 
-__all__ = ["Pairing", "choose_new_pairs", "choose_pairs", "global_descriptors", "nearest_pairs"]
-
 MAX_EXHAUSTIVE = 60
 """Photographs of which all pairs are matched by default."""
 MAX_EXHAUSTIVE_MASKED = 150

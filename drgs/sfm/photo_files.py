@@ -17,17 +17,6 @@ import numpy as np
 
 from drgs.data.images import IMAGE_SUFFIXES, MissingReader, heif_as_jpeg, is_heif, read_image
 
-__all__ = [
-    "check_names",
-    "entry_fault",
-    "leave_out",
-    "link_or_copy",
-    "own_file",
-    "photo_fault",
-    "readable_photos",
-    "usable_photos",
-]
-
 _QUALITY = 98  # of JPEG, for what has been compressed before
 _LONGEST = 251  # bytes of a name, where file systems allow 255 and COLMAP wants .png behind it
 _SHOWN = 5  # names that a message repeats

@@ -12,17 +12,6 @@ from drgs.data.camera_layout import Focus, scene_extent
 from drgs.data.masks import MASK_KEEP
 from drgs.data.views import View
 
-__all__ = [
-    "FEWEST",
-    "VisualHull",
-    "back_project",
-    "uncovered_share",
-    "propose_along_rays",
-    "propose_in_view",
-    "propose_near_triangulated",
-    "random_subset",
-]
-
 FEWEST = 3
 """Triangulated points of a view that say how far away its other pixels may be."""
 _MAX_POINTS_PER_VIEW = 1_000  # triangulated points of a view that are used: bounds time; chosen

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from drgs.sfm.matching import Progress
     from drgs.sfm.pairing import Pairing
 
-__all__ = ["CAMERA_MODELS", "MATCHING", "SfmOptions", "SfmSummary", "StageTimes", "run_sfm"]
-
 CAMERA_MODELS = (
     "SIMPLE_PINHOLE",
     "PINHOLE",

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from drgs.io.outputs import LockedFolder
     from drgs.sfm.matching import Progress
 
-__all__ = ["Registration", "register"]
-
 _MODEL = ("cameras.bin", "images.bin", "points3D.bin")
 _SAME_LENS = 0.1  # relative difference of focal lengths, in EXIF and in the model, of one lens
 

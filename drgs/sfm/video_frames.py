@@ -23,8 +23,6 @@ from drgs.data.videos import VideoFile, VideoFrame, read_video
 from drgs.display.pictures import shrunk
 from drgs.sfm.findings import Finding
 
-__all__ = ["ExaminedVideo", "Picked", "PickedFrame", "examine", "pick_frames"]
-
 # Thresholds without a source are chosen by hand and were not varied in a study; tests/test_video_frames.py holds what
 # they do on walks, turns, stills and blur. Lengths are shares of the longer side of the picture.
 _SAMPLE_RATE = 10.0  # samples a second: at 30 frames a second each is the sharpest of 3

@@ -17,8 +17,6 @@ import torch
 
 from drgs.checks.arguments import ArgumentError
 
-__all__ = ["factors", "strained"]
-
 # share of the largest eigenvalue that one of 0 gets: a flat Gaussian has 1e-12 of its size as thickness
 _MIN_EIGENVALUE_SHARE = 1e-24
 _MIN_EIGENVALUE = 1e-40  # scene units squared, least eigenvalue: of a covariance of 0

@@ -25,19 +25,6 @@ from drgs.information.prior import Prior
 from drgs.studies.cells import Metric, Study
 from drgs.studies.protocols import ExperimentName, StudyName, StudyScale
 
-__all__ = [
-    "EXPERIMENTS",
-    "MADE_SPLIT",
-    "SIZES",
-    "Experiment",
-    "PaperNumbers",
-    "Sizes",
-    "fisher_policy",
-    "made_folder",
-    "metrics_of",
-    "study_of",
-]
-
 # -------------------------------------------------------------------------------------------------- sizes and data sets
 
 MADE_SPLIT = (3, 0)

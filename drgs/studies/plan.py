@@ -14,8 +14,6 @@ from drgs.studies.experiments import EXPERIMENTS, MADE_SPLIT, Experiment, study_
 from drgs.studies.protocols import PROTOCOLS, ExperimentName, ProtocolName, StudyScale
 from drgs.studies.rows import Cell
 
-__all__ = ["StudyPlan", "plan_of"]
-
 _ROOMS = {"tiny": ("room-1",), "small": ("room-1", "room-2"), "paper": ("room-1", "room-2")}
 _CAMERA = "cam00"  # of a kitchen: in the middle of the arc
 _STATED_SPLIT = (0, 0)  # the split that a data set states

@@ -11,8 +11,6 @@ from typing import Any, Literal
 
 from drgs.fitting.config import InitPoints
 
-__all__ = ["PROTOCOLS", "ExperimentName", "Protocol", "ProtocolName", "StudyName", "StudyScale"]
-
 ExperimentName = Literal["static", "dynamic", "prior", "blocks", "captures"]
 StudyName = Literal["static", "dynamic", "captures"]
 ProtocolName = Literal["paper", "blind", "fisherrf", "nbv-gym"]

@@ -14,8 +14,6 @@ from drgs.studies.protocols import PROTOCOLS
 from drgs.studies.statistics import Unit, estimate, unit_of, values_of, view_counts
 from drgs.studies.tables import comparison_table, curves, explained, markdown_table, paragraph, unlike_units
 
-__all__ = ["best_of_units", "results_page", "results_rows"]
-
 ResultRows = Sequence[Mapping[str, Any]]
 _COSTS = {"minutes": "minutes (steps and picks)", "peak_memory": "peak memory, GB", "pick_seconds": "seconds a pick"}
 _BEST_BY = "psnr"  # the metric by which a unit has a best policy

@@ -11,8 +11,6 @@ from typing import Any
 from drgs.fitting.config import Start
 from drgs.io.journal import Journal
 
-__all__ = ["Cell", "append_row", "cell_of", "is_done", "read_study"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Cell:

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from drgs.fitting.frames import Frame
     from drgs.fitting.records import LoadedRun
 
-__all__ = ["comparison_sheet"]
-
 _WIDTH = 300  # pixels of a column, about; chosen, as the numbers below
 _ZOOM = 0.5  # of the width and the height of a view: the part that is enlarged
 _GAP = 6  # pixels between pictures

@@ -32,21 +32,6 @@ from typing import Any
 import numpy as np
 from scipy.special import stdtrit
 
-__all__ = [
-    "FEWEST_UNITS",
-    "Effect",
-    "Unit",
-    "at_views",
-    "coverage",
-    "decided",
-    "differences",
-    "estimate",
-    "over_views",
-    "unit_of",
-    "values_of",
-    "view_counts",
-]
-
 Unit = tuple[str, tuple[int, int], tuple[str, ...]]
 """Scene, split, and what was given before the first pick."""
 

@@ -21,21 +21,6 @@ from drgs.studies.statistics import (
     values_of,
 )
 
-__all__ = [
-    "comparison_table",
-    "curves",
-    "difference_text",
-    "estimates_of",
-    "explained",
-    "labels_of",
-    "markdown_table",
-    "paragraph",
-    "range_text",
-    "title_of",
-    "unlike_units",
-    "verdict_of",
-]
-
 StudyRows = Sequence[Mapping[str, Any]]
 
 

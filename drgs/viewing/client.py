@@ -17,8 +17,6 @@ from drgs.cameras import Camera, intrinsics
 from drgs.data.camera_path import quaternion_of, rotation_of
 from drgs.ellipsoids import Y_00, Gaussians, semi_axes
 
-__all__ = ["ClientGaussians", "Pose", "camera_of", "looking", "pose_of"]
-
 _WIDEST = math.radians(150.0)  # widest view of a client; a wider one is drawn so wide
 _MAX_WINDOW = 1 << 15  # pixels of a side of a window
 _MAX_COORDINATE = 1e30  # world units, largest coordinate: far beyond any scene, and within float32 (3e38)

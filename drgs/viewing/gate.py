@@ -20,8 +20,6 @@ import socket
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-__all__ = ["Gate", "is_loopback"]
-
 _HOST = re.compile(r"(?:(?P<name>[A-Za-z0-9._-]{1,253})|\[(?P<address>[0-9A-Fa-f:.]{2,45})\])(?::\d{1,5})?")
 _TOKEN = re.compile(r"[A-Za-z0-9_~.-]{8,200}")
 # The client would connect to whatever server these name, and show what that says as a page of ours.

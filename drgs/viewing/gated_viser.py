@@ -29,8 +29,6 @@ from drgs.viewing.gate import Gate
 if TYPE_CHECKING:
     import viser
 
-__all__ = ["bound_socket", "gated_server", "guarded", "in_a_line"]
-
 _log = logging.getLogger(__name__)
 
 

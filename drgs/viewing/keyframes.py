@@ -20,8 +20,6 @@ from drgs.viewing import panel
 if TYPE_CHECKING:
     import viser
 
-__all__ = ["KeyframeFolder"]
-
 # Chosen by eye.
 _DEFAULT_STEP = 2.0  # seconds from a keyframe to the next
 _SHORTEST, _LONGEST = 0.1, 600.0  # of such a step

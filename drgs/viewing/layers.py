@@ -34,24 +34,6 @@ if TYPE_CHECKING:
     from drgs.integrator import Output
     from drgs.settings import RenderSettings
 
-__all__ = [
-    "SKETCH_VIEWS",
-    "ColorScale",
-    "DrawingProgress",
-    "Drawing",
-    "ExpectedError",
-    "Layer",
-    "PhotographMap",
-    "Steps",
-    "Uncertainty",
-    "bands",
-    "rendered_in_bands",
-    "layers_of",
-    "over",
-    "stages",
-    "tinted",
-]
-
 
 class DrawingProgress(NamedTuple):
     """How far a picture is.

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from drgs.viewing.placed_views import Sight
     from drgs.viewing.subject import Subject
 
-__all__ = ["header", "legend", "photograph", "status"]
-
 _STYLE = "font-size:0.8em;line-height:1.5;padding:0.2em 0.9em;overflow-wrap:anywhere"
 _STEPS = 9  # colors of a scale
 

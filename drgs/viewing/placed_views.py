@@ -16,18 +16,6 @@ from drgs.io.json_files import check_json, read_json
 if TYPE_CHECKING:
     from drgs.data import View
 
-__all__ = [
-    "NEXT",
-    "Ranking",
-    "Score",
-    "Sight",
-    "PlacedView",
-    "read_ranking",
-    "scale_colors",
-    "score_colors",
-    "placed_views_of",
-]
-
 Kind = Literal["training", "held out", "candidate"]
 
 NEXT = "next.json"

@@ -17,8 +17,6 @@ from drgs.viewing.session import Session
 from drgs.viewing.subject import Subject
 from drgs.viewing.worker import Worker
 
-__all__ = ["Viewer"]
-
 _log = logging.getLogger(__name__)
 
 _NEAR = 1e-3  # times the distance to the orbit center: where the client's pictures begin

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from drgs.viewing.subject import Subject
     from drgs.viewing.worker import Worker
 
-__all__ = ["REST", "Session"]
-
 REST = 0.3
 """Seconds that a camera rests before our picture is drawn."""
 

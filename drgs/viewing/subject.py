@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Scene
     from drgs.settings import RenderSettings
 
-__all__ = ["FirstView", "Subject"]
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FirstView:

@@ -10,8 +10,6 @@ import logging
 import threading
 from collections.abc import Callable, Hashable, Iterator
 
-__all__ = ["Worker"]
-
 _log = logging.getLogger(__name__)
 
 

@@ -11,8 +11,6 @@ from drgs.fitting.records import FitRecord, fit_record
 from drgs.io.json_files import check_json, parse_json, read_json
 from drgs.io.run import Run
 
-__all__ = ["Account", "account_of"]
-
 _ADVICE = "restore the file, or leave it out"
 _NUMBER = (None, float)
 _EVENTS: dict[str, dict] = {

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.pages.report.account import Account
 
-__all__ = ["camera_map", "is_available", "progress", "score_bars"]
-
 _WIDTH = 5.2  # inches: about a phone's width, where text keeps its size; wider screens enlarge it
 _STYLE: Any = {"svg.fonttype": "none", "font.size": 8.5, "font.family": "sans-serif", "axes.spines.top": False}
 _STYLE |= {"axes.spines.right": False, "axes.grid": True, "grid.color": "#e4e4e4", "grid.linewidth": 0.6}

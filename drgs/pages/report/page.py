@@ -24,8 +24,6 @@ from drgs.pages.report.pictures import Picture
 if TYPE_CHECKING:
     from drgs.pages.report.account import Account
 
-__all__ = ["GENERATOR", "Drawings", "page_html"]
-
 GENERATOR = "drgs report"
 """What the page says of itself: a file that does is one that may be replaced."""
 

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from drgs.pages.report.account import Account
     from drgs.settings import RenderSettings
 
-__all__ = ["Picture", "jpeg", "maps", "previews", "spread", "stills", "view_pictures"]
-
 _QUALITY = 88  # of JPEG; a page of thirty pictures then has about two megabytes
 _WIDEST = 1200  # pixels of width, at most; no page is wider
 _MOST_PREVIEWS = 12  # pictures of how the fit went, evenly spaced: a slider of more is no smoother

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from drgs.data import Dataset, View
     from drgs.fitting.records import LoadedRun
 
-__all__ = ["FILE", "write_report"]
-
 FILE = "report.html"
 _SHOWN_VIEWS = 4  # views that are shown with pictures; chosen for the size of the page
 _MOST_RESIDUALS = 24  # photographs whose residuals stand for those of all, at most; chosen for its seconds

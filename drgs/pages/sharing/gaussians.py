@@ -15,8 +15,6 @@ from drgs.codecs.sog import encode_sog
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["archive_of"]
-
 
 def archive_of(g: Gaussians) -> tuple[bytes, dict[str, Any] | None]:
     """The archive, and where in it spherical harmonics are; None where there are none.

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from drgs.information.nuisances import Nuisances
     from drgs.settings import RenderSettings
 
-__all__ = ["GaussianScale", "classes_layer", "error_of", "motion_layer", "scale_layer", "uncertainty_of"]
-
 _NUM_COLORS = 256  # entries of the table of colors: a Gaussian's is one byte
 _MOST_DECADES = 3.0  # range of a scale, at most, as in the report's maps; chosen
 _LEAST = 1e-12  # stands for 0 on a logarithmic scale, far below all that is measured

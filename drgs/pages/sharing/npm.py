@@ -18,8 +18,6 @@ import urllib.error
 import urllib.request
 from pathlib import Path
 
-__all__ = ["PACKAGED", "PACKAGES", "Package", "fetch_into", "viewer_files"]
-
 PACKAGED = Path(__file__).parent / "npm"
 """Where a wheel has the files of the packages, in a folder for each."""
 

@@ -11,8 +11,6 @@ from typing import Any
 
 from drgs.pages.sharing.npm import PACKAGES
 
-__all__ = ["SHARED_BY", "scene_html"]
-
 SHARED_BY = "drgs share"
 """What the page says of itself: a file that does is one that may be replaced."""
 

@@ -9,8 +9,6 @@ import numpy as np
 if TYPE_CHECKING:
     from drgs.cameras import Camera
 
-__all__ = ["PhotoKind", "columns", "photo", "upright_matrix"]
-
 PhotoKind = Literal["fitted", "next", "other"]
 """A photograph, a photograph to take next, or a view of a scene without photographs."""
 

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from drgs.pages.sharing.layers import GaussianScale
     from drgs.pages.sharing.placing import PhotoKind
 
-__all__ = ["FILE", "STORED_TIMES", "scene_of_file", "scene_of_run"]
-
 FILE = "scene.html"
 """The page in a run folder."""
 

@@ -17,8 +17,6 @@ from types import ModuleType
 
 from setuptools.command.build_py import build_py
 
-__all__ = ["BuildWithViewer"]
-
 
 class BuildWithViewer(build_py):
     """`build_py`, and the packages of `drgs.pages.sharing.npm` beside the modules."""

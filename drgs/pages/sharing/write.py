@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.pages.sharing.layers import GaussianScale
 
-__all__ = ["Shared", "write_page"]
-
 _NEAR_SHARE = 2e-3  # near plane over the distance to what is looked at: about gsplat's 0.01 in the units of COLMAP
 _FAR_FACTOR = 10.0  # far plane over the distance of the farthest Gaussian: a reader may step back as far; chosen
 
