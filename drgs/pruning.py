@@ -14,34 +14,29 @@ import dataclasses
 import logging
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Generic, Literal, TypeVar
+from typing import Generic, Literal, TypeVar
 
 import numpy as np
 import torch
 
-from drgs.cameras import some_cameras
+from drgs.cameras import Camera, some_cameras
 from drgs.data import scene_extent
 from drgs.deform import DynamicGaussians
 from drgs.display.progress import Bar
-from drgs.ellipsoids import Gaussians, check_gaussians, colors_only
+from drgs.ellipsoids import Gaussians, Scene, check_gaussians, colors_only
 from drgs.fisher import removal_error
+from drgs.fitting.components.base import Component
+from drgs.fitting.config import FitConfig, RateConfig
 from drgs.fitting.frames import Frame
 from drgs.fitting.losses import psnr
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.threads import fewer_torch_threads
 from drgs.fitting.trainer import Trainer
-from drgs.information.inputs import mask_list
+from drgs.information.inputs import Masks, mask_list
+from drgs.information.region import Region
+from drgs.information.semantics import SemanticMetric
 from drgs.integrator import render
 from drgs.settings import RenderSettings
-
-if TYPE_CHECKING:
-    from drgs.cameras import Camera
-    from drgs.ellipsoids import Scene
-    from drgs.fitting.components.base import Component
-    from drgs.fitting.config import FitConfig, RateConfig
-    from drgs.information.inputs import Masks
-    from drgs.information.region import Region
-    from drgs.information.semantics import SemanticMetric
 
 __all__ = ["POWER", "ROUNDS", "Pruned", "Round", "Unseen", "check_amount", "fit_on", "prune"]
 

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.cameras import Camera
 from drgs.cameras.shutters import BY_COLUMN, FORWARD
-
-if TYPE_CHECKING:
-    from drgs.cameras import Camera
 
 
 def reduced_size(camera: Camera, max_pixels: int) -> tuple[int, int]:

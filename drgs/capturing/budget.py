@@ -17,10 +17,10 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.data import Dataset, View
 from drgs.data.images import image_size, read_image
 from drgs.data.videos import VideoFrame, read_video
 from drgs.display.pictures import shrunk
@@ -32,9 +32,6 @@ from drgs.fitting.threads import fewer_torch_threads
 from drgs.io.atomic import temporary_folder
 from drgs.sfm.matching import FeatureOptions, extract, match, quiet, start_extraction
 from drgs.sfm.pairing import MAX_EXHAUSTIVE
-
-if TYPE_CHECKING:
-    from drgs.data import Dataset, View
 
 FEWEST_STEPS = 100
 """Least number of steps of a fit, however little time is left: fewer give no usable picture. Chosen."""

@@ -10,11 +10,12 @@ import dataclasses
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from drgs.capturing.record import FOLDER, Batch, CaptureRecord
+from drgs.data import Dataset
 from drgs.data.images import read_image
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import load_dataset
@@ -22,9 +23,6 @@ from drgs.fitting.records import fit_record, is_run
 from drgs.io.checkpoint import state_header
 from drgs.io.run import Run
 from drgs.runtime import memory
-
-if TYPE_CHECKING:
-    from drgs.data import Dataset
 
 SCENE = "scene"
 """Folder of the data set that structure from motion makes, in that of the capture."""

@@ -13,27 +13,24 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
 
+from drgs.cameras import Camera
 from drgs.capturing.next_views import pinhole_of, reachable_places
+from drgs.capturing.places import Place
+from drgs.data import Dataset
 from drgs.display.progress import Bar
+from drgs.ellipsoids import Gaussians
 from drgs.fitting.errors import run_error_record
 from drgs.fitting.records import fitted_views, load_run
-from drgs.information.expected_error import error_parts
+from drgs.information.expected_error import ErrorRecord, error_parts
 from drgs.information.quantity import opacity_of
 from drgs.integrator import render
+from drgs.io.run import Run
 from drgs.sfm.findings import Finding
-
-if TYPE_CHECKING:
-    from drgs.cameras import Camera
-    from drgs.capturing.places import Place
-    from drgs.data import Dataset
-    from drgs.ellipsoids import Gaussians
-    from drgs.information.expected_error import ErrorRecord
-    from drgs.io.run import Run
 
 _Any = TypeVar("_Any")
 

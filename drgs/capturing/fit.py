@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from drgs.capturing import diagnosis
 from drgs.capturing.budget import FitPlan, Pacer, plan_fit
-from drgs.capturing.capture import config_of
+from drgs.capturing.capture import Capture, config_of
 from drgs.capturing.expected_errors import of_expected_error
 from drgs.fitting.config import FitConfig
 from drgs.fitting.records import fit_record, is_run
@@ -17,14 +17,12 @@ from drgs.io.checkpoint import save_state
 from drgs.io.outputs import lock_folder
 from drgs.pages.report.write import FILE as REPORT
 from drgs.pages.sharing.scene import FILE as PAGE
-from drgs.train import fit
+from drgs.train import FitResult, fit
 from drgs.viewing.placed_views import NEXT
 
 if TYPE_CHECKING:
-    from drgs.capturing.capture import Capture
     from drgs.capturing.poses import Outcome
     from drgs.sfm.findings import Finding
-    from drgs.train import FitResult
 
 NEW_FIT_SHARE = 0.5
 """Of the photographs before, as many that join: beyond, the fit begins anew, since what was fitted to too few

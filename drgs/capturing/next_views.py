@@ -6,18 +6,21 @@ import dataclasses
 import statistics
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 
+from drgs.cameras import Camera
 from drgs.cameras.sizes import at_most
 from drgs.capturing.places import Place, meters_of, places_around
+from drgs.data import View
 from drgs.data.camera_layout import upright
 from drgs.data.camera_lists import camera_to_json
 from drgs.display.progress import Bar
+from drgs.ellipsoids import Gaussians
 from drgs.fitting.frames import load_dataset
-from drgs.fitting.records import fitted_views, load_run
+from drgs.fitting.records import LoadedRun, fitted_views, load_run
 from drgs.information.region import Region, RegionText, masked_photographs
 from drgs.information.scoring import Scoring
 from drgs.information.semantics import SemanticMetric
@@ -30,12 +33,6 @@ from drgs.select import select
 from drgs.selection.cache import Cache
 from drgs.settings import RenderSettings
 from drgs.viewing.placed_views import NEXT
-
-if TYPE_CHECKING:
-    from drgs.cameras import Camera
-    from drgs.data import View
-    from drgs.ellipsoids import Gaussians
-    from drgs.fitting.records import LoadedRun
 
 _INFORMATION_PIXELS = 20_000  # pixels of a view whose information is compared: a ranking takes many views
 _SOLID_OPACITY = 0.3  # opacity of Gaussians that one does not walk through

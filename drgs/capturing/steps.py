@@ -17,17 +17,18 @@ import shlex
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from drgs.capturing import diagnosis
 from drgs.capturing.budget import plan_frames
 from drgs.capturing.capture import Capture, CaptureOptions, Clock, Photographs, config_of
 from drgs.capturing.fit import fit_photographs
 from drgs.capturing.opening import new_files, open_record
-from drgs.capturing.poses import add_poses, find_poses, given_poses
+from drgs.capturing.poses import Outcome, add_poses, find_poses, given_poses
 from drgs.capturing.record import FOLDER, CaptureRecord, DoneStep, inputs_of
+from drgs.data import Dataset
 from drgs.data.images import list_images
 from drgs.display.progress import Bar, duration
+from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import is_run
 from drgs.fitting.resume import lock_run
@@ -40,11 +41,6 @@ from drgs.pages.sharing.scene import FILE as PAGE
 from drgs.pages.sharing.scene import scene_of_run
 from drgs.pages.sharing.write import write_page
 from drgs.sfm.image_folder import make_image_folder, named_files, usable_files
-
-if TYPE_CHECKING:
-    from drgs.capturing.poses import Outcome
-    from drgs.data import Dataset
-    from drgs.fitting.config import FitConfig
 
 Report = Callable[[Run, Path, "Dataset"], None]
 """Writes the report of a run to a file; the data set has the cameras as fitted."""

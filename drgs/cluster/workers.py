@@ -33,13 +33,12 @@ from drgs.cluster.agreement import (
     worker_statement,
 )
 from drgs.cluster.payloads import Missing, Payload, keep, opened_payload
-from drgs.information.quantity import ViewContext
+from drgs.information.quantity import Quantity, ViewContext
 
 if TYPE_CHECKING:
     from distributed import Client, Future, LocalCluster
 
     from drgs.ellipsoids import Scene
-    from drgs.information.quantity import Quantity
     from drgs.information.sums import Information
     from drgs.selection.pool import ViewRequest
     from drgs.settings import RenderSettings

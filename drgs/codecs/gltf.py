@@ -16,7 +16,7 @@ from __future__ import annotations
 import logging
 import struct
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -24,11 +24,8 @@ from drgs.cameras.origins import check_origin
 from drgs.codecs.codec import Codec
 from drgs.codecs.glb import BIN, JSON, glb_of
 from drgs.codecs.values import SH_COUNTS, assembled, check_count, flipped, log_of_scales, logits_of_opacities
-from drgs.ellipsoids import Y_00
+from drgs.ellipsoids import Y_00, Gaussians
 from drgs.io.json_files import check_json, parse_json
-
-if TYPE_CHECKING:
-    from drgs.ellipsoids import Gaussians
 
 _AXES = (-1, -1, 1)  # signs of x, y and z between glTF and PLY
 _NAME = "KHR_gaussian_splatting"

@@ -17,16 +17,13 @@ from __future__ import annotations
 import dataclasses
 import struct
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drgs.codecs.codec import Codec
 from drgs.codecs.splat import LEAST_FLOAT
 from drgs.codecs.values import SH_COUNTS, assembled, check_count, dc_of_colors, log_of_scales, logits_of_bytes
-
-if TYPE_CHECKING:
-    from drgs.ellipsoids import Gaussians
+from drgs.ellipsoids import Gaussians
 
 _HEADER_BYTES = 4096  # bytes of the header of a file
 _SECTION_BYTES = 1024  # bytes of the header of a section

@@ -10,20 +10,15 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drgs.codecs.clustering import morton_order
 from drgs.codecs.codec import Codec
 from drgs.codecs.ply import note_antialiased
-from drgs.codecs.ply_headers import is_antialiased, offset_line, ply_offset, ply_source, read_ply_header
+from drgs.codecs.ply_headers import PlyElement, is_antialiased, offset_line, ply_offset, ply_source, read_ply_header
 from drgs.codecs.values import assembled, check_count, dc_of_colors, logits_of_bytes, quats_of_smallest
-from drgs.ellipsoids import Y_00
-
-if TYPE_CHECKING:
-    from drgs.codecs.ply_headers import PlyElement
-    from drgs.ellipsoids import Gaussians
+from drgs.ellipsoids import Y_00, Gaussians
 
 _log = logging.getLogger(__name__)
 

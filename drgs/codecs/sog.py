@@ -22,7 +22,7 @@ import logging
 import math
 import zipfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -32,10 +32,8 @@ from drgs.codecs.clustering import codebook, morton_order, palette
 from drgs.codecs.codec import Codec
 from drgs.codecs.folders import is_checkpoint, names_in_archive
 from drgs.codecs.values import SH_COUNTS, assembled, check_count, logits_of_bytes, quats_of_smallest
+from drgs.ellipsoids import Gaussians
 from drgs.io.json_files import check_json, parse_json
-
-if TYPE_CHECKING:
-    from drgs.ellipsoids import Gaussians
 
 _log = logging.getLogger(__name__)
 _MAX_META_BYTES = 4 << 20  # bytes

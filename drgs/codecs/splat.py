@@ -8,16 +8,12 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drgs.codecs.codec import Codec
 from drgs.codecs.values import assembled, check_count, dc_of_colors, log_of_scales, logits_of_bytes
-from drgs.ellipsoids import Y_00
-
-if TYPE_CHECKING:
-    from drgs.ellipsoids import Gaussians
+from drgs.ellipsoids import Y_00, Gaussians
 
 _log = logging.getLogger(__name__)
 

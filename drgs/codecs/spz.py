@@ -26,7 +26,6 @@ import math
 import struct
 import zlib
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -36,9 +35,7 @@ from drgs.codecs.codec import Codec
 from drgs.codecs.ply import note_antialiased
 from drgs.codecs.ply_headers import offset_line
 from drgs.codecs.values import SH_COUNTS, assembled, check_count, flipped, logits_of_bytes, quats_of_smallest, spread
-
-if TYPE_CHECKING:
-    from drgs.ellipsoids import Gaussians
+from drgs.ellipsoids import Gaussians
 
 _AXES = (1, -1, -1)  # signs of x, y and z between SPZ and PLY
 _COLOR_SCALE = 0.15  # the format holds the DC coefficient times 0.15

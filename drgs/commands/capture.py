@@ -7,17 +7,14 @@ from __future__ import annotations
 
 import functools
 import shlex
-from typing import TYPE_CHECKING
 
 from drgs.capturing.budget import seconds_of_budget
 from drgs.capturing.capture import CaptureOptions
 from drgs.capturing.next_views import rank_next
 from drgs.capturing.steps import run_capture
+from drgs.commands.options import Capture
 from drgs.commands.report import report_of
 from drgs.fitting.config import FitConfig
-
-if TYPE_CHECKING:
-    from drgs.commands.options import Capture
 
 
 def run(args: Capture) -> None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from drgs import runtime
 from drgs.cameras.origins import origin_text
 from drgs.cameras.sizes import at_most
+from drgs.commands.options import Crossval
 from drgs.commands.orbits import OrbitShape
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import views_to_sample
@@ -19,9 +18,6 @@ from drgs.io.outputs import atomic_write, check_file, lock_folder, write_json
 from drgs.lab import ladder, rasterizers
 from drgs.lab.crossval import Result, crossval
 from drgs.lab.report import html
-
-if TYPE_CHECKING:
-    from drgs.commands.options import Crossval
 
 
 def run(args: Crossval) -> int:

@@ -12,7 +12,6 @@ import statistics
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -20,11 +19,13 @@ import torch
 from drgs import reference, runtime
 from drgs.cameras import Camera, intrinsics_from_fov, look_at
 from drgs.cameras.sizes import cropped
+from drgs.commands.options import Demo
 from drgs.commands.report import report_of
 from drgs.commands.scene import maker_of
-from drgs.data import load
+from drgs.data import Dataset, load
 from drgs.display import pictures, tables
 from drgs.display.progress import Bar
+from drgs.ellipsoids import Gaussians
 from drgs.fitting import metrics
 from drgs.fitting.frames import Frame, frames_for
 from drgs.fitting.losses import psnr_of
@@ -34,13 +35,7 @@ from drgs.io.journal import SCHEMA
 from drgs.io.outputs import LockedFolder, lock_folder, write_json
 from drgs.pages.report.write import FILE
 from drgs.settings import RenderSettings
-from drgs.train import FitConfig, fit
-
-if TYPE_CHECKING:
-    from drgs.commands.options import Demo
-    from drgs.data import Dataset
-    from drgs.ellipsoids import Gaussians
-    from drgs.train import FitResult
+from drgs.train import FitConfig, FitResult, fit
 
 _PRESETS = {
     "exact": "exact order along every ray, nothing cut off above 1e-5",

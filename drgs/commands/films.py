@@ -13,14 +13,12 @@ from drgs.cameras import Camera, intrinsics
 from drgs.codecs.ply import note_offset, save_ply
 from drgs.commands.viewpoints import frame_size
 from drgs.data.camera_layout import level_frame, upright
-from drgs.data.camera_path import read_camera_path
+from drgs.data.camera_path import CameraPath, read_camera_path
 from drgs.display.progress import Bar
 
 if TYPE_CHECKING:
-    from drgs.cameras import Camera
     from drgs.commands.options import Render
     from drgs.commands.scene_input import SceneInput
-    from drgs.data.camera_path import CameraPath
     from drgs.ellipsoids import Scene
     from drgs.settings import RenderSettings
 

@@ -20,45 +20,38 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 
 from drgs import fisher
+from drgs.cameras import Camera
+from drgs.commands.options import Fisher
 from drgs.commands.orbits import OrbitShape
 from drgs.commands.regions import region_of
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewpoints import Source, check_lenses, evenly, known_views, views_to_compare, with_times
+from drgs.commands.viewpoints import Known, Source, check_lenses, evenly, known_views, views_to_compare, with_times
 from drgs.data.camera_lists import camera_to_json
 from drgs.display import pictures, tables
 from drgs.display.progress import Bar
+from drgs.ellipsoids import Scene
 from drgs.fitting.config import FitConfig
 from drgs.fitting.errors import error_record_of_views, run_error_record
 from drgs.gain import Information, Prior, check, information_gain, variances
 from drgs.information.blocks import MAP_PRIOR, SceneBlocks
-from drgs.information.expected_error import PARTS, error_parts
+from drgs.information.expected_error import PARTS, ErrorRecord, error_parts
 from drgs.information.maps import fisherrf_map, moments_map
 from drgs.information.region import RegionText
+from drgs.information.scoring import Scoring
 from drgs.information.sums import add, together
 from drgs.integrator import render
 from drgs.io.checkpoint import save_state
 from drgs.io.journal import SCHEMA
-from drgs.io.outputs import lock_folder, write_json
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from drgs.cameras import Camera
-    from drgs.commands.options import Fisher
-    from drgs.commands.viewpoints import Known
-    from drgs.ellipsoids import Scene
-    from drgs.gain import Prior
-    from drgs.information.expected_error import ErrorRecord
-    from drgs.information.scoring import Scoring
-    from drgs.io.outputs import LockedFolder
-    from drgs.settings import RenderSettings
+from drgs.io.outputs import LockedFolder, lock_folder, write_json
+from drgs.settings import RenderSettings
 
 KINDS = ("variance", "share")  # of maps
 _log = logging.getLogger(__name__)

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING
 
 from drgs.commands.eval import print_table
+from drgs.commands.options import Fit
 from drgs.commands.report import report_of
+from drgs.data import Dataset
 from drgs.data.view_checks import default_background
+from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import fit_record, is_run
 from drgs.fitting.resume import lock_run
 from drgs.io.run import Run
 from drgs.pages.report.write import FILE
 from drgs.train import fit
-
-if TYPE_CHECKING:
-    from drgs.commands.options import Fit
-    from drgs.data import Dataset
-    from drgs.fitting.config import FitConfig
 
 _log = logging.getLogger(__name__)
 

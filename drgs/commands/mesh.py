@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.cameras import Camera
 from drgs.cameras.origins import origin_text
 from drgs.commands.convert import still
+from drgs.commands.options import Mesh
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import check_lenses, evenly, known_views
 from drgs.display.progress import Bar
+from drgs.ellipsoids import Gaussians
 from drgs.io.checkpoint import state_header
 from drgs.io.outputs import lock_folder
 from drgs.meshing.extraction import mesh_of
 from drgs.meshing.writing import MESH_SUFFIXES, save_mesh
-
-if TYPE_CHECKING:
-    from drgs.cameras import Camera
-    from drgs.commands.options import Mesh
-    from drgs.ellipsoids import Gaussians
 
 
 def run(args: Mesh) -> None:

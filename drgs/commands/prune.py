@@ -5,15 +5,20 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import torch
+
+from drgs.cameras import Camera
 from drgs.codecs import check_suffix, origin_file, save_gaussians
+from drgs.commands.options import Prune
 from drgs.commands.regions import region_of
 from drgs.commands.scene_input import SELECTION, SceneInput
 from drgs.commands.viewpoints import Source, check_lenses, warn_of_unseen
+from drgs.data import View
 from drgs.display import tables
 from drgs.display.progress import Bar
-from drgs.ellipsoids import Gaussians
+from drgs.ellipsoids import Gaussians, Scene
 from drgs.fitting.components.base import Checkpoint, Component
 from drgs.fitting.components.exposure import ExposureComponent
 from drgs.fitting.components.poses import CAMERAS
@@ -23,23 +28,13 @@ from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.metrics import TRAIN_VIEWS, through_renderers
 from drgs.fitting.records import fitted_views, is_run, of_some
 from drgs.fitting.renderers import renderers_to_measure
-from drgs.information.region import RegionText
+from drgs.information.region import Region, RegionText
 from drgs.io.checkpoint import load_state, save_state, state_header
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import atomic_write, lock_folder, write_json
 from drgs.io.run import Run
-from drgs.pruning import ROUNDS, check_amount, fit_on, prune
-
-if TYPE_CHECKING:
-    import torch
-
-    from drgs.cameras import Camera
-    from drgs.commands.options import Prune
-    from drgs.data import View
-    from drgs.ellipsoids import Scene
-    from drgs.information.region import Region
-    from drgs.pruning import Pruned
-    from drgs.settings import RenderSettings
+from drgs.pruning import ROUNDS, Pruned, check_amount, fit_on, prune
+from drgs.settings import RenderSettings
 
 _COPIED = ("config.json", "env.json", "log.jsonl", SELECTION, EMBEDDINGS, CAMERAS)
 """Files of a run that hold for it with fewer Gaussians, too."""

@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
+from drgs.cameras import Camera
 from drgs.cameras.sizes import at_most
 from drgs.codecs import save_gaussians
+from drgs.commands.options import Query
 from drgs.commands.orbits import OrbitShape
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.semantic_pictures import OPAQUE
@@ -19,20 +21,15 @@ from drgs.data.camera_lists import camera_to_json
 from drgs.data.checks import read_npy
 from drgs.display import pictures
 from drgs.display.progress import Bar
-from drgs.features.decoder import load_decoder
+from drgs.ellipsoids import Gaussians
+from drgs.features.decoder import Decoder, load_decoder
 from drgs.features.pictures import mask_picture
 from drgs.features.query import TEMPERATURE, TextQuery
 from drgs.features.teacher import read_tensor
 from drgs.integrator import render
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import lock_folder, write_json
-
-if TYPE_CHECKING:
-    from drgs.cameras import Camera
-    from drgs.commands.options import Query
-    from drgs.ellipsoids import Gaussians
-    from drgs.features.decoder import Decoder
-    from drgs.settings import RenderSettings
+from drgs.settings import RenderSettings
 
 
 def run(args: Query) -> None:

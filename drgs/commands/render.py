@@ -14,12 +14,13 @@ import time
 import types
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 
 from drgs import runtime
+from drgs.cameras import Camera
 from drgs.cameras.sizes import cropped
 from drgs.commands.films import (
     Film,
@@ -35,27 +36,22 @@ from drgs.commands.films import (
     up_of,
     write_plys,
 )
+from drgs.commands.options import Render
 from drgs.commands.orbits import OrbitShape
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.semantic_pictures import PICTURE_KINDS, picture_functions
+from drgs.commands.semantic_pictures import PICTURE_KINDS, PictureFunction, picture_functions
 from drgs.commands.viewpoints import captured_cameras, check_lenses, views_to_render
 from drgs.data.camera_layout import middle_camera
 from drgs.data.camera_lists import camera_to_json, save_cameras_json
 from drgs.display import pictures
 from drgs.display.mp4 import Mp4, need_mp4
 from drgs.display.progress import Bar, duration
-from drgs.ellipsoids import colors_only
+from drgs.ellipsoids import Gaussians, Scene, colors_only
 from drgs.integrator import render
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import lock_folder, write_json
 from drgs.runtime import memory
-
-if TYPE_CHECKING:
-    from drgs.cameras import Camera
-    from drgs.commands.options import Render
-    from drgs.commands.semantic_pictures import PictureFunction
-    from drgs.ellipsoids import Gaussians, Scene
-    from drgs.settings import RenderSettings
+from drgs.settings import RenderSettings
 
 _log = logging.getLogger(__name__)
 

@@ -6,12 +6,13 @@ import json
 import logging
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from drgs.checks.records import options_in
 from drgs.commands.command_line import words_of
-from drgs.commands.options import Fit
+from drgs.commands.options import Fit, Report
 from drgs.commands.values import override
+from drgs.data import Dataset
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import fit_record
@@ -21,10 +22,6 @@ from drgs.io.outputs import check_file
 from drgs.io.run import Run
 from drgs.pages.report.page import GENERATOR
 from drgs.pages.report.write import FILE, write_report
-
-if TYPE_CHECKING:
-    from drgs.commands.options import Report
-    from drgs.data import Dataset
 
 _log = logging.getLogger(__name__)
 

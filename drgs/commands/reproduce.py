@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from drgs.commands.command_line import config_fields
 from drgs.commands.fisher import InformationMaps
-from drgs.commands.options import Views
+from drgs.commands.options import Reproduce, Views
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import check_lenses, held_out_views, known_views
 from drgs.display import tables
@@ -31,7 +31,6 @@ from drgs.studies.sheets import comparison_sheet
 
 if TYPE_CHECKING:
     from drgs.cluster.workers import Cluster
-    from drgs.commands.options import Reproduce
 
 # of all experiments in one folder: they share cells
 _ROWS = "rows.jsonl"

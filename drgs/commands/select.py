@@ -4,29 +4,26 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
+from drgs.cameras import Camera
+from drgs.commands.options import Select
 from drgs.commands.orbits import OrbitShape
 from drgs.commands.regions import region_of
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewpoints import Source, check_lenses, known_views, views_to_compare, with_times
+from drgs.commands.viewpoints import Known, Source, check_lenses, known_views, views_to_compare, with_times
 from drgs.data.camera_lists import camera_to_json
 from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.information.criteria import criterion_named
 from drgs.information.region import RegionText
+from drgs.information.scoring import Scoring
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import check_file, write_json
 from drgs.select import Refine, Selection, policy_named, select
 from drgs.selection.policies import check_region
-
-if TYPE_CHECKING:
-    from drgs.cameras import Camera
-    from drgs.commands.options import Select
-    from drgs.commands.viewpoints import Known
-    from drgs.information.scoring import Scoring
 
 _SHORT = {
     "rotations": "rot.",

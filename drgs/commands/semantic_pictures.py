@@ -4,16 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
 from drgs.commands.scene_input import SceneInput
-
-if TYPE_CHECKING:
-    import torch
-
-    from drgs.integrator import Output
+from drgs.integrator import Output
 
 PICTURE_KINDS = ("features", "labels", "overlay")
 OPAQUE = 0.5

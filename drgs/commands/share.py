@@ -5,16 +5,19 @@ from __future__ import annotations
 import contextlib
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.cameras import Camera
 from drgs.cameras.origins import origin_text
+from drgs.commands.options import Share
 from drgs.commands.orbits import scene_orbit
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import known_views
+from drgs.data import Dataset
+from drgs.ellipsoids import Gaussians
 from drgs.fitting.frames import load_dataset
-from drgs.fitting.records import is_run, load_run
+from drgs.fitting.records import FitRecord, is_run, load_run
 from drgs.fitting.resume import lock_run
 from drgs.io.foreign import refuse_foreign
 from drgs.io.outputs import check_file
@@ -23,13 +26,6 @@ from drgs.pages.sharing.page import SHARED_BY
 from drgs.pages.sharing.scene import FILE, scene_of_file, scene_of_run
 from drgs.pages.sharing.write import Shared, write_page
 from drgs.viewing.placed_views import read_ranking
-
-if TYPE_CHECKING:
-    from drgs.cameras import Camera
-    from drgs.commands.options import Share
-    from drgs.data import Dataset
-    from drgs.ellipsoids import Gaussians
-    from drgs.fitting.records import FitRecord
 
 _DEFAULT_SIZE = 960, 640  # pixels of the first view of a scene without photographs: about the shape of a screen; chosen
 

@@ -26,10 +26,12 @@ import dataclasses
 import datetime
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from drgs import runtime
+from drgs.cameras import Camera
 from drgs.cameras.sizes import at_most
+from drgs.commands.options import Tradeoff
 from drgs.commands.orbits import OrbitShape
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import views_to_sample
@@ -52,10 +54,6 @@ from drgs.lab.tradeoff import (
     plot,
     recommend,
 )
-
-if TYPE_CHECKING:
-    from drgs.cameras import Camera
-    from drgs.commands.options import Tradeoff
 
 
 def run(args: Tradeoff) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from drgs.commands.orbits import OrbitShape, capture_orbit, scene_orbit
 from drgs.commands.scene_input import SELECTION, SceneInput, ranking_of
-from drgs.commands.semantic_pictures import PICTURE_KINDS, picture_functions
+from drgs.commands.semantic_pictures import PICTURE_KINDS, PictureFunction, picture_functions
 from drgs.commands.values import UP
 from drgs.commands.viewpoints import Known, Source, evenly, known_views
 from drgs.data import View as DataView
@@ -38,7 +38,6 @@ from drgs.viewing.subject import FirstView, Subject
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.commands.options import View
-    from drgs.commands.semantic_pictures import PictureFunction
     from drgs.information.expected_error import ErrorRecord
     from drgs.viewing.server import Viewer
 

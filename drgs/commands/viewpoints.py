@@ -23,7 +23,7 @@ from drgs import data
 from drgs.cameras.sizes import at_most, resized_alike
 from drgs.codecs.folders import cameras_of_model
 from drgs.commands.frames import DATAPARSER_TRANSFORMS
-from drgs.commands.options import SIDE
+from drgs.commands.options import SIDE, Crossval, Fisher, Query, Render, Select, Tradeoff, Views
 from drgs.commands.orbits import OrbitShape, capture_orbit, dome, scene_orbit
 from drgs.commands.values import UP
 from drgs.data.camera_lists import is_camera_list, load_cameras_json
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from drgs.cameras import Camera
-    from drgs.commands.options import Crossval, Fisher, Query, Render, Select, Tradeoff, Views
     from drgs.commands.scene_input import SceneInput
     from drgs.data import Dataset, View
     from drgs.ellipsoids import Gaussians

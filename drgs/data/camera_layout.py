@@ -6,17 +6,12 @@ Poses and image sizes only; no image is opened.
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 
-from drgs.cameras import look_at
+from drgs.cameras import Camera, look_at
 from drgs.cameras.origins import origin_near, rounding
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from drgs.cameras import Camera
 
 # Angles and shares are chosen by hand, so that orbits, forward-facing captures, walks and drives of the data sets in
 # tests/test_orbits.py are classified rightly; no study varied them.

@@ -6,17 +6,14 @@ import dataclasses
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.data.semantics import Semantics
 from drgs.data.views import View
 from drgs.io.journal import SCHEMA
 from drgs.io.json_files import check_json, read_json
 from drgs.io.outputs import write_json
-
-if TYPE_CHECKING:
-    from drgs.data.semantics import Semantics
 
 
 @dataclasses.dataclass

@@ -15,8 +15,6 @@ from drgs.data.images import image_size
 if TYPE_CHECKING:
     import torch
 
-    from drgs.cameras import Camera
-
 ASPECT_TOLERANCE = 0.01  # of the shape of an image against that of its camera
 
 

@@ -22,13 +22,10 @@ from __future__ import annotations
 import logging
 import re
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING
 
+from drgs.data.dataset import Dataset
 from drgs.data.semantics import CLASS_FILES, SEGMENTS, Semantics
-
-if TYPE_CHECKING:
-    from drgs.data.dataset import Dataset
-    from drgs.data.views import View
+from drgs.data.views import View
 
 TEACHER_FOLDERS = ("rgb_feature_langseg", "sam_embeddings")
 LABEL_FOLDERS = ("semantic_class", "semantic", "labels")

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.cameras import Camera
 from drgs.data.dataset import Dataset
 from drgs.data.images import image_size
 from drgs.data.resampling import fit_to_image, resized_to
@@ -17,11 +17,6 @@ from drgs.data.videos import VideoFile, VideoFrame
 from drgs.data.view_checks import report_missing_images
 from drgs.data.views import View
 from drgs.io.foreign import is_file
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from drgs.cameras import Camera
 
 # What folders of synchronous cameras are called.
 CAMERA_NAME = re.compile(r"cam[a-z_-]*\d{1,9}", re.IGNORECASE)

@@ -8,18 +8,15 @@ import filecmp
 import logging
 from collections import defaultdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drgs.cameras.origins import rounding
+from drgs.data.dataset import Dataset
 from drgs.data.images import png_has_alpha, read_image, unit_range
 from drgs.data.resampling import resize_area
+from drgs.data.views import View
 from drgs.io.foreign import is_file
-
-if TYPE_CHECKING:
-    from drgs.data.dataset import Dataset
-    from drgs.data.views import View
 
 # of cameras that film what moves (docs/dynamic-data.md, Layouts)
 _FEW_PLACES = 4

@@ -24,7 +24,7 @@ import torch
 
 from drgs.cameras.origins import decimals
 from drgs.cameras.sizes import at_most
-from drgs.ellipsoids import colors_only
+from drgs.ellipsoids import Scene, colors_only
 from drgs.information.complement import remaining
 from drgs.information.nuisances import NO_NUISANCES, Nuisances
 from drgs.information.quantity import Quantity, ViewContext
@@ -33,7 +33,6 @@ from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
-    from drgs.ellipsoids import Scene
     from drgs.information.semantics import SemanticMetric
 
 BACKDROP = "backdrop"  # the group of its information

@@ -18,12 +18,14 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
-from drgs.information.backdrop import BACKDROP, Backdrop, backdrop_sphere
-from drgs.information.choices import BLOCKS, GAUSSIAN_GROUPS
+from drgs.cameras import Camera
+from drgs.ellipsoids import Gaussians, Scene
+from drgs.information.backdrop import BACKDROP, Backdrop, ComputeViews, backdrop_sphere
+from drgs.information.choices import BLOCKS, GAUSSIAN_GROUPS, Block, NetworkEstimate
 from drgs.information.criteria import criterion_named
 from drgs.information.network_groups import NETWORK_GROUPS, network_groups
 from drgs.information.nuisances import Nuisances
@@ -32,12 +34,6 @@ from drgs.information.quantity import Quantity, ViewContext
 from drgs.information.scoring import Scoring
 from drgs.information.semantics import SemanticMetric
 from drgs.information.sums import Information
-
-if TYPE_CHECKING:
-    from drgs.cameras import Camera
-    from drgs.ellipsoids import Gaussians, Scene
-    from drgs.information.backdrop import ComputeViews
-    from drgs.information.choices import Block, NetworkEstimate
 
 MAP_PRIOR = Prior(1.0)
 """lambda with which a map of the variance follows the error best, of 1e-6, 1e-2 and 1 (docs/active-static.md)."""

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
+from drgs.cameras import Camera
 from drgs.checks.arguments import must_be
+from drgs.ellipsoids import Gaussians, Scene
 from drgs.information.groups import groups_of, scene_groups
-from drgs.information.quantity import Quantity
+from drgs.information.quantity import Quantity, ViewContext
 from drgs.integrator import render_jvp
+from drgs.settings import RenderSettings
 from drgs.tracing.inputs import check_view, gaussians_at
-
-if TYPE_CHECKING:
-    from drgs.cameras import Camera
-    from drgs.ellipsoids import Gaussians, Scene
-    from drgs.information.quantity import ViewContext
-    from drgs.settings import RenderSettings
 
 BATCH = 16  # tangents of one traversal; chosen: bounds memory
 

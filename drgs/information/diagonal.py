@@ -13,12 +13,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
 
-from drgs.ellipsoids import DeformableScene
+from drgs.ellipsoids import DeformableScene, Scene
 from drgs.information.choices import METHODS, Method
 from drgs.information.columns import BATCH, jacobian_columns
 from drgs.information.complement import remaining
@@ -29,16 +29,12 @@ from drgs.information.jacobian import GEOMETRY, BlockSums
 from drgs.information.maps import variance_map
 from drgs.information.nuisances import NO_NUISANCES, Nuisances
 from drgs.information.pullback import Pullback
-from drgs.information.quantity import Quantity
+from drgs.information.quantity import Quantity, ViewContext
 from drgs.information.semantics import SemanticMetric
 from drgs.information.sums import Information
 from drgs.runtime import alone
 from drgs.tracing.call import Call
 from drgs.tracing.errors import own_errors
-
-if TYPE_CHECKING:
-    from drgs.ellipsoids import Scene
-    from drgs.information.quantity import ViewContext
 
 
 @dataclasses.dataclass(frozen=True)

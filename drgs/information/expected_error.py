@@ -29,17 +29,20 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 
+from drgs.cameras import Camera
 from drgs.cameras.sizes import cropped
 from drgs.checks.arguments import ArgumentError, kind_of, must_be
 from drgs.checks.records import nested, stated
+from drgs.ellipsoids import Gaussians, Scene
 from drgs.information.backdrop import BACKDROP, Backdrop, Sphere, backdrop_sphere
 from drgs.information.diagonal import Diagonal
 from drgs.information.gains import variances
+from drgs.information.inputs import Masks
 from drgs.information.maps import variance_map
 from drgs.information.misfit import BEHIND, CONTRAST, RESIDUALS, WEIGHTS, Misfit
 from drgs.information.prior import Prior, unit_length
@@ -48,13 +51,8 @@ from drgs.information.sums import Information, add
 from drgs.integrator import render
 from drgs.runtime import alone
 from drgs.settings import RenderSettings
+from drgs.tracing.call import Output
 from drgs.tracing.inputs import check_view, gaussians_at
-
-if TYPE_CHECKING:
-    from drgs.cameras import Camera
-    from drgs.ellipsoids import Gaussians, Scene
-    from drgs.information.inputs import Masks
-    from drgs.tracing.call import Output
 
 __all__ = ["PARTS", "ErrorRecord", "error_parts", "error_record", "expected_error", "residual_record"]
 

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING
 import torch
 
 from drgs.checks.arguments import must_be
-from drgs.ellipsoids import Y_00
-from drgs.information.backdrop import BACKDROP, CELLS, backdrop_variance
+from drgs.ellipsoids import Y_00, Gaussians
+from drgs.information.backdrop import BACKDROP, CELLS, Sphere, backdrop_variance
 from drgs.information.gains import variances
 from drgs.information.groups import groups_of
 from drgs.information.prior import Prior
@@ -31,8 +31,6 @@ from drgs.oracle import sh_colors
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
-    from drgs.ellipsoids import Gaussians
-    from drgs.information.backdrop import Sphere
     from drgs.information.quantity import ViewContext
     from drgs.information.semantics import SemanticMetric
     from drgs.settings import RenderSettings

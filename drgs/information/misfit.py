@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, ClassVar
 import drjit as dr
 import torch
 
-from drgs.information.quantity import Quantity
+from drgs.information.quantity import Quantity, ViewContext
 from drgs.runtime import alone
 from drgs.tracing.arrays import Float, Lib, Mask, UInt32
 from drgs.tracing.bridge import to_drjit
@@ -28,7 +28,6 @@ from drgs.tracing.sums import add_row
 
 if TYPE_CHECKING:
     from drgs.information.jacobian import Row
-    from drgs.information.quantity import ViewContext
     from drgs.information.replay import Replay, Walk, WalkSums
     from drgs.information.semantics import SemanticMetric
 

@@ -37,8 +37,8 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 
 from drgs.checks.arguments import must_be
-from drgs.dynamics.jacobian import scene_jacobian
-from drgs.ellipsoids import DeformableScene
+from drgs.dynamics.jacobian import SceneJacobian, scene_jacobian
+from drgs.ellipsoids import DeformableScene, Gaussians, Scene
 from drgs.information.choices import NETWORK_ESTIMATES, NetworkEstimate
 from drgs.information.complement import Eliminated
 from drgs.information.elimination import eliminated_of
@@ -48,7 +48,7 @@ from drgs.information.jacobian import GEOMETRY
 from drgs.information.network_groups import NETWORK_GROUPS, network_groups
 from drgs.information.nuisances import NO_NUISANCES, Nuisances
 from drgs.information.pullback import Pullback
-from drgs.information.quantity import Quantity, original
+from drgs.information.quantity import Quantity, ViewContext, original
 from drgs.information.replay import Replay
 from drgs.information.sums import Information
 from drgs.runtime import alone
@@ -59,9 +59,6 @@ from drgs.tracing.tangents import push_forward
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
-    from drgs.dynamics.jacobian import SceneJacobian
-    from drgs.ellipsoids import Gaussians, Scene
-    from drgs.information.quantity import ViewContext
     from drgs.information.semantics import SemanticMetric
     from drgs.settings import RenderSettings
 

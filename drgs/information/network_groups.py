@@ -7,14 +7,9 @@ The sibling of groups.py, whose groups are entries of Gaussians. A scene that mo
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 
-from drgs.ellipsoids import DeformableScene
-
-if TYPE_CHECKING:
-    from drgs.ellipsoids import Scene
+from drgs.ellipsoids import DeformableScene, Scene
 
 NETWORK_GROUPS = {"grid": "phi.grid.", "mlp": "phi.mlp."}
 """Group -> what the names of its parameters begin with."""

@@ -28,16 +28,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar, cast
 
 import torch
 
-from drgs.cameras import some_cameras
+from drgs.cameras import Camera, some_cameras
 from drgs.ellipsoids import DeformableScene, Gaussians, Scene, check_any_scene, colors_only
-from drgs.information.inputs import mask_list
+from drgs.information.inputs import Masks, mask_list
 from drgs.information.sums import Information, add
 from drgs.settings import RenderSettings
 from drgs.tracing.inputs import check_scene, gaussians_at
 
 if TYPE_CHECKING:
-    from drgs.cameras import Camera
-    from drgs.information.inputs import Masks
     from drgs.information.replay import Replay, WalkSums
     from drgs.information.semantics import SemanticMetric
 

@@ -24,17 +24,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 
-from drgs.information.quantity import Quantity
+from drgs.information.quantity import Quantity, ViewContext
 from drgs.information.semantics import SemanticMetric
 from drgs.runtime import alone
-
-if TYPE_CHECKING:
-    from drgs.information.quantity import ViewContext
-    from drgs.settings import RenderSettings
+from drgs.settings import RenderSettings
 
 REMOVAL = "removal"
 """Name of what `RemovalError` computes."""

@@ -28,7 +28,7 @@ import torch
 
 from drgs import fisher, reference, runtime
 from drgs.cameras.sizes import at_most, by_share
-from drgs.integrator import render, render_rays
+from drgs.integrator import Output, render, render_rays
 from drgs.io.outputs import replacing
 from drgs.settings import RenderSettings
 
@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
     from drgs.information.choices import Method
-    from drgs.integrator import Output
-    from drgs.settings import RenderSettings
 
 CLOCKS = ("forward", "forward_backward", "fisher")
 """What is timed: an image; an image and its gradients; the Fisher diagonal of a view."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,15 +15,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from drgs import fisher
+from drgs.cameras import Camera
+from drgs.ellipsoids import Gaussians
 from drgs.meshing.depths import DepthView, depth_views, footprint
 from drgs.meshing.fusion import bricks_of, sampled, surface
 from drgs.meshing.options import POINTS, MeshOptions
 from drgs.runtime import memory
 from drgs.settings import RenderSettings
-
-if TYPE_CHECKING:
-    from drgs.cameras import Camera
-    from drgs.ellipsoids import Gaussians
 
 __all__ = ["FINENESS", "TriangleMesh", "deviations_of", "mesh_of", "mesh_of_depths"]
 

@@ -18,11 +18,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.cameras import rigid
+from drgs.cameras import Camera, rigid
 from drgs.meshing.options import BRICK
 
 if TYPE_CHECKING:
-    from drgs.cameras import Camera
     from drgs.meshing.depths import DepthView
 
 _SNAP_DISTANCE = 1e-4  # of a cell: a vertex nearer to a lattice point than that is put on it; chosen

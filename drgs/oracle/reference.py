@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -34,10 +34,7 @@ from drgs.oracle import (
     view_rays,
     within,
 )
-from drgs.settings import EPS_ALPHA
-
-if TYPE_CHECKING:
-    from drgs.settings import RenderSettings
+from drgs.settings import EPS_ALPHA, RenderSettings
 
 _TILE = 16  # pixels; both rasterizers' tile size
 _FLOAT32 = 2.0**-23  # of a coordinate: twice what rounding it to float32 changes

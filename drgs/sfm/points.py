@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from drgs.data.views import View
 from drgs.display.progress import Bar
 from drgs.sfm.guided import Matches, Triangulated, detect
 from drgs.sfm.match_cache import cached
-from drgs.sfm.matching import nearby_pairs
+from drgs.sfm.matching import Progress, nearby_pairs
 from drgs.sfm.proposals import (
     FEWEST,
     VisualHull,
@@ -25,9 +24,6 @@ from drgs.sfm.proposals import (
     random_subset,
     uncovered_share,
 )
-
-if TYPE_CHECKING:
-    from drgs.sfm.matching import Progress
 
 __all__ = [
     "added_points",

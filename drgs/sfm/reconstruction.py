@@ -9,24 +9,19 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from drgs.data.images import image_size, list_images
 from drgs.data.videos import list_videos
 from drgs.io.atomic import temporary_folder
-from drgs.io.outputs import lock_folder
+from drgs.io.outputs import LockedFolder, lock_folder
 from drgs.sfm.feature_masks import ALPHA_MASKS, find_masks, write_masked_photos
+from drgs.sfm.findings import Finding
 from drgs.sfm.image_folder import fill_image_folder, named_files, recorded_frames, usable_files
 from drgs.sfm.mapping import MappingProgress, PhotoGroups, map_photos, posed_names, write_model
-from drgs.sfm.matching import FeatureOptions
-from drgs.sfm.pairing import choose_pairs
+from drgs.sfm.matching import FeatureOptions, Progress
+from drgs.sfm.pairing import Pairing, choose_pairs
 from drgs.sfm.photo_files import check_names, readable_photos, usable_photos
-
-if TYPE_CHECKING:
-    from drgs.io.outputs import LockedFolder
-    from drgs.sfm.findings import Finding
-    from drgs.sfm.matching import Progress
-    from drgs.sfm.pairing import Pairing
 
 CAMERA_MODELS = (
     "SIMPLE_PINHOLE",

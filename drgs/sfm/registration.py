@@ -12,23 +12,19 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from drgs.data.images import IMAGE_SUFFIXES, image_size
 from drgs.io.atomic import temporary_folder
-from drgs.io.outputs import lock_folder
+from drgs.io.outputs import LockedFolder, lock_folder
 from drgs.sfm.image_folder import FRAMES, joined_frames, recorded_frames, write_frames
 from drgs.sfm.mapping import MappingProgress, PhotoGroups, map_photos, posed_names, write_model
-from drgs.sfm.matching import FeatureOptions
+from drgs.sfm.matching import FeatureOptions, Progress
 from drgs.sfm.pairing import choose_new_pairs
 from drgs.sfm.photo_files import link_or_copy, photo_fault, readable_photos
 from drgs.sfm.reconstruction import SfmOptions, SfmSummary, StageTimes
-
-if TYPE_CHECKING:
-    from drgs.io.outputs import LockedFolder
-    from drgs.sfm.matching import Progress
 
 _MODEL = ("cameras.bin", "images.bin", "points3D.bin")
 _SAME_LENS = 0.1  # relative difference of focal lengths, in EXIF and in the model, of one lens

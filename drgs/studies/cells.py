@@ -13,10 +13,11 @@ import shlex
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from drgs.data import Dataset
 from drgs.fitting.active import SELECTION, ActiveViews
 from drgs.fitting.config import FitConfig, SelectionConfig, Start
 from drgs.fitting.evaluation import evaluate_run
@@ -34,9 +35,6 @@ from drgs.studies.protocols import PROTOCOLS
 from drgs.studies.rows import Cell, append_row, is_done, read_study
 from drgs.studies.statistics import decided
 from drgs.train import fit
-
-if TYPE_CHECKING:
-    from drgs.data import Dataset
 
 __all__ = ["FAILURES", "Metric", "Study", "distinct_seeds", "out_of_race", "result_line", "run_cell", "run_cells"]
 

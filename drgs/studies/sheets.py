@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -13,14 +12,10 @@ import torch
 from drgs.display import pictures
 from drgs.features.pictures import FeatureColors, label_picture
 from drgs.features.segmentation import classify
-from drgs.fitting.frames import frames_for, load_dataset
-from drgs.fitting.records import load_run
+from drgs.fitting.frames import Frame, frames_for, load_dataset
+from drgs.fitting.records import LoadedRun, load_run
 from drgs.integrator import render
 from drgs.io.run import Run
-
-if TYPE_CHECKING:
-    from drgs.fitting.frames import Frame
-    from drgs.fitting.records import LoadedRun
 
 _WIDTH = 300  # pixels of a column, about; chosen, as the numbers below
 _ZOOM = 0.5  # of the width and the height of a view: the part that is enlarged

@@ -12,27 +12,20 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
 
+from drgs.cameras import Camera
 from drgs.cameras.sizes import at_most, cropped
 from drgs.display import pictures
-from drgs.ellipsoids import colors_only
+from drgs.ellipsoids import Gaussians, Scene, colors_only
 from drgs.gain import Information, Prior, check, variances
-from drgs.information.expected_error import expected_error
+from drgs.information.expected_error import ErrorRecord, expected_error
 from drgs.information.sums import add
 from drgs.integrator import Output, render
-
-if TYPE_CHECKING:
-    import torch
-
-    from drgs.cameras import Camera
-    from drgs.ellipsoids import Gaussians, Scene
-    from drgs.information.expected_error import ErrorRecord
-    from drgs.integrator import Output
-    from drgs.settings import RenderSettings
+from drgs.settings import RenderSettings
 
 
 class DrawingProgress(NamedTuple):

@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.display.pictures import inferno
-from drgs.viewing.placed_views import PlacedView, scale_colors, score_colors
+from drgs.viewing.placed_views import PlacedView, Sight, scale_colors, score_colors
 
 if TYPE_CHECKING:
     from drgs.viewing.layers import ColorScale
-    from drgs.viewing.placed_views import Sight
     from drgs.viewing.subject import Subject
 
 _STYLE = "font-size:0.8em;line-height:1.5;padding:0.2em 0.9em;overflow-wrap:anywhere"

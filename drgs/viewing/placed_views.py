@@ -5,16 +5,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from drgs.cameras import Camera
+from drgs.data import View
 from drgs.data.camera_lists import camera_from_json
 from drgs.io.json_files import check_json, read_json
-
-if TYPE_CHECKING:
-    from drgs.data import View
 
 Kind = Literal["training", "held out", "candidate"]
 

@@ -25,14 +25,13 @@ from drgs.display.progress import duration
 from drgs.viewing import panel
 from drgs.viewing.client import ClientGaussians, Pose, camera_of, looking, pose_of
 from drgs.viewing.keyframes import KeyframeFolder
-from drgs.viewing.layers import Layer, over, stages, tinted
+from drgs.viewing.layers import ColorScale, Drawing, Drawings, Layer, over, stages, tinted
 from drgs.viewing.placed_views import PlacedView, score_colors
 
 if TYPE_CHECKING:
     import viser
 
     from drgs.cameras import Camera
-    from drgs.viewing.layers import ColorScale, Drawing, Drawings
     from drgs.viewing.subject import Subject
     from drgs.viewing.worker import Worker
 

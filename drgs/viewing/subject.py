@@ -5,17 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.ellipsoids import Scene
+from drgs.settings import RenderSettings
 from drgs.viewing.client import Pose
 from drgs.viewing.layers import Layer, PhotographMap
 from drgs.viewing.placed_views import PlacedView, Ranking
-
-if TYPE_CHECKING:
-    from drgs.ellipsoids import Scene
-    from drgs.settings import RenderSettings
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

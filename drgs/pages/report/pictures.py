@@ -14,14 +14,12 @@ import torch
 
 from drgs.display import pictures
 from drgs.display.progress import Bar
-from drgs.ellipsoids import colors_only
-from drgs.information.expected_error import expected_error
+from drgs.ellipsoids import Scene, colors_only
+from drgs.information.expected_error import ErrorRecord, expected_error
 from drgs.integrator import render
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
-    from drgs.ellipsoids import Scene
-    from drgs.information.expected_error import ErrorRecord
     from drgs.pages.report.account import Account
     from drgs.settings import RenderSettings
 

@@ -5,25 +5,21 @@ from __future__ import annotations
 import dataclasses
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.cameras import Camera
 from drgs.cameras.sizes import at_most
+from drgs.data import Dataset, View
 from drgs.data.camera_lists import camera_from_json
 from drgs.display.progress import Bar
 from drgs.fitting.errors import run_error_record
-from drgs.fitting.records import load_run
+from drgs.fitting.records import LoadedRun, load_run
 from drgs.io.outputs import atomic_write
 from drgs.io.run import Run
 from drgs.pages.report import charts, pictures
 from drgs.pages.report.account import Account, account_of
 from drgs.pages.report.page import Drawings, page_html
-
-if TYPE_CHECKING:
-    from drgs.cameras import Camera
-    from drgs.data import Dataset, View
-    from drgs.fitting.records import LoadedRun
 
 FILE = "report.html"
 _SHOWN_VIEWS = 4  # views that are shown with pictures; chosen for the size of the page

@@ -5,15 +5,13 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from drgs.codecs.bounded import pixels_of_webp
 from drgs.codecs.sog import encode_sog
-
-if TYPE_CHECKING:
-    from drgs.ellipsoids import Gaussians
+from drgs.ellipsoids import Gaussians
 
 
 def archive_of(g: Gaussians) -> tuple[bytes, dict[str, Any] | None]:

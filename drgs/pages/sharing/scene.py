@@ -5,33 +5,29 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from drgs.cameras import Camera
 from drgs.cameras.origins import origin_text
 from drgs.cameras.sizes import at_most
+from drgs.data import Dataset, View
 from drgs.data.camera_layout import Focus, upright
+from drgs.ellipsoids import Gaussians
 from drgs.fitting.config import DataConfig
 from drgs.fitting.errors import error_record_of_views, run_error_record
-from drgs.fitting.records import fitted_views, load_run
+from drgs.fitting.records import LoadedRun, fitted_views, load_run
 from drgs.fitting.renderers import VIEWERS, planar_of
 from drgs.information.nuisances import Nuisances
+from drgs.io.run import Run
 from drgs.meshing.depths import seen_distance
 from drgs.pages.report.pictures import spread
-from drgs.pages.sharing.layers import classes_layer, error_of, uncertainty_of
+from drgs.pages.sharing.layers import GaussianScale, classes_layer, error_of, uncertainty_of
+from drgs.pages.sharing.placing import PhotoKind
 from drgs.pages.sharing.write import Shared
 from drgs.settings import RenderSettings
 from drgs.viewing.placed_views import NEXT, Ranking, placed_views_of, read_ranking
-
-if TYPE_CHECKING:
-    from drgs.cameras import Camera
-    from drgs.data import Dataset, View
-    from drgs.ellipsoids import Gaussians
-    from drgs.fitting.records import LoadedRun
-    from drgs.io.run import Run
-    from drgs.pages.sharing.layers import GaussianScale
-    from drgs.pages.sharing.placing import PhotoKind
 
 FILE = "scene.html"
 """The page in a run folder."""

@@ -14,7 +14,7 @@ from drgs.data.camera_layout import middle_camera
 from drgs.display.progress import Bar
 from drgs.io.outputs import atomic_write
 from drgs.pages.sharing.gaussians import archive_of
-from drgs.pages.sharing.layers import motion_layer, scale_layer
+from drgs.pages.sharing.layers import GaussianScale, motion_layer, scale_layer
 from drgs.pages.sharing.npm import viewer_files
 from drgs.pages.sharing.page import scene_html
 from drgs.pages.sharing.placing import PhotoKind, columns, photo, upright_matrix
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.deform import DynamicGaussians
     from drgs.ellipsoids import Gaussians
-    from drgs.pages.sharing.layers import GaussianScale
 
 _NEAR_SHARE = 2e-3  # near plane over the distance to what is looked at: about gsplat's 0.01 in the units of COLMAP
 _FAR_FACTOR = 10.0  # far plane over the distance of the farthest Gaussian: a reader may step back as far; chosen
