@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 from collections.abc import Collection, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -32,6 +33,9 @@ Split = Literal["all", "train", "test"]
 
 SIDE = (1, 16_384)  # pixels; a mistyped size shall not ask for terabytes
 VIEWS = (1, 10_000)  # views of one command; more is a typing error
+
+of_views = functools.partial(option, heading="Views")
+"""An option of a command that says which views it takes."""
 
 
 def _scene() -> Any:
@@ -184,13 +188,12 @@ class SampledViews(Settings, Orbits, Views):
     """Options of commands that look at a scene from a few cameras."""
 
     scene: Path = _scene()
-    cameras: str | None = option(
+    cameras: str | None = of_views(
         None,
         "Views: a data set, a run, a cameras.json or selection.json, or orbit; default those of the run, else orbit.",
-        heading="Views",
     )
-    split: Split = option("all", "Which views of a data set to take.", heading="Views", rare=True)
-    limit: int = option(2, "At most this many views, evenly spaced.", heading="Views", within=VIEWS)
+    split: Split = of_views("all", "Which views of a data set to take.", rare=True)
+    limit: int = of_views(2, "At most this many views, evenly spaced.", within=VIEWS)
     max_pixels: int = option(20000, "Views are reduced to at most this many pixels.", within=COUNT)
     seed: int = option(0, "Random seed.", within=SEED, rare=True)
 
@@ -208,17 +211,13 @@ class ComparedViews(Information, Orbits, Views, Lenses):
     """Options of commands that compare views with known ones."""
 
     scene: Path = _scene()
-    train: str | None = option(
-        None,
-        "Training views: a data set, a run, a cameras.json or a selection.json; default those of the run.",
-        heading="Views",
+    train: str | None = of_views(
+        None, "Training views: a data set, a run, a cameras.json or a selection.json; default those of the run."
     )
-    split: Split = option(
-        "all", "Which views of the data set of --candidates or --cameras to take.", heading="Views", rare=True
-    )
-    count: int = option(40, "Number of cameras of an orbit or a dome.", heading="Views", within=VIEWS)
-    time: float | None = option(
-        None, "Dynamic scenes: the time of cameras that have none, such as those of an orbit.", heading="Views"
+    split: Split = of_views("all", "Which views of the data set of --candidates or --cameras to take.", rare=True)
+    count: int = of_views(40, "Number of cameras of an orbit or a dome.", within=VIEWS)
+    time: float | None = of_views(
+        None, "Dynamic scenes: the time of cameras that have none, such as those of an orbit."
     )
     orbit_keys: ClassVar[tuple[str, ...]] = tuple(key for key in ORBIT_KEYS if key != "fov")
 
@@ -257,15 +256,11 @@ class Workers(Common):
 class SceneTimes:
     """Options of commands that draw a scene that moves."""
 
-    time: str | None = option(
-        None,
-        "Dynamic scenes: one time, or a range (0..1) over all views; default that of each view, else all times.",
-        heading="Views",
+    time: str | None = of_views(
+        None, "Dynamic scenes: one time, or a range (0..1) over all views; default that of each view, else all times."
     )
-    view: str | None = option(
-        None,
-        "Only the view, or the camera, of this name; with a range of --time, --frames images of it.",
-        heading="Views",
+    view: str | None = of_views(
+        None, "Only the view, or the camera, of this name; with a range of --time, --frames images of it."
     )
     moving: bool = option(False, "Write only moving Gaussians to ply files.", rare=True)
 
@@ -285,10 +280,9 @@ class Render(Settings, Orbits, Views, SceneTimes, Lenses):
     """Render a file of Gaussians, or a finished run, to pictures or a video."""
 
     scene: Path = _scene()
-    cameras: str | None = option(
+    cameras: str | None = of_views(
         None,
         "Views: a data set, a run, a cameras.json or selection.json, or orbit; default orbit, or with --view the run.",
-        heading="Views",
     )
     output: Path = option(
         Path("out/render"),
@@ -314,10 +308,9 @@ class Render(Settings, Orbits, Views, SceneTimes, Lenses):
         "Panoramas (360 by 180 degrees, upright) at the places of the cameras; default that of the middle photograph.",
         rare=True,
     )
-    frames: int | None = option(
+    frames: int | None = of_views(
         None,
         "Number of images of an orbit, a flight or a range of --time; default 60, for a flight by its seconds.",
-        heading="Views",
         within=(1, 100_000),
     )
     duration: float | None = option(
@@ -339,8 +332,8 @@ class Render(Settings, Orbits, Views, SceneTimes, Lenses):
     features: bool = option(False, "Write images of the semantic features too, three principal components as colors.")
     labels: bool = option(False, "Write images of the classes too, for a run that was fitted with classes.")
     overlay: bool = option(False, "Write images of the classes over the colors too.", rare=True)
-    split: Split = option("all", "Which views of a data set to take.", heading="Views", rare=True)
-    limit: int | None = option(None, "At most this many views.", heading="Views", within=COUNT)
+    split: Split = of_views("all", "Which views of a data set to take.", rare=True)
+    limit: int | None = of_views(None, "At most this many views.", within=COUNT)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -350,15 +343,12 @@ class View(Information, Orbits, Views):
     scene: Path = option(
         help="A run folder, a 3DGS point_cloud.ply, or Gaussians in another format (docs/files.md).", positional=True
     )
-    train: str | None = option(
+    train: str | None = of_views(
         None,
         "Training views to display: a data set, a run, a cameras.json or selection.json; default those of the run.",
-        heading="Views",
     )
-    selection: Path | None = option(
-        None,
-        "Scores of cameras, a file that drgs select wrote; default those of the run, if it chose its views.",
-        heading="Views",
+    selection: Path | None = of_views(
+        None, "Scores of cameras, a file that drgs select wrote; default those of the run, if it chose its views."
     )
     scoring: Scoring = part(
         Scoring(blocks=("geometry", "backdrop")), only=("method", "blocks", "prior", "probes", "nuisances")
@@ -393,10 +383,8 @@ class Fit(Workers, Data):
         "(docs/configuration.md).",
     )
     resume: bool = option(False, "Continue from the last checkpoint in the run folder.")
-    views: Literal["all", "active"] = option(
-        "all",
-        "Fit to all training views, or start with a few and choose more during the fit (active; options below).",
-        heading="Views",
+    views: Literal["all", "active"] = of_views(
+        "all", "Fit to all training views, or start with a few and choose more during the fit (active; options below)."
     )
     report: bool = option(
         True, "Write report.html into the run folder at the end, unless --no-report is given.", rare=True
@@ -457,7 +445,7 @@ class Eval(Common, Data):
     """Measure a run on held-out views: PSNR, SSIM, FLIP, and LPIPS if weights are given."""
 
     run: Path = option(help="A run folder.", positional=True)
-    split: Split = option("test", "Which views to measure.", heading="Views")
+    split: Split = of_views("test", "Which views to measure.")
     preset: Literal["all", Preset] | None = option(
         None,
         "Further renderers to measure with; default those that the run was fitted for, and gsplat.",
@@ -495,16 +483,14 @@ class Share(Views, Common):
     output: Path | None = option(
         None, "Output HTML file; default scene.html in the run folder, for a file its name with .html.", short="o"
     )
-    train: str | None = option(
+    train: str | None = of_views(
         None,
         "Training views of a file of Gaussians, for the page's cameras and expected error: a data set, a run, a "
         "cameras.json.",
-        heading="Views",
     )
-    selection: Path | None = option(
+    selection: Path | None = of_views(
         None,
         "Photographs to take next, a file that drgs select wrote; default those of the run, if it chose its views.",
-        heading="Views",
     )
     uncertainty: bool = option(
         True, "Add a layer of the expected error (docs/uncertainty.md), unless --no-uncertainty is given."
@@ -518,12 +504,11 @@ class Share(Views, Common):
 class Select(ComparedViews, Workers):
     """Rank cameras by what their views would add to a run, or to a file of Gaussians."""
 
-    candidates: str = option(
+    candidates: str = of_views(
         help="A data set or a run (its views without the training views), a cameras.json or selection.json, orbit,"
-        " or dome.",
-        heading="Views",
+        " or dome."
     )
-    k: int = option(1, "Number of views to pick, one after the other.", short="k", heading="Views")
+    k: int = of_views(1, "Number of views to pick, one after the other.", short="k")
     region: str | None = same_option(SelectionConfig, "region", rare=False, heading="Views")
     refine: int = option(
         0,
@@ -543,11 +528,7 @@ class Select(ComparedViews, Workers):
     )
     policy: str = same_option(SelectionConfig, "policy", heading="Views")
     scoring: Scoring = part(Scoring())
-    config: Path | None = option(
-        None,
-        "Configuration: a TOML or JSON file, or a run; options of the command line override it "
-        "(docs/configuration.md).",
-    )
+    config: Path | None = same_option(Fit, "config")
     seed: int = option(0, "Random seed.", within=SEED, rare=True)
 
 
@@ -555,15 +536,14 @@ class Select(ComparedViews, Workers):
 class Fisher(ComparedViews):
     """Write where a scene is wrong, the Fisher information of training views about every Gaussian, and maps of both."""
 
-    cameras: str | None = option(
+    cameras: str | None = of_views(
         None,
         "Views for maps: a data set, a run, a cameras.json or selection.json, orbit or dome; default training views.",
-        heading="Views",
     )
     output: Path = option(
         Path("out/fisher"), "Folder for information.safetensors, fisher.json and the maps.", short="o"
     )
-    limit: int = option(4, "At most this many views for maps, evenly spaced.", heading="Views", within=VIEWS)
+    limit: int = of_views(4, "At most this many views for maps, evenly spaced.", within=VIEWS)
     region: str | None = same_option(
         SelectionConfig,
         "region",
@@ -600,13 +580,9 @@ class Query(Settings, Orbits, Views, Lenses):
     )
     remove: bool = option(False, "Write all Gaussians except the selected ones.")
     preset: Preset = option("fast", "Preset of render settings.", heading="Rendering")
-    cameras: str | None = option(
-        None,
-        "Views: a data set, a run, a cameras.json or selection.json, or orbit; default those of the run, else orbit.",
-        heading="Views",
-    )
-    split: Split = option("all", "Which views of a data set to take.", heading="Views", rare=True)
-    limit: int = option(4, "At most this many views for masks, evenly spaced.", heading="Views", within=VIEWS)
+    cameras: str | None = same_option(SampledViews, "cameras")
+    split: Split = of_views("all", "Which views of a data set to take.", rare=True)
+    limit: int = of_views(4, "At most this many views for masks, evenly spaced.", within=VIEWS)
     max_pixels: int | None = option(
         None, "Views are reduced to at most this many pixels; default that of the fit.", within=COUNT
     )
@@ -624,14 +600,12 @@ class Convert(Common):
     as_stored: bool = option(
         False, "Do not turn the axes of an .spz: some programs write the axes of PLY files instead of the format's."
     )
-    time: float | None = option(None, "Dynamic scenes: the time at which Gaussians are written.", heading="Views")
+    time: float | None = of_views(None, "Dynamic scenes: the time at which Gaussians are written.")
     uncertainty: Path | None = option(
         None, "information.safetensors of drgs fisher: adds a column of standard deviations for each group to the PLY."
     )
-    prior: float = option(
-        1.0,
-        "For --uncertainty: prior information about every parameter (lambda), as in the maps of drgs fisher.",
-        heading="Views",
+    prior: float = of_views(
+        1.0, "For --uncertainty: prior information about every parameter (lambda), as in the maps of drgs fisher."
     )
     labels: bool = option(
         False, "Add a column with the class of each Gaussian to the PLY, for a run that was fitted with classes."
@@ -647,10 +621,8 @@ class Prune(Settings, Views, Lenses):
         help="Output file, whose suffix is the format (docs/files.md); of a run also a folder, for a smaller run.",
         short="o",
     )
-    data: str | None = option(
-        None,
-        "Photographs of the scene: a data set or a run, or a cameras.json without any; default those of the run.",
-        heading="Views",
+    data: str | None = of_views(
+        None, "Photographs of the scene: a data set or a run, or a cameras.json without any; default those of the run."
     )
     keep: float | None = option(None, "Share of the Gaussians to keep, of those that the views show, e.g. 0.3.")
     loss: str | None = option(
@@ -688,16 +660,13 @@ class Mesh(Settings, Views, Lenses):
     scene: Path = _scene()
     output: Path = option(help="Output file: .ply, .glb or .obj.", short="o")
     meshing: MeshOptions = part(MeshOptions())
-    cameras: str | None = option(
+    cameras: str | None = of_views(
         None,
         "Views whose depth is used: a data set, a run or a cameras.json; default those that the run was fitted to.",
-        heading="Views",
     )
-    info_pixels: int | None = option(
-        None, "Views are reduced to at most this many pixels; default that of the fit, or 130000.", within=COUNT
-    )
-    limit: int | None = option(None, "At most this many views, evenly spaced.", heading="Views", within=COUNT)
-    time: float | None = option(None, "Dynamic scenes: the time of the surface.", heading="Views")
+    info_pixels: int | None = same_option(Prune, "max_pixels")
+    limit: int | None = of_views(None, "At most this many views, evenly spaced.", within=COUNT)
+    time: float | None = of_views(None, "Dynamic scenes: the time of the surface.")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -762,7 +731,7 @@ class Capture(Common):
         None,
         "Time for the whole command (90s, 10min, 2h), from which sizes and steps follow; default those of drgs fit.",
     )
-    frames: int = option(150, "At most this many frames of all videos together.", heading="Views")
+    frames: int = of_views(150, "At most this many frames of all videos together.")
     masks: str | None = option(
         None,
         "Masks of an object that was turned or moved: a folder (NAME.png, white is kept), or alpha, the alpha"
@@ -778,7 +747,7 @@ class Capture(Common):
     more: bool = option(
         False, "Print which photographs to take next: where to stand, where to look, and how much they would tell."
     )
-    k: int = option(5, "Number of photographs that --more suggests.", short="k", heading="Views", within=COUNT)
+    k: int = of_views(5, "Number of photographs that --more suggests.", short="k", within=COUNT)
     region: str | None = same_option(SelectionConfig, "region", rare=False, heading="Views")
     length: str | None = option(
         None, "Measured distance of two photographs, 'IMG_0001 IMG_0004 1.5 m', so that --more prints meters."
@@ -796,7 +765,7 @@ class Sfm(Common):
         metavar="PATH",
     )
     output: Path = option(help="Folder for the data set.", short="o")
-    frames: int = option(150, "At most this many frames of all videos together.", heading="Views")
+    frames: int = of_views(150, "At most this many frames of all videos together.")
     camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"] = option(
         "SIMPLE_RADIAL", "COLMAP's camera model; photographs of one size and focal length share one camera."
     )
@@ -805,11 +774,7 @@ class Sfm(Common):
         "Match all pairs, neighbors by name (video), or those and the most similar images; auto: all pairs of"
         " up to 60.",
     )
-    masks: str | None = option(
-        None,
-        "Masks of an object that was turned or moved: a folder (NAME.png, white is kept), or alpha, the alpha"
-        " channels.",
-    )
+    masks: str | None = same_option(Capture, "masks")
     seed: int = option(0, "Random seed.", within=SEED)
 
 
@@ -851,13 +816,10 @@ class Scene(Common):
     size: str | None = option(
         None, "WIDTHxHEIGHT of the images in pixels; default 320x240; 240x180 (capture, kitchen), 160x120 (hall)."
     )
-    views: int | None = option(
-        None, "Number of images; default 75 (room), 32 (still_life) or 28 (capture).", heading="Views"
-    )
-    cameras: int | None = option(
+    views: int | None = of_views(None, "Number of images; default 75 (room), 32 (still_life) or 28 (capture).")
+    cameras: int | None = of_views(
         None,
         "Number of video cameras (kitchen, hall); default 15, 12. cam00, in the middle of their arc, is the test view.",
-        heading="Views",
     )
     times: int | None = option(None, "Number of frames of each camera (kitchen, hall); default 40, 12.", heading="Data")
     seed: int = option(
