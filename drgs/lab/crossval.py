@@ -48,6 +48,7 @@ _TOLERANCE = {torch.float64: 5e-4, torch.float32: 5e-3}  # relative L2 differenc
 _SETTLED = {torch.float64: 1e-5, torch.float32: 1e-4}  # RMS of images that differ by rounding and its cut-offs
 # mean difference of alpha from which on it is reported; chosen, ten times `_SETTLED` of float64
 _ALPHA_TOLERANCE = 1e-4
+_EMPTY = "crossval: the cameras must show Gaussians, none of them shows any; choose others"
 _CROP_SIDES = (32, 16, 8)  # pixels of a side of a crop: the largest that the oracle can take
 _CROP_STEP = 16  # pixels between the places that are tried for a crop: gsplat's tiles stay where they are
 _CROP_PAIRS = 1_000_000  # (pixel, Gaussian) pairs of a crop that take the oracle seconds: image and gradient, by CPU
@@ -207,35 +208,33 @@ def crossval(
                 f"{rasterizer.name}: its image must show Gaussians, shows the background alone where preset {claimed} "
                 "shows some; correct the rasterizer"
             )
-        raise ValueError("crossval: the cameras must show Gaussians, none of them shows any; choose others")
-    case = Case(rasterizer, raw, cameras, background, oracle, tolerance or _TOLERANCE[dtype], entries, first, say)
-    comparison = compared(case, model, signs, pictures, alphas, drawn, functools.partial(ties_of, model))
+        raise ValueError(_EMPTY)
+    tolerance = tolerance or _TOLERANCE[dtype]
+    ties = functools.partial(ties_of, model)
+    case = Case(rasterizer, raw, cameras, background, oracle, tolerance, entries, first, seed, ties, say)
+    comparison = compared(case, model, signs, pictures, alphas, drawn)
     judge(case, model, comparison)
     if not comparison.agrees:
         say("what the error looks like")
-        models = {"the model at its conventions": model} if search.findings else {}
-        models |= {f"preset {claimed}": search.start}  # and what else may be meant
-        models |= {f"preset {name}": start for name, start in starts.items()}
-        comparison.views = with_errors(comparison, pictures, models, rendered_by)
+        comparison.views = with_errors(comparison, pictures, _meant(search, claimed, starts), rendered_by)
     not_offered = {k: "its image has no gradient of them" for k in MOTIONS if k in raw and k not in comparison.groups}
     if channels:
-        wide, reason = _wide_gradients(case, model, comparison, channels, seed, functools.partial(ties_of, model))
+        wide, reason = _wide_gradients(case, model, comparison, channels)
         comparison.groups |= wide
         not_offered |= {COLORS: reason} if reason else {}
-    report = _report(case, comparison, search, claimed, given, places, not_offered, seed)
+    report = _report(case, comparison, search, claimed, given, places, not_offered)
     rows: list[PathRow] = []
     if paths:
         lens = _lens_row(rasterizer, g, of_lenses, fields or {}, seed)
-        rows = _path_rows(case, comparison, report, model, not_offered, seed, functools.partial(ties_of, model), lens)
+        rows = path_rows(case, model, comparison, report["verdict"], not_offered.get(COLORS, ""), lens)
         verdicts = [row.verdict for row in rows if row.verdict]
         report["verdict"] = min((report["verdict"], *verdicts), key=VERDICTS.index)
     report["paths"] = [dataclasses.asdict(row) for row in rows]
     say("pictures")
     exact = ReferenceModel(RenderSettings.preset("exact", background=background))
-    images = []
-    for picture, (same, _), camera in zip(pictures, drawn, cameras, strict=True):
-        true, _ = _rendered(exact, raw, camera, False)
-        images.append({"rasterizer": picture.numpy(), "model": same.numpy(), "exact": true.numpy()})
+    true = [_rendered(exact, raw, camera, False)[0] for camera in cameras]
+    beside = zip(pictures, [same for same, _ in drawn], true, strict=True)
+    images = [dict(zip(("rasterizer", "model", "exact"), (x.numpy() for x in row), strict=True)) for row in beside]
     return Result(report, images, comparison.groups, comparison.views, search.findings, model, g, cameras, rows)
 
 
@@ -261,6 +260,15 @@ def _starting_models(
     return along_rays
 
 
+def _meant(
+    search: conventions.SearchResult, claimed: str, starts: dict[str, ReferenceModel]
+) -> dict[str, ReferenceModel]:
+    """Name in words -> model: the one that was found first, then what else may be meant."""
+    found = {"the model at its conventions": search.model} if search.findings else {}
+    presets = {claimed: search.start} | starts
+    return found | {f"preset {name}": start for name, start in presets.items()}
+
+
 def _lens_row(
     rasterizer: Rasterizer | Dump, g: Gaussians, cameras: list[Camera], fields: dict, seed: int
 ) -> PathRow | None:
@@ -282,22 +290,6 @@ def _lens_row(
     what = [f"{x.name} is {x.found}" for x in found.findings]
     what += [f"{name}: {x.verdict}: {x.why}" for name, x in found.groups.items() if x.verdict != "agreement"]
     return PathRow("lens", status_of(found.verdict), "; ".join(["with preset 3dgut", *what]), "", found.verdict)
-
-
-def _path_rows(
-    case: Case,
-    comparison: Compared,
-    report: dict,
-    model: ReferenceModel,
-    not_offered: dict[str, str],
-    seed: int,
-    near_ties: Callable[[int], torch.Tensor],
-    lens: PathRow | None,
-) -> list[PathRow]:
-    """`path_rows` of what was compared in single views; `report` as it is before paths are known."""
-    wide = {name: row for name, row in comparison.groups.items() if name == COLORS or name.endswith("channels")}
-    reason = not_offered.get(COLORS, "")
-    return path_rows(case, model, comparison, report["verdict"], wide, reason, seed, near_ties, lens)
 
 
 def _images(
@@ -332,7 +324,6 @@ def _report(
     given: tuple[Gaussians, list[Camera]],
     places: list[Crop | None],
     not_offered: dict[str, str],
-    seed: int,
 ) -> dict:
     """`Result.report`; `given` are the scene and the cameras before anything was cropped."""
     worst = min((row.verdict for row in comparison.groups.values()), key=VERDICTS.index)
@@ -365,7 +356,7 @@ def _report(
         "near_ties_counted": comparison.counted,
         "background": list(case.background),
         "tolerance": case.tolerance,
-        "seed": seed,
+        "seed": case.seed,
         "settings": dataclasses.asdict(search.model.settings),
     }
     report["scope"] = _scope(report)
@@ -433,7 +424,7 @@ def crops(g: Gaussians, cameras: list[Camera], settings: RenderSettings) -> tupl
         if bool(visible.any()):
             drawn.append((camera, image))
     if not drawn:
-        raise ValueError("crossval: the cameras must show Gaussians, none of them shows any; choose others")
+        raise ValueError(_EMPTY)
     for side in _CROP_SIDES:
         parts = []
         places = []
@@ -475,9 +466,7 @@ def _most_varied(image: torch.Tensor, width: int, height: int) -> tuple[int, int
 # ------------------------------------------------------------------------- images of many channels
 
 
-def _wide_gradients(
-    case: Case, model: ReferenceModel, rgb: Compared, channels: int, seed: int, near_ties: Callable[[int], torch.Tensor]
-) -> tuple[dict[str, GroupRow], str]:
+def _wide_gradients(case: Case, model: ReferenceModel, rgb: Compared, channels: int) -> tuple[dict[str, GroupRow], str]:
     """Gradients of an image of D channels: the same Gaussians with plain colors (N, D) instead of SH.
 
     Rasterizers carry such channels along other paths than RGB (padding, chunks, a second pass), where gradients get
@@ -488,8 +477,6 @@ def _wide_gradients(
         model: The model at the conventions that were found.
         rgb: The comparison in RGB.
         channels: Number D of channels.
-        seed: Seed of colors and cotangents.
-        near_ties: Function of a view's index: (H, W) bool, the pixels that hang on near ties.
     Returns:
         The row `colors`, and `GROUP, D channels` for every other group whose gradient is wrong here and was right in
         RGB; or nothing, and the reason.
@@ -505,18 +492,19 @@ def _wide_gradients(
     ):
         return {}, "what it does to colors is a convention of three channels"
     fixed = {name: x for name, x in case.raw.items() if name not in MOTIONS}
-    raw = with_colors(fixed, channels, seed)
+    raw = with_colors(fixed, channels, case.seed)
     black = (0.0,) * channels
-    u = cotangents([camera], seed, channels)
+    u = cotangents([camera], case.seed, channels)
     case.say(f"{channels} channels")
     try:
         picture, alpha = rasterizer.image(raw, camera, black)
         rasterizer.gradient(raw, camera, black, u[0])
     except Exception as error:  # whatever a function raises that knows three channels only
         return {}, f"it draws no image of {channels} channels: {one_line(error)}"
-    wide = dataclasses.replace(case, raw=raw, cameras=[camera], background=black, first=0)
+    ties = lambda _: case.near_ties(case.first)  # noqa: E731
+    wide = dataclasses.replace(case, raw=raw, cameras=[camera], background=black, first=0, near_ties=ties)
     drawn = [_rendered(model, raw, camera, case.oracle)]
-    wider = compared(wide, model, u, [picture], [alpha], drawn, lambda _: near_ties(case.first))
+    wider = compared(wide, model, u, [picture], [alpha], drawn)
     right = [name for name, row in rgb.groups.items() if row.verdict == "agreement"]
     wider.groups = {name: row for name, row in wider.groups.items() if name == COLORS or name in right}
     judge(wide, model, wider)

@@ -16,8 +16,8 @@ gradient, is wrong.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
-from typing import Literal
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, Literal
 
 import torch
 
@@ -106,10 +106,7 @@ def path_rows(
     model: ReferenceModel,
     rgb: Compared,
     verdict: str,
-    wide: dict[str, GroupRow],
     not_wide: str,
-    seed: int,
-    near_ties: Callable[[int], torch.Tensor],
     lens: PathRow | None = None,
 ) -> list[PathRow]:
     """A row for each of `PATHS`.
@@ -117,19 +114,17 @@ def path_rows(
     Args:
         case: What was compared in RGB.
         model: The model at the conventions that were found.
-        rgb: The comparison in RGB.
+        rgb: The comparison in RGB, with the rows of an image of many channels.
         verdict: Its verdict.
-        wide: Rows of an image of many channels.
-        not_wide: Why there is none.
-        seed: Seed of cotangents.
-        near_ties: Function of a view's index: (H, W) bool, the pixels that hang on near ties.
+        not_wide: Why `rgb` has no rows of an image of many channels.
         lens: Row of the lens, where it was compared apart from `case`, whose cameras are pinholes.
     """
-    tests = _Tests(case, model, rgb, seed, near_ties)
+    tests = _Tests(case, model, rgb)
     rows = [*_camera_rows(case, verdict, lens)]
     for path in PATHS[len(rows) : -1]:
         case.say(f"path: {path}")
         rows.append(tests.row(path))
+    wide = {name: row for name, row in rgb.groups.items() if name == COLORS or name.endswith("channels")}
     if not_wide or not wide:
         rows.append(PathRow(PATHS[-1], "not tested", not_wide or "not asked for", "a function of (N, D) colors"))
     else:
@@ -219,8 +214,6 @@ class _Tests:
     case: Case
     model: ReferenceModel
     rgb: Compared
-    seed: int
-    near_ties: Callable[[int], torch.Tensor]
 
     def row(self, path: str) -> PathRow:
         """The row of a path that has a test of its own."""
@@ -286,6 +279,10 @@ class _Tests:
         images, alphas = self._own.several(raws, cameras, backgrounds, changed or {}, channels)
         return images.flatten(0, 1), alphas.flatten(0, 1)
 
+    def _with(self, **changed: Any) -> Draw:
+        """A call of one view with arguments of its own."""
+        return lambda raw, camera, background: self._called([raw], [camera], [background], changed)
+
     # ------------------------------------------------------------------------------------------ beside the model
 
     def _beside(self, path: str, draw: Draw, model: ReferenceModel, channels: int, least_alpha: float = 0) -> PathRow:
@@ -295,9 +292,10 @@ class _Tests:
         picture, alpha = rasterizer.image(case.raw, self._view, case.background)
         drawn = model.draw({k: x.detach() for k, x in case.raw.items()}, self._view, case.oracle)
         drawn = tuple(x.detach().cpu() for x in drawn)
-        signs = cotangents([self._view], self.seed, channels) * (alpha >= least_alpha)[..., None]
-        other = dataclasses.replace(case, rasterizer=rasterizer, cameras=[self._view], first=0)
-        found = compared(other, model, signs, [picture], [alpha], [drawn], lambda _: self.near_ties(case.first))
+        signs = cotangents([self._view], case.seed, channels) * (alpha >= least_alpha)[..., None]
+        ties = lambda _: case.near_ties(case.first)  # noqa: E731
+        other = dataclasses.replace(case, rasterizer=rasterizer, cameras=[self._view], first=0, near_ties=ties)
+        found = compared(other, model, signs, [picture], [alpha], [drawn])
         right = [k for k, row in self.rgb.groups.items() if row.verdict in ("agreement", "known deviation")]
         found.groups = {k: row for k, row in found.groups.items() if k in right}
         if not found.groups:
@@ -345,11 +343,7 @@ class _Tests:
     def _antialiased(self, path: str) -> PathRow:
         if not self.model.settings.planar or self.model.compensation != "none":
             raise _NotTested("it is a mode of the image plane's model", "drgs crossval SCENE --preset gsplat")
-        changed = {"rasterize_mode": "antialiased"}
-
-        def draw(raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
-            return self._called([raw], [camera], [background], changed)
-
+        draw = self._with(rasterize_mode="antialiased")
         if "rasterize_mode" not in self._own.named:
             self._refuse_ignored("rasterize_mode", draw)
         return self._beside(path, draw, self.model.replace(compensation="at least 0.005"), 3)
@@ -372,7 +366,7 @@ class _Tests:
         error = float((images[0] - images[1]).square().mean().sqrt())
         if not error <= _SAME:  # nor is NaN
             return _judged(path, "model difference", f"its image is not that of plain calls: RMS {error:.1e}")
-        generator = torch.Generator().manual_seed(self.seed)
+        generator = torch.Generator().manual_seed(self.case.seed)
         u = torch.randint(0, 2, images[0].shape, generator=generator).double() * 2 - 1
         ours = both[1].gradient(raw, camera, background, u)
         theirs = both[0].gradient(raw, camera, background, u)
@@ -396,17 +390,12 @@ class _Tests:
         highest = round(self.case.raw["sh"].shape[1] ** 0.5) - 1
         for degree in range(highest):
 
-            def varied(
-                raw: dict, camera: Camera, background: tuple, degree: int = degree
-            ) -> tuple[torch.Tensor, torch.Tensor]:
-                return self._called([raw], [camera], [background], {"sh_degree": degree})
-
             def plain(
                 raw: dict, camera: Camera, background: tuple, degree: int = degree
             ) -> tuple[torch.Tensor, torch.Tensor]:
                 return self._own.draw(raw | {"sh": raw["sh"][:, : (degree + 1) ** 2]}, camera, background)
 
-            row = self._alike(path, varied, plain)
+            row = self._alike(path, self._with(sh_degree=degree), plain)
             if row.status != "agrees":
                 return dataclasses.replace(row, why=f"degree {degree}: {row.why}")
         return _judged(path, "agreement", f"0 to {highest}, the scene's")
@@ -417,15 +406,12 @@ class _Tests:
         black = (0.0, 0.0, 0.0)
         behind = torch.tensor([(0.3, 0.9, 0.6)], dtype=torch.float64)
 
-        def varied(raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
-            return self._called([raw], [camera], [background])
-
         def plain(raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
             own = {name: x for name, x in raw.items() if name != BACKGROUNDS}
             image, alpha = self._own.draw(own, camera, black)
             return image + (1 - alpha[..., None]) * raw[BACKGROUNDS], alpha
 
-        return self._alike(path, varied, plain, "values and gradient", self.case.raw | {BACKGROUNDS: behind})
+        return self._alike(path, self._with(), plain, "values and gradient", self.case.raw | {BACKGROUNDS: behind})
 
     def _cameras(self, path: str) -> PathRow:
         first = self._view
@@ -439,9 +425,7 @@ class _Tests:
             return self._called([raw], [camera, second], [background, background[::-1]])
 
         def plain(raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
-            pairs = [self._own.draw(raw, *x) for x in ((camera, background), (second, background[::-1]))]
-            image, alpha = (torch.cat(x) for x in zip(*pairs, strict=True))
-            return image, alpha
+            return _below(self._own.draw(raw, *x) for x in ((camera, background), (second, background[::-1])))
 
         return self._alike(path, varied, plain, "two")
 
@@ -453,20 +437,14 @@ class _Tests:
             return self._called(raws(raw), [camera], [background])
 
         def plain(raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
-            pairs = [self._own.draw(x, camera, background) for x in raws(raw)]
-            image, alpha = (torch.cat(x) for x in zip(*pairs, strict=True))
-            return image, alpha
+            return _below(self._own.draw(x, camera, background) for x in raws(raw))
 
         return self._alike(path, varied, plain, "two")
 
     def _packed(self, path: str) -> PathRow:
         if "packed" not in self._own.named:
             raise _NotTested("its signature does not name packed", "a function that does")
-
-        def varied(raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
-            return self._called([raw], [camera], [background], {"packed": True})
-
-        return self._alike(path, varied, self._own.draw)
+        return self._alike(path, self._with(packed=True), self._own.draw)
 
     def _culled(self, path: str) -> PathRow:
         w2c = float64(self._view.w2c).detach()
@@ -498,17 +476,20 @@ class _Tests:
         near = float(0.5 * (ahead[k - 1] + ahead[k]))
         beyond = torch.nonzero(depths > near)[:, 0]
 
-        def varied(raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
-            return self._called([raw], [camera], [background], {"near_plane": near})
-
         def plain(raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
             fewer = {k: x if k in MOTIONS else x[beyond.to(x.device)] for k, x in raw.items()}
             fewer |= {k: _posed_as(raw, fewer, camera, k) for k in MOTIONS if k in raw}
             return self._own.draw(fewer, camera, background)
 
         if "near_plane" not in self._own.named:
-            self._refuse_ignored("near_plane", varied)
-        return self._alike(path, varied, plain, f"at {near:.3g}")
+            self._refuse_ignored("near_plane", self._with(near_plane=near))
+        return self._alike(path, self._with(near_plane=near), plain, f"at {near:.3g}")
+
+
+def _below(pairs: Iterable[tuple[torch.Tensor, torch.Tensor]]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Several images and alphas, below each other."""
+    images, alphas = zip(*pairs, strict=True)
+    return torch.cat(images), torch.cat(alphas)
 
 
 def _posed_as(raw: dict, other: dict, camera: Camera, name: str) -> torch.Tensor:

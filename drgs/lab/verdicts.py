@@ -181,7 +181,12 @@ _BETWEEN = Deviation(
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """What is compared, and how: arguments of `crossval`; `first` is the view whose differences are taken."""
+    """What is compared, and how: arguments of `crossval`.
+
+    Attributes:
+        first: The view whose central differences are taken.
+        near_ties: Function of a view's index: (H, W) bool, the pixels that hang on near ties of the model.
+    """
 
     rasterizer: Rasterizer | Dump
     raw: dict
@@ -191,6 +196,8 @@ class Case:
     tolerance: float
     entries: int
     first: int
+    seed: int
+    near_ties: Callable[[int], torch.Tensor]
     say: Callable[[str], None]
 
     def theirs(self, u: torch.Tensor) -> dict:
@@ -243,7 +250,6 @@ def compared(
     pictures: list[torch.Tensor],
     alphas: list[torch.Tensor],
     drawn: list[tuple[torch.Tensor, torch.Tensor]],
-    near_ties: Callable[[int], torch.Tensor],
 ) -> Compared:
     """Two correct renderers differ where pixels hang on near ties: these are left out before a difference counts."""
     ties = torch.zeros(signs.shape[:3], dtype=torch.bool)
@@ -266,7 +272,7 @@ def compared(
         comparison = Compared(views, agrees, u, theirs, groups, ties, counted)
         if ties.any() or (agrees and all(row.verdict for row in groups.values())):
             return comparison
-        ties = torch.stack([near_ties(view) for view in range(len(case.cameras))])
+        ties = torch.stack([case.near_ties(view) for view in range(len(case.cameras))])
         counted = float((~ties).double().mean()) < LEAST
         if counted or not ties.any():
             return dataclasses.replace(comparison, ties=ties, counted=counted)
