@@ -192,13 +192,7 @@ def activate(g: Any, s: RenderSettings) -> OracleScene:
     raw = (g.means, g.quats, g.log_scales, g.logit_opacities, g.sh)
     means, quats, log_scales, logits, sh = map(float64, raw)
     n = len(means)
-    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    rotation = torch.stack(rows, dim=-1).reshape(-1, 3, 3)
+    rotation = _rotations(*(quats / quats.norm(dim=-1, keepdim=True)).unbind(-1))
     softplus = torch.logaddexp(logits, torch.zeros_like(logits))
     extent = torch.full((n,), s.extent or _NO_EXTENT, dtype=torch.float64)
     if s.extent is None and s.order == "entry":
@@ -223,6 +217,16 @@ def activate(g: Any, s: RenderSettings) -> OracleScene:
         extent=extent,
         index=torch.arange(n),
     )
+
+
+def _rotations(w: torch.Tensor, x: torch.Tensor, y: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
+    """(N, 3, 3) of unit quaternions, whose parts are (N,)."""
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=-1).reshape(-1, 3, 3)
 
 
 def _entered(strength: torch.Tensor) -> torch.Tensor:
@@ -291,13 +295,7 @@ def rolling_poses(cam: Any, origin: torch.Tensor | None = None) -> tuple[torch.T
     half = torch.atan2(length, w) * times
     w = torch.where(still, torch.ones_like(times), half.cos())
     x, y, z = (torch.where(still, times * c, half.sin() * c / length) for c in v)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    turns = torch.stack(rows, dim=-1).reshape(-1, 3, 3)
-    return turns @ R0, (1 - times)[:, None] * t0 + times[:, None] * t1
+    return _rotations(w, x, y, z) @ R0, (1 - times)[:, None] * t0 + times[:, None] * t1
 
 
 def cull_near(

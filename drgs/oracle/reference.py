@@ -112,20 +112,51 @@ def render(
         ValueError: If `ewa` meets rays or distortion, or a camera is needed and missing.
     """
     check_oracle("reference.render", g, cam, settings)
-    s = settings
+    form = _form_of(settings, window, plain_directions, peaks_behind)
+    _check_rays(cam, settings, rays)
+    scene, view = _prepared(g, cam, settings, rays, window, tolerance)
+    job = _Job(scene, settings, form, view.rotation, view.center, tolerance, exact_ties, effect)
+    step = max(1, _PAIRS // max(len(scene.index), 1))
+    parts = []
+    for i in range(0, max(len(view.directions), 1), step):
+        rays_of_part = [x[i : i + step] for x in (view.origins, view.directions, view.pixels)]
+        # Recomputing a chunk in the backward pass keeps memory bounded by one chunk.
+        if torch.is_grad_enabled() and len(view.directions) > step:
+            parts.append(checkpoint(_composite, job, *rays_of_part, use_reentrant=False))
+        else:
+            parts.append(_composite(job, *rays_of_part))
+    seen = sum(part.pop("visibility") for part in parts)
+    fields: dict[str, Any] = dict.fromkeys(parts[0])
+    for name in (name for name in fields if parts[0][name] is not None):
+        joined = torch.cat([part[name] for part in parts])
+        fields[name] = joined.reshape(*view.shape, *joined.shape[1:])
+    seen = torch.zeros(len(g.means), dtype=torch.float64).index_add(0, scene.index, seen)
+    return ReferenceOutput(visibility=seen, **fields)
+
+
+def _form_of(s: RenderSettings, window: tuple | None, plain_directions: bool, peaks_behind: bool) -> _Peak:
+    """The equations of the settings' response.
+
+    Raises:
+        ValueError: If there are none, or not with the options of `render`.
+    """
     if s.response not in _FORMS:
         raise ValueError(
             f"reference.render: response must be one of {', '.join(_FORMS)}, got {s.response!r}; add its equations to "
             "drgs.oracle.reference._FORMS"
         )
-    form = _FORMS[s.response]
-    if plain_directions or peaks_behind:
-        if s.response != "peak" or (plain_directions and window is not None):
-            raise ValueError(
-                f"reference.render: plain_directions and peaks_behind need response='peak' and no window, got "
-                f"{s.response!r} and {window}"
-            )
-        form = _OddPeak(plain_directions, not peaks_behind)
+    if not (plain_directions or peaks_behind):
+        return _FORMS[s.response]
+    if s.response != "peak" or (plain_directions and window is not None):
+        raise ValueError(
+            f"reference.render: plain_directions and peaks_behind need response='peak' and no window, got "
+            f"{s.response!r} and {window}"
+        )
+    return _OddPeak(plain_directions, not peaks_behind)
+
+
+def _check_rays(cam: Any, s: RenderSettings, rays: tuple | None) -> None:
+    """Raise ValueError where settings do not go with rays, or with the camera that they have."""
     if s.planar and (
         rays is not None
         or getattr(cam, "model", "pinhole") != "pinhole"
@@ -136,43 +167,31 @@ def render(
         raise ValueError("reference.render: culling='ut' needs the pixels of a camera, got rays")
     if cam is None and (rays is None or s.near > 0 or s.depth_key == "z"):
         raise ValueError("reference.render: near, depth_key='z', images need cam, got None")
+
+
+def _prepared(
+    g: Any, cam: Any, s: RenderSettings, rays: tuple | None, window: tuple | None, tolerance: float
+) -> tuple[OracleScene, OracleRays]:
+    """The Gaussians that may be met, activated and projected, and the rays."""
     scene = activate(g, s)
     view = view_rays(g, cam, rays, window)
     if s.culling == "ut" and rays is not None:
         if view.shape != (cam.height, cam.width):
             raise ValueError(f"reference.render: culling='ut' needs a ray a pixel of cam, got shape {view.shape}")
         view = dataclasses.replace(view, pixels=camera_rays(cam, rigid(float64(cam.w2c))[0])[0])
-    rotation, center, directions = view.rotation, view.center, view.directions
     if cam is not None:
-        scene = cull_near(scene, rotation, center, s, tolerance)
+        scene = cull_near(scene, view.rotation, view.center, s, tolerance)
     if s.planar:
-        screen, tiles = _project(scene, cam, rotation, center, s, tolerance)
+        screen, tiles = _project(scene, cam, view.rotation, view.center, s, tolerance)
         scene = dataclasses.replace(scene, screen=screen, tiles=tiles)
     elif s.culling == "ut":
         offset = float64(getattr(g, "origin", (0, 0, 0)))
         scene = dataclasses.replace(scene, tiles=_unscented(scene, cam, view, offset, tolerance))
     if window is not None:
         scene = _in_window(scene, s, view, window, tolerance)
-    if s.sh_direction == "gaussian" and center is not None:
-        scene = scene.colored(center)
-
-    step = max(1, _PAIRS // max(len(scene.index), 1))
-    parts = []
-    for i in range(0, max(len(directions), 1), step):
-        part = (x[i : i + step] for x in (view.origins, directions, view.pixels))
-        args: tuple[Any, ...] = (scene, s, form, rotation, center, *part, tolerance, exact_ties, effect)
-        # Recomputing a chunk in the backward pass keeps memory bounded by one chunk.
-        if torch.is_grad_enabled() and len(directions) > step:
-            parts.append(checkpoint(_composite, *args, use_reentrant=False))
-        else:
-            parts.append(_composite(*args))
-    seen = sum(part.pop("visibility") for part in parts)
-    fields: dict[str, Any] = dict.fromkeys(parts[0])
-    for name in (name for name in fields if parts[0][name] is not None):
-        joined = torch.cat([part[name] for part in parts])
-        fields[name] = joined.reshape(*view.shape, *joined.shape[1:])
-    seen = torch.zeros(len(g.means), dtype=torch.float64).index_add(0, scene.index, seen)
-    return ReferenceOutput(visibility=seen, **fields)
+    if s.sh_direction == "gaussian" and view.center is not None:
+        scene = scene.colored(view.center)
+    return scene, view
 
 
 def _project(
@@ -284,23 +303,28 @@ def _in_window(
     return scene.take(((last > torch.floor(low / tile)) & (first <= torch.floor(high / tile))).all(1))
 
 
-def _responses(
-    scene: OracleScene,
-    s: RenderSettings,
-    form: _Peak,
-    rotation: Tensor,
-    center: Tensor | None,
-    o: Tensor,
-    d: Tensor,
-    pixels: Tensor,
-    tolerance: float,
-) -> tuple:
+@dataclasses.dataclass(frozen=True)
+class _Job:
+    """What all chunks of rays of a call have in common; the last three are arguments of `render`."""
+
+    scene: OracleScene
+    settings: RenderSettings
+    form: _Peak
+    rotation: Tensor
+    center: Tensor | None
+    tolerance: float
+    exact_ties: bool
+    effect: float
+
+
+def _responses(job: _Job, o: Tensor, d: Tensor, pixels: Tensor) -> tuple:
     """What is known of (P, N) pairs before ordering.
 
     Returns: a, 1 - a, t; and without gradient: order key, exists (bool), margin (relative distance
     to the nearest cut-off of existence, negative beyond it), distance from a to alpha_max, distance
     to the mean.
     """
+    scene, s, form, rotation = job.scene, job.settings, job.form, job.rotation
     away = scene.means - o[:, None, :]
     rho2, t, length = form.meet(scene, s, rotation, away, d, pixels)
     a, rest = form.opacity(scene, rho2, t, length)
@@ -330,14 +354,14 @@ def _responses(
             tight, exact, loose = (((tile >= i) & (tile < j)).all(-1) for i, j in scene.tiles.ranges)
             cut(exact, torch.where(tight, math.inf, torch.where(loose, 0.0, -math.inf)))
         if form.front_only:
-            cut(t > 0, t / torch.maximum(distance, _sway(scene, o, d) / tolerance).clamp(min=1e-300))  # no 0 / 0
+            cut(t > 0, t / torch.maximum(distance, _sway(scene, o, d) / job.tolerance).clamp(min=1e-300))  # no 0 / 0
         if s.alpha_min > 0:
             cut(a >= s.alpha_min, a / s.alpha_min - 1)
         if scene.near_margin is not None:
             cut(scene.near_margin > 0, scene.near_margin)
         key = t
         if s.order == "center":
-            reach = away if center is None else scene.means - center
+            reach = away if job.center is None else scene.means - job.center
             key = reach @ rotation[2] if s.depth_key == "z" else reach.norm(dim=-1)
         elif s.order == "entry":
             key = t - (scene.extent**2 - rho2).clamp(min=0).sqrt() / length
@@ -437,21 +461,10 @@ class _Ewa(_Peak):
 _FORMS = {"peak": _Peak(), "integral": _Integral(), "ewa": _Ewa()}
 
 
-def _composite(
-    scene: OracleScene,
-    s: RenderSettings,
-    form: _Peak,
-    rotation: Tensor,
-    center: Tensor | None,
-    o: Tensor,
-    d: Tensor,
-    pixels: Tensor,
-    tolerance: float,
-    exact_ties: bool,
-    effect: float,
-) -> dict:
+def _composite(job: _Job, o: Tensor, d: Tensor, pixels: Tensor) -> dict:
     """The fields of `ReferenceOutput` for one chunk of rays."""
-    a, rest, t, key, *checks = _responses(scene, s, form, rotation, center, o, d, pixels, tolerance)
+    scene, s, tolerance, effect = job.scene, job.settings, job.tolerance, job.effect
+    a, rest, t, key, *checks = _responses(job, o, d, pixels)
     # Near misses are sorted in, without effect, to see what they would have done.
     candidate = checks[0] | (checks[1] >= -tolerance)
     key, order = torch.where(candidate, key, math.inf).sort(dim=1, stable=True)
@@ -495,7 +508,7 @@ def _composite(
         gap = key - _previous(last, -math.inf)
         swap = a * a.gather(1, place) * before.gather(1, place)
         close = gap <= tolerance * torch.maximum(distance, key.abs())
-        doubt |= matters & ((gap > 0) | exact_ties) & close & (swap > effect)
+        doubt |= matters & ((gap > 0) | job.exact_ties) & close & (swap > effect)
     return {
         "rgb": (weights[:, :, None] * colors).sum(dim=1) + background,
         "alpha": alpha,
