@@ -30,9 +30,9 @@ from drgs.fitting.errors import run_error_record
 from drgs.fitting.records import load_run
 from drgs.io.run import Run
 from drgs.pages.sharing import npm
-from drgs.pages.sharing.gaussians import archive_of
 from drgs.pages.sharing.layers import GaussianScale, scale_layer
 from drgs.pages.sharing.placing import upright_matrix
+from drgs.pages.sharing.write import archive_of
 
 
 def blobs(count: int = 300, degree: int = 3, seed: int = 0) -> drgs.Gaussians:

@@ -34,6 +34,11 @@ def must_be(where: str, name: str, value: Any, kinds: type | tuple[type, ...], h
     raise ArgumentError(f"{where}: {name} must be {article} {names}, got {kind_of(value)}; {hint}")
 
 
+def said(error: Exception, longest: int = 120) -> str:
+    """The message of a library's error in one line of at most so many characters; its type where there is none."""
+    return " ".join(str(error).split())[:longest] or type(error).__name__
+
+
 def kind_of(value: Any) -> str:
     """A value in a few words: its type, and its shape, length or text."""
     if value is None:

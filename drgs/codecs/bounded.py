@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
+from drgs.checks.arguments import said
 from drgs.io.foreign import is_file
 
 _DAMAGED = "it is truncated or damaged, copy it again"
 # characters of names, and of what libraries say
 _NAME = 200
-_SHOWN = 120
 _PIECE = 1 << 20  # bytes of a stream that are unpacked at once
 _ZIP_ERRORS = (
     zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, NotImplementedError, OSError, OverflowError,
@@ -137,7 +137,7 @@ class Archive:
             self._zip = zipfile.ZipFile(path)
             found = [name for name in self._zip.namelist() if name.rpartition("/")[2] == "meta.json"]
         except _ZIP_ERRORS as error:
-            raise ValueError(f"{path}: must be a zip archive, got {_said(error)}; {_DAMAGED}") from None
+            raise ValueError(f"{path}: must be a zip archive, got {said(error)}; {_DAMAGED}") from None
         if found:
             self._prefix = min(found, key=len).removesuffix("meta.json")
 
@@ -181,12 +181,7 @@ class Archive:
         except KeyError:
             raise ValueError(f"{self.path}: must hold {name}, holds none; export it again") from None
         except _ZIP_ERRORS as error:
-            raise ValueError(f"{self.path}: {name} must be readable, got {_said(error)}; {_DAMAGED}") from None
-
-
-def _said(error: Exception) -> str:
-    """A library's error in one line."""
-    return " ".join(str(error).split())[:_SHOWN]
+            raise ValueError(f"{self.path}: {name} must be readable, got {said(error)}; {_DAMAGED}") from None
 
 
 def pixels_of_webp(where: str, data: bytes, least: int, most: int) -> np.ndarray:

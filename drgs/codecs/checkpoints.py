@@ -19,6 +19,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
+from drgs.checks.arguments import said
 from drgs.codecs.codec import Codec
 from drgs.codecs.folders import is_checkpoint, nerfstudio_run
 from drgs.codecs.values import SH_COUNTS, check_count
@@ -36,7 +37,6 @@ _GSPLAT = {
 _SPLATFACTO = _GSPLAT | {"dc": "features_dc", "rest": "features_rest"}
 _PREFIX = "_model.gauss_params."  # of names in a pipeline of nerfstudio
 _RANK = re.compile(r"(.*_rank)0(\.[a-z]+)")
-_SHOWN = 120  # characters of PyTorch's own message
 _log = logging.getLogger(__name__)
 
 
@@ -86,7 +86,7 @@ def _part(path: Path) -> dict[str, Any]:
     except MemoryError:
         raise
     except Exception as error:  # of a damaged file, or of a pickle with more in it than weights
-        text = " ".join(str(error).split())[:_SHOWN]
+        text = said(error)
         if nerfstudio_run(path) is not None:
             _refuse_nerfstudio(path, text)
         raise ValueError(

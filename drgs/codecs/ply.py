@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drgs.cameras.origins import origin_text
-from drgs.checks.arguments import ArgumentError, check_path
+from drgs.checks.arguments import ArgumentError, check_path, said
 from drgs.codecs.ply_headers import (
     EXTRA,
     extra_kind,
@@ -43,7 +43,6 @@ _COLUMNS = {
 _NORMALS = ("nx", "ny", "nz")
 _FEATURE = "semantic_"
 _HIGHER = 15  # SH coefficients a color channel above degree 0, up to degree 3
-_SHOWN = 200  # characters of a reader's own message
 
 
 def load_ply(path: str | os.PathLike) -> Gaussians:
@@ -90,8 +89,7 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
     except MemoryError:
         raise
     except Exception as error:  # of a damaged file, whatever its words make plyfile and NumPy raise
-        text = " ".join(str(error).split())[:_SHOWN]
-        raise ValueError(f"{path}: must be a readable PLY, got {text}; export it again") from None
+        raise ValueError(f"{path}: must be a readable PLY, got {said(error, 200)}; export it again") from None
     sh = arrays.pop("dc")[:, None, :]
     if rest:
         # f_rest is stored channel by channel; ours are coefficient by coefficient.

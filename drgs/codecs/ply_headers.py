@@ -98,13 +98,7 @@ def is_antialiased(path: Path) -> bool:
 
     Brush and gsplat write `comment SplatRenderMode: mip`, Postshot `comment antialiased 1`; the last such line counts.
     """
-    with path.open("rb") as file:
-        head = file.read(_MAX_HEADER)
-    said = re.findall(
-        rb"^comment[ \t]+(?:SplatRenderMode:[ \t]*(mip|default)|antialiased[ \t]+([01]))[ \t]*$",
-        head[: head.find(b"\nend_header")].replace(b"\r", b"\n"),
-        re.IGNORECASE | re.MULTILINE,
-    )
+    said = _comments(path, rb"(?:SplatRenderMode:[ \t]*(mip|default)|antialiased[ \t]+([01]))[ \t]*$")
     return bool(said) and (said[-1][0].lower(), said[-1][1]) in ((b"mip", b""), (b"", b"1"))
 
 
@@ -121,17 +115,19 @@ def ply_offset(path: Path) -> np.ndarray | None:
     Raises:
         ValueError: If it is not three finite numbers, or two lines differ.
     """
-    with path.open("rb") as file:
-        head = file.read(_MAX_HEADER)
-    lines = re.findall(
-        rb"^comment[ \t]+offset:?[ \t]+([-+.0-9]|nan|inf)([^\r\n]*)",
-        head[: head.find(b"\nend_header")].replace(b"\r", b"\n"),
-        re.IGNORECASE | re.MULTILINE,
-    )
+    lines = _comments(path, rb"offset:?[ \t]+([-+.0-9]|nan|inf)([^\r\n]*)")
     texts = {(first + rest).decode("ascii", "replace").strip() for first, rest in lines}
     if len(texts) > 1:
         raise ValueError(f"{path}: must state one offset, states {' and '.join(sorted(texts))[:80]}; remove the others")
     return origin_of_text(f"{path}: comment offset", texts.pop()) if texts else None
+
+
+def _comments(path: Path, pattern: bytes) -> list[tuple[bytes, ...]]:
+    """The groups of a pattern in each comment of a header that it matches, case aside."""
+    with path.open("rb") as file:
+        head = file.read(_MAX_HEADER)
+    lines = head[: head.find(b"\nend_header")].replace(b"\r", b"\n")
+    return re.findall(rb"^comment[ \t]+" + pattern, lines, re.IGNORECASE | re.MULTILINE)
 
 
 def extra_kind(name: str, values: np.ndarray, count: int) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 
 from drgs.cameras import Camera, intrinsics
 from drgs.codecs.ply import note_offset, save_ply
-from drgs.commands.viewpoints import frame_size
+from drgs.commands.viewpoints import frame_size, one_a_place
 from drgs.data.camera_layout import level_frame, upright
 from drgs.data.camera_path import CameraPath, read_camera_path
 from drgs.display.progress import Bar
@@ -222,8 +222,7 @@ def at_times(
         if not (first <= begin <= last and first <= end <= last):
             raise ValueError(f"--time must be in {first:g}..{last:g}, the times of the run, got {text!r}; correct it")
     if not is_film:
-        poses = {(camera.w2c.tobytes(), camera.K.tobytes()): camera for camera in reversed(cameras)}
-        cameras = list(reversed(poses.values()))  # synchronous cameras have a view for every time
+        cameras = one_a_place(cameras)  # synchronous cameras have a view for every time
     if begin == end:
         return [dataclasses.replace(camera, time=begin) for camera in cameras]
     if len(cameras) == 1 and not is_film:

@@ -12,10 +12,8 @@ from drgs.cameras.origins import origin_text
 from drgs.commands.convert import still
 from drgs.commands.options import Mesh
 from drgs.commands.scene_input import SceneInput
-from drgs.commands.viewpoints import check_lenses, evenly, known_views
+from drgs.commands.viewpoints import check_lenses, evenly, known_views, one_a_place
 from drgs.display.progress import Bar
-from drgs.ellipsoids import Gaussians
-from drgs.io.checkpoint import state_header
 from drgs.io.outputs import lock_folder
 from drgs.meshing.extraction import mesh_of
 from drgs.meshing.writing import MESH_SUFFIXES, save_mesh
@@ -34,7 +32,7 @@ def run(args: Mesh) -> None:
     with lock_folder(args.output.parent, "mesh", [args.output.name], [args.scene, args.cameras or ""]):
         with Bar("reading", show=not args.quiet):
             given = SceneInput.of(args)
-            gaussians = _without_skybox(still(args, given), given)
+            gaussians = still(args, given).take(slice(given.far, None))
         if args.cameras is None and given.run is None:
             raise ValueError(
                 "a file of Gaussians does not say its views: --cameras must name a data set, a run or a cameras.json"
@@ -66,15 +64,6 @@ def run(args: Mesh) -> None:
             print(f"positions are relative to the offset {origin_text(mesh.origin)}, which the file states")
 
 
-def _without_skybox(gaussians: Gaussians, given: SceneInput) -> Gaussians:
-    """The Gaussians but those of a skybox, which a run has first."""
-    if given.run is None or given.step is None:
-        return gaussians
-    count = state_header(given.run.state).get("skybox", 0)
-    return gaussians.take(slice(count, None)) if count else gaussians
-
-
 def _places(cameras: list[Camera]) -> list[Camera]:
     """Cameras without the times of their photographs, each place once: frames of a video have one."""
-    found = {(camera.w2c.tobytes(), camera.K.tobytes()): camera for camera in reversed(cameras)}
-    return [dataclasses.replace(camera, time=None) for camera in reversed(found.values())]
+    return [dataclasses.replace(camera, time=None) for camera in one_a_place(cameras)]

@@ -65,6 +65,11 @@ class Common:
     def __post_init__(self) -> None:
         check_ranges(self)
 
+    def say(self, text: str) -> None:
+        """Print a line, unless --quiet is given."""
+        if not self.quiet:
+            print(text, flush=True)
+
     @classmethod
     def values(cls, given: Mapping[str, Any], line: Collection[str]) -> dict[tuple[str, ...], Any]:
         """Path of a field -> its value, as `drgs.checks.records.nested` makes these options of them.

@@ -29,7 +29,7 @@ from drgs.fitting.metrics import TRAIN_VIEWS, through_renderers
 from drgs.fitting.records import fitted_views, is_run, of_some
 from drgs.fitting.renderers import renderers_to_measure
 from drgs.information.region import Region, RegionText
-from drgs.io.checkpoint import load_state, save_state, state_header
+from drgs.io.checkpoint import load_state, save_state
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import atomic_write, lock_folder, write_json
 from drgs.io.run import Run
@@ -86,7 +86,7 @@ def run(args: Prune) -> None:
                 )
             stages = {"before": given.scene, "pruned": pruned.gaussians}
             if args.refit and views.train is not None and isinstance(pruned.gaussians, Gaussians):
-                far = int(pruned.kept[: _skybox(given)].sum())
+                far = int(pruned.kept[: given.far].sum())
                 config = given.record.config if given.record else _config_over(given)
                 frames = _shown(views.train, region, given, settings)
                 stages["refitted"] = fit_on(pruned.gaussians, frames, config, args.refit, far, exposures)
@@ -303,13 +303,6 @@ def _shown(frames: list[Frame], region: Region | None, given: SceneInput, settin
         dataclasses.replace(frame, mask=x, is_object=False, alpha=None) for frame, x in zip(frames, masks, strict=True)
     )
     return [frame for frame in shown if frame.mask is not None and bool((frame.mask > 0).any())]
-
-
-def _skybox(given: SceneInput) -> int:
-    """How many of the first Gaussians are a run's skybox."""
-    if given.run is None or given.step is None:
-        return 0
-    return state_header(given.run.state).get("skybox", 0)
 
 
 def _config_over(given: SceneInput) -> FitConfig:

@@ -82,8 +82,7 @@ def run(args: Query) -> None:
         "views": views,
     }
     write_json(args.output / "query.json", report)
-    if not args.quiet:
-        print(_summary(args, report))
+    args.say(_summary(args, report))
 
 
 def read_embeddings(path: Path) -> torch.Tensor:

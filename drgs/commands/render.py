@@ -113,10 +113,10 @@ def run(args: Render) -> None:
         )
     report = {"scene": str(args.scene), "cameras": source, "gaussians": len(gaussians)} | report
     if single is not None:
-        _print(args, _summary(report, single.path))
+        args.say(_summary(report, single.path))
         return
     _write_lists(args, report, film, given, cameras, formats)
-    _print(args, _summary(report, args.output))
+    args.say(_summary(report, args.output))
 
 
 def _check(args: Render, settings: RenderSettings, formats: tuple[str, ...]) -> None:
@@ -147,8 +147,7 @@ def _write_lists(
     if all(not camera.is_distorted and camera.K[0, 1] == 0 for camera in cameras):
         save_cameras_json(args.output / "cameras.json", cameras)
     else:
-        _print(
-            args,
+        args.say(
             "no cameras.json: its layout has no lens and no skew; render.json holds the cameras, --cameras reads it",
         )
     write_json(args.output / "render.json", {"schema": SCHEMA, "command": "render"} | report)
@@ -195,7 +194,7 @@ def _cameras_of(
     bent = sum(camera.is_distorted for camera in cameras)
     if bent and not args.panorama and not (follows or given.keeps_lenses(args.undistort)):
         cameras = [camera.undistorted() for camera in cameras]
-        _print(args, f"{bent} cameras have a lens: drawn without it; --undistort off draws through it")
+        args.say(f"{bent} cameras have a lens: drawn without it; --undistort off draws through it")
     check_lenses("render", settings, cameras)
     return cameras, source
 
@@ -391,15 +390,9 @@ def _print_forecast(args: Render, gaussians: Gaussians, cameras: list[Camera], s
     seconds = forecast(gaussians, cameras, settings)
     if seconds > _LONG_SECONDS:
         what = f"{args.preset}, {len(cameras)} views of {cameras[0].width}x{cameras[0].height}"
-        _print(
-            args,
+        args.say(
             f"{what} will take about {duration(seconds)} on this machine; --preset fast takes a small part of that",
         )
-
-
-def _print(args: Render, text: str) -> None:
-    if not args.quiet:
-        print(text, flush=True)
 
 
 # ---------------------------------------------------------------------------------------------------- how long it takes

@@ -45,8 +45,7 @@ def run(args: Report) -> None:
         _log.warning("%s; the report goes without the data set's cameras", str(error).partition(";")[0])
         dataset = None
     report_of(folder, path, dataset)
-    if not args.quiet:
-        print(f"report: {path}")
+    args.say(f"report: {path}")
 
 
 def report_of(run: Run, path: Path, dataset: Dataset | None) -> None:

@@ -11,6 +11,7 @@ from drgs.codecs.folders import cameras_of_model, file_of_folder
 from drgs.commands.frames import in_frame_of_data
 from drgs.data.camera_lists import is_camera_list
 from drgs.fitting.records import FitRecord, fit_record, is_run, load_run
+from drgs.io.checkpoint import state_header
 from drgs.io.foreign import refuse_foreign
 from drgs.io.run import Run
 from drgs.settings import RenderSettings
@@ -131,6 +132,11 @@ class SceneInput:
     def estimated(self) -> tuple[Nuisance, ...]:
         """Unknowns of the photographs that the run has estimated."""
         return () if self.record is None else self.record.estimated
+
+    @property
+    def far(self) -> int:
+        """How many of the first Gaussians are a run's skybox."""
+        return 0 if self.run is None or self.step is None else state_header(self.run.state).get("skybox", 0)
 
     @property
     def scene(self) -> Scene:

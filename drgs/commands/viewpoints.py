@@ -218,10 +218,10 @@ def _orbit_to_render(
     how = {"width": width, "height": height, "fixed": fixed, "returns": returns}
     cameras, source = capture_orbit(captured, frames, distance_of=seen_distance(given.gaussians), **how)
     if cameras:
-        _print(args, source)
+        args.say(source)
         return cameras, source
     if fixed.up is None:
-        _print(args, "orbit with minus-y up, as COLMAP's worlds stand; turn it with --orbit up=z")
+        args.say("orbit with minus-y up, as COLMAP's worlds stand; turn it with --orbit up=z")
     up = next(name for name, direction in UP.items() if direction == (fixed.up or UP["minus-y"]))
     return scene_orbit(given.gaussians, frames, **how), f"orbit, up {up}"
 
@@ -455,6 +455,12 @@ def evenly(views: list, limit: int) -> list:
     return [views[i * len(views) // limit] for i in range(limit)]
 
 
+def one_a_place(cameras: list[Camera]) -> list[Camera]:
+    """The first camera of each pose and intrinsics, in their order."""
+    first = {(camera.w2c.tobytes(), camera.K.tobytes()): camera for camera in reversed(cameras)}
+    return list(reversed(first.values()))
+
+
 def check_lenses(command: str, settings: RenderSettings, cameras: Iterable[Camera]) -> None:
     """Raise ValueError if a camera has a lens and the settings render pinholes alone."""
     bent = sum(camera.is_distorted for camera in cameras) if settings.planar else 0
@@ -464,8 +470,3 @@ def check_lenses(command: str, settings: RenderSettings, cameras: Iterable[Camer
             f"pinhole's image plane, and {bent} cameras have a lens; use --preset exact, fast or 3dgut, or "
             "--undistort on"
         )
-
-
-def _print(args: Render | Crossval | Query | Tradeoff, text: str) -> None:
-    if not args.quiet:
-        print(text, flush=True)

@@ -20,13 +20,14 @@ from typing import IO
 import numpy as np
 
 from drgs.cameras.checks import check_distance
+from drgs.checks.arguments import said
 from drgs.io.foreign import is_file, refuse_foreign
+from drgs.io.json_files import read_bounded
 from drgs.runtime import memory
 
 _MAX_NPY_HEADER = 65536  # bytes: a dtype of many fields takes a few hundred
 _DEFLATE = 1032  # bytes that one byte of deflate can become
 _MAX_NAME = 1024  # characters, folders included
-_SHOWN = 120  # characters of a reader's own message
 # Poses printed with a few digits are repaired up to this error; anything larger is no rotation.
 _ROUNDING = 1e-2
 
@@ -100,13 +101,9 @@ def read_text(path: Path, what: str, largest: int) -> str:
         FileNotFoundError: No such file.
         ValueError: larger, of another format, or bytes that are no text.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: must be {what}, found none; check the path")
-    refuse_foreign(path, what)
-    if path.stat().st_size > largest:
-        raise ValueError(f"{path}: must be {what} of at most {largest >> 20} MiB, is larger; name another")
+    data = read_bounded(path, what, "name another", largest)
     try:
-        return path.read_text(encoding="utf-8-sig")
+        return data.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError:
         raise ValueError(f"{path}: must be {what} in UTF-8, got other bytes; write it again") from None
 
@@ -144,8 +141,7 @@ def _check_npy(where: str, file: IO[bytes], size: int) -> None:
         shape, _, dtype = read(file, max_header_size=_MAX_NPY_HEADER)
         start = file.tell()
     except Exception as error:  # NumPy's parser of headers raises whatever Python's tokenizer does
-        text = " ".join(str(error).split())[:_SHOWN]
-        raise ValueError(f"{where}: must be a .npy file, got {text}; save it with numpy.save") from None
+        raise ValueError(f"{where}: must be a .npy file, got {said(error)}; save it with numpy.save") from None
     if dtype.hasobject or dtype.kind not in "fiub":
         raise ValueError(f"{where}: must hold plain numbers, got dtype {dtype}; save a float array")
     # Python integers: a claimed shape of 10^12 x 10^12 must not wrap around.
@@ -215,8 +211,7 @@ def _reading_archive(path: Path, what: str) -> Iterator[None]:
         # of the disk.
         if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno not in (None, errno.EINVAL)):
             raise
-        text = " ".join(str(error).split())[:_SHOWN]
-        raise ValueError(f"{path}: must hold {what}, got {text}; save it with numpy.savez") from None
+        raise ValueError(f"{path}: must hold {what}, got {said(error)}; save it with numpy.savez") from None
 
 
 def inverse_pose(where: str, c2w: np.ndarray) -> np.ndarray:

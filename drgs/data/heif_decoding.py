@@ -16,6 +16,7 @@ import numpy as np
 import pillow_heif
 from PIL import Image, ImageOps, UnidentifiedImageError
 
+from drgs.checks.arguments import said
 from drgs.data.hdr import HDR, in_srgb
 from drgs.data.reader_process import serve
 from drgs.runtime import memory
@@ -27,7 +28,6 @@ _ORIENTATION = 0x0112
 _EXIF = b"Exif\0\0"
 _MAX_EXIF_BYTES = 65_533
 _COPY = "it is damaged, or no such photograph: copy it again, or convert it to JPEG"
-_SHOWN = 120  # characters of a library's own message
 
 Image.MAX_IMAGE_PIXELS = None  # bounded here, and phones make 200 million
 pillow_heif.register_heif_opener(thumbnails=False, depth_images=False, aux_images=False)
@@ -106,8 +106,7 @@ def _opened(path: Path) -> Image.Image:
 
 
 def _damaged(path: Path, error: Exception) -> ValueError:
-    text = " ".join(str(error).split())[:_SHOWN] or type(error).__name__
-    return ValueError(f"{path}: must be a whole HEIC or AVIF photograph, got {text}; {_COPY}")
+    return ValueError(f"{path}: must be a whole HEIC or AVIF photograph, got {said(error)}; {_COPY}")
 
 
 if __name__ == "__main__":

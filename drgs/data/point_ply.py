@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from drgs.checks.arguments import said
 from drgs.codecs.ply_headers import ply_offset, ply_source
 from drgs.io.foreign import is_file, refuse_foreign
 
 _MAX_PLY_HEADER = 65536  # bytes in which a header must end: that of 3DGS takes some 1,500
-_SHOWN = 200  # characters of a reader's own message
 _PLY_BYTES = {
     **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
     **dict.fromkeys(("int", "uint", "int32", "uint32", "float", "float32"), 4),
@@ -44,8 +44,9 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     except MemoryError:
         raise
     except Exception as error:  # of a damaged file, whatever its words make plyfile and NumPy raise
-        text = " ".join(str(error).split())[:_SHOWN]
-        raise ValueError(f"{path}: must be a PLY point cloud with x, y, z, got {text}; export it again") from None
+        raise ValueError(
+            f"{path}: must be a PLY point cloud with x, y, z, got {said(error, 200)}; export it again"
+        ) from None
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(bad):
         raise ValueError(f"{path}: points must be finite, got NaN or Inf at index {bad[0]}; export it again")

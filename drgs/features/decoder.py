@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 
-from drgs.checks.arguments import check_path
+from drgs.checks.arguments import check_path, said
 from drgs.io.archives import check_archive
 from drgs.io.foreign import refuse_foreign
 from drgs.io.outputs import atomic_write
@@ -139,9 +139,8 @@ def load_decoder(path: str | os.PathLike) -> Decoder:
             raise ValueError("no file that torch.save writes")
         state: Any = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # of a damaged file, whatever its bytes make the parsers raise
-        text = " ".join(str(error).split())[:120]
         raise ValueError(
-            f"{path}: must be a decoder's state (.pth) of plain tensors, got {text or type(error).__name__}; save it "
+            f"{path}: must be a decoder's state (.pth) of plain tensors, got {said(error)}; save it "
             "with torch.save(decoder.state_dict(), ...)"
         ) from None
     return Decoder.of_state(state, str(path))

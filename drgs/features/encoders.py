@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from drgs.checks.arguments import said
 from drgs.io.json_files import check_json, read_json
 
 SCALES = (0.75, 1.0, 1.5)
@@ -78,7 +79,9 @@ class ClipEncoder:
                 output_loading_info=True,
             )
         except Exception as error:  # of a damaged file, whatever its bytes make the parsers raise
-            raise ValueError(f"{self.weights}: must be weights of CLIP, got {_line(error)}; copy them again") from None
+            raise ValueError(
+                f"{self.weights}: must be weights of CLIP, got {said(error, 160)}; copy them again"
+            ) from None
         missing = sorted(report["missing_keys"]) + sorted(map(str, report["mismatched_keys"]))
         if missing:  # transformers would go on with random numbers in their place
             raise ValueError(
@@ -168,7 +171,7 @@ class ClipEncoder:
                 rows.append(torch.nn.functional.normalize(found, dim=1).mean(0).cpu())
         except Exception as error:  # of a damaged file, whatever its bytes make the parsers raise
             raise ValueError(
-                f"{self.folder}: its tokenizer must be that of its model, got {_line(error)}; copy it again"
+                f"{self.folder}: its tokenizer must be that of its model, got {said(error, 160)}; copy it again"
             ) from None
         return torch.nn.functional.normalize(torch.stack(rows), dim=1)
 
@@ -249,8 +252,3 @@ def _colors(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     if len(mean) != 3 or len(std) != 3 or min(std) <= 0:
         raise ValueError(f"{path}: image_mean and image_std must be 3 numbers, image_std > 0; copy it again")
     return np.array(mean, np.float32), np.array(std, np.float32)
-
-
-def _line(error: Exception) -> str:
-    """An error's text in part of a line."""
-    return (" ".join(str(error).split()) or type(error).__name__)[:160]

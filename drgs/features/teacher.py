@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drgs.checks.arguments import said
 from drgs.io.archives import check_archive
 from drgs.io.foreign import refuse_foreign
 
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 # `CxHxW` are the letters in the files of Feature 3DGS; numbers in their place must agree with the tensor.
 _NAME = re.compile(r"(.+)_fmap_(CxHxW|(\d+)x(\d+)x(\d+))\.pt")
 _ZIP = b"PK\x03\x04"
-_SHOWN = 120  # characters of torch's own message
 _finite: set[tuple[Path, int, int]] = set()  # files (path, size, time of change) that have been looked through
 
 
@@ -99,9 +99,9 @@ def read_tensor(path: str | os.PathLike, what: str = "a tensor's file") -> torch
             "save the tensor alone"
         ) from None
     except Exception as error:  # torch's reader raises whatever its parts do: RuntimeError, KeyError, EOFError
-        text = " ".join(str(error).split())[:_SHOWN] or type(error).__name__
         raise ValueError(
-            f"{path}: must hold one plain tensor, whole, torch says {text!r}; copy it again, or save the tensor alone"
+            f"{path}: must hold one plain tensor, whole, torch says {said(error)!r}; copy it again, or save the tensor "
+            "alone"
         ) from None
     if not isinstance(value, torch.Tensor) or value.layout != torch.strided:
         kind = type(value).__name__ if not isinstance(value, torch.Tensor) else f"tensor of layout {value.layout}"

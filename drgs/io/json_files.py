@@ -27,7 +27,7 @@ def read_json(path: Path, what: str = "a JSON file", advice: str = "write the fi
         FileNotFoundError: If there is no such file.
         ValueError: If it is not JSON, too large or too deeply nested, or known to be of another kind.
     """
-    return parse_json(_bounded(path, what, advice, _MAX_JSON_BYTES), str(path), advice)
+    return parse_json(read_bounded(path, what, advice, _MAX_JSON_BYTES), str(path), advice)
 
 
 def read_toml(path: Path, what: str = "a TOML file", advice: str = "write the file again") -> dict[str, Any]:
@@ -35,7 +35,7 @@ def read_toml(path: Path, what: str = "a TOML file", advice: str = "write the fi
 
     Args, Raises: As `read_json`.
     """
-    data = _bounded(path, what, advice, _MAX_TOML_BYTES)
+    data = read_bounded(path, what, advice, _MAX_TOML_BYTES)
     try:
         return tomllib.loads(data.decode("utf-8-sig").replace("\r\n", "\n"))
     except RecursionError:
@@ -44,8 +44,13 @@ def read_toml(path: Path, what: str = "a TOML file", advice: str = "write the fi
         raise ValueError(f"{path}: must be valid TOML, got {' '.join(str(error).split())}; {advice}") from None
 
 
-def _bounded(path: Path, what: str, advice: str, largest: int) -> bytes:
-    """The bytes of a file that is not too large, and not known to be of another kind."""
+def read_bounded(path: Path, what: str, advice: str, largest: int) -> bytes:
+    """The bytes of a file that is not too large, and not known to be of another kind.
+
+    Raises:
+        FileNotFoundError: No such file.
+        ValueError: Larger, or of another format.
+    """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be {what}, found none; check the path")
     refuse_foreign(path, what)
