@@ -11,7 +11,6 @@ Constants of the expected error were chosen on CHOOSING, and all other runs meas
 
 from __future__ import annotations
 
-import argparse
 import os
 import statistics
 import sys
@@ -25,7 +24,7 @@ import studies
 import torch
 from pages import fill_between
 from studies import ROOT
-from where import add_row, ran, read_rows
+from where import ran, rows_of_runs
 
 import drgs
 from drgs import fisher
@@ -236,14 +235,7 @@ def data_lines(rows: list[dict]) -> list[list[str]]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("runs", nargs="*", type=Path)
-    args = parser.parse_args()
-    there = {row.get("run") for row in read_rows(ROWS)}
-    for path in args.runs:
-        if path.name not in there:
-            add_row(ROWS, measured(path))
-    rows = read_rows(ROWS)
+    rows = rows_of_runs(ROWS, measured, __doc__)
     parts = halves(rows)
     text = [studies.stamp("expected_error")]
     text += [paragraph(summary(rows))] if parts["captures"] else []

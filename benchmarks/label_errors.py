@@ -11,7 +11,6 @@ with the teacher's maps of held-out views, where there are some. AUSE as in benc
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import os
 import statistics
@@ -26,7 +25,7 @@ import torch
 from expected_error import ause
 from pages import fill_between
 from studies import ROOT
-from where import add_row, ran, read_rows
+from where import ran, rows_of_runs
 
 import drgs
 from drgs import fisher
@@ -140,14 +139,7 @@ def feature_sentence(rows: list[dict]) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("runs", nargs="*", type=Path)
-    args = parser.parse_args()
-    there = {row.get("run") for row in read_rows(ROWS)}
-    for path in args.runs:
-        if path.name not in there:
-            add_row(ROWS, measured(path))
-    rows = read_rows(ROWS)
+    rows = rows_of_runs(ROWS, measured, __doc__)
     text = [studies.stamp("label_errors"), label_table(rows), feature_sentence(rows)]
     print("\n\n".join(text))
     if PAGE.exists():

@@ -11,7 +11,6 @@ perfect. Rows are kept (benchmarks/uncertainty.jsonl); their means go to a data 
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import sys
@@ -23,7 +22,7 @@ import numpy as np
 import studies
 import torch
 from studies import ROOT
-from where import add_row, ran, read_rows
+from where import ran, rows_of_runs
 
 import drgs
 from drgs import fisher
@@ -109,14 +108,7 @@ def lines(rows: list[dict]) -> list[list[str]]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("runs", nargs="*", type=Path)
-    args = parser.parse_args()
-    there = {row.get("run") for row in read_rows(ROWS)}
-    for path in args.runs:
-        if path.name not in there:
-            add_row(ROWS, measured(path))
-    table = lines(read_rows(ROWS))
+    table = lines(rows_of_runs(ROWS, measured, __doc__))
     print(studies.csv_text(table))
     studies.write_csv(ROOT / "docs" / "data" / "uncertainty.csv", table)
     return 0

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import argparse
 import datetime
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 from drgs import runtime
 from drgs.runtime import machine
 
-__all__ = ["DATA", "ROOT", "UNITS", "add_row", "ran", "read_rows"]
+__all__ = ["DATA", "ROOT", "UNITS", "add_row", "ran", "read_rows", "rows_of_runs"]
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("DRGS_DATA", ROOT.parent / "shared" / "data"))
@@ -39,3 +41,20 @@ def add_row(path: Path, row: dict) -> None:
     """Add a row to a study, as soon as it is there."""
     with path.open("a") as file:
         file.write(json.dumps(row) + "\n")
+
+
+def rows_of_runs(path: Path, measured: Callable[[Path], dict], about: str | None) -> list[dict]:
+    """The rows of a study of runs, once those that its command line names are among them.
+
+    Args:
+        path: The rows that are kept.
+        measured: Makes the row of a run folder, whose name is its `run`.
+        about: What --help says.
+    """
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="*", type=Path)
+    there = {row.get("run") for row in read_rows(path)}
+    for run in parser.parse_args().runs:
+        if run.name not in there:
+            add_row(path, measured(run))
+    return read_rows(path)
