@@ -24,14 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from drgs.cluster.agreement import (
-    Disagreement,
-    check_agreement,
-    statement,
-    this_worker,
-    worker_name,
-    worker_statement,
-)
+from drgs.cluster.agreement import Disagreement, check_agreement, statement, this_worker, worker_name, worker_statement
 from drgs.cluster.payloads import Missing, Payload, keep, opened_payload
 from drgs.information.quantity import Quantity, ViewContext
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +23,6 @@ from drgs.pages.report.page import Drawings, page_html
 FILE = "report.html"
 _SHOWN_VIEWS = 4  # views that are shown with pictures; chosen for the size of the page
 _MOST_RESIDUALS = 24  # photographs whose residuals stand for those of all, at most; chosen for its seconds
-
-_log = logging.getLogger(__name__)
 
 
 def write_report(run: Run, path: Path, command: str, command_text: str, dataset: Dataset | None) -> None:
