@@ -215,6 +215,7 @@ def test_large_photographs_have_several_updates_by_default(dataset, tmp_path, mo
     assert updates("active", 12, selection=plan()) == 1
     assert updates("again", begin=tmp_path / "large" / "state.safetensors") == 1
     assert updates("stated", updates_per_step=2) == 2
+    assert updates("many", max_gaussians=SIZE * SIZE // 2 + 1) == 1
     monkeypatch.setattr(resolution, "LARGE", SIZE * SIZE + 1)
     assert updates("large", resume=True) == resolution.UPDATES
     assert updates("small") == 1

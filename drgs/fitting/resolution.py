@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from drgs.fitting.config import FitConfig
     from drgs.fitting.frames import Frame
 
-__all__ = ["FULL", "LARGE", "UPDATES", "WHOLE", "Resolution", "default_updates", "halved_size"]
+__all__ = ["FULL", "LARGE", "PIXELS_A_GAUSSIAN", "UPDATES", "WHOLE", "Resolution", "default_updates", "halved_size"]
 
 FULL = 1 / 2
 """Fraction of the steps from which on photographs have the size of the fit; chosen (docs/one-model.md has its gain)."""
@@ -45,6 +45,10 @@ WHOLE = 0.8
 
 LARGE = 30_000
 """Pixels of a photograph, the median, from which on a step of a plain fit is several updates (docs/one-model.md)."""
+
+PIXELS_A_GAUSSIAN = 2.0
+"""Pixels of a photograph over the largest number of Gaussians, from which on likewise: what an update costs by Gaussian
+would take more time than its fewer pixels save (with 1.8, and as long, nothing is gained)."""
 
 UPDATES = 3
 """Updates of such a step: of half the width and height, or of a quarter, they take as long as one of all pixels."""
@@ -164,7 +168,8 @@ def default_updates(setup: Setup) -> int:
     pixels = [frame.camera.width * frame.camera.height for frame in setup.frames]
     is_plain = not (setup.modes & {"selection", "begin"} or setup.times or config.loss.depth != "off")
     is_plain = is_plain and all(frame.teacher is None for frame in setup.frames)
-    return UPDATES if is_plain and statistics.median(pixels) >= LARGE else 1
+    least = max(LARGE, PIXELS_A_GAUSSIAN * config.density.max_gaussians)
+    return UPDATES if is_plain and statistics.median(pixels) >= least else 1
 
 
 def halved_size(width: int, height: int, times: int) -> tuple[int, int]:
