@@ -10,7 +10,7 @@ import contextlib
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -247,7 +247,8 @@ def _result_of(loop: _Loop) -> FitResult:
     reported: dict[str, Any] = {}
     for component in trainer.components:
         reported |= component.metrics(trainer, held_out)
-    result = loop.measured(run.renders / "test")
+    options = loop.evaluation()
+    result = loop.measured(run.renders / "test", options)
     written = metrics.write_metrics(
         run,
         "test",
@@ -264,6 +265,7 @@ def _result_of(loop: _Loop) -> FitResult:
             renderers_to_measure(config.renderers, config.settings, lenses=config.data.undistort == "off"),
             "test" if held_out else "train",
             None if held_out else metrics.TRAIN_VIEWS,
+            options.get("as_photograph"),
         ),
         **chosen,
         **reported,
@@ -349,12 +351,16 @@ class _Loop:
         self._saved_at = time.monotonic()
         self._recorded = trainer.step_index  # steps at the last record of errors
 
-    def measured(self, pictures: Path | None = None) -> dict:
-        """Metrics of the held-out views as things are now; `pictures` as of `drgs.fitting.metrics.evaluate`."""
-        trainer = self.trainer
+    def evaluation(self) -> dict[str, Any]:
+        """Arguments of `drgs.fitting.metrics.evaluate` as things are now."""
         options: dict[str, Any] = {}
-        for component in trainer.components:
-            options |= component.evaluation(trainer, self.held_out)
+        for component in self.trainer.components:
+            options |= component.evaluation(self.trainer, self.held_out)
+        return options
+
+    def measured(self, pictures: Path | None = None, options: Mapping[str, Any] | None = None) -> dict:
+        """Metrics of the held-out views as things are now; `pictures` and `options` as of `evaluate`."""
+        trainer, options = self.trainer, self.evaluation() if options is None else options
         return metrics.evaluate(trainer.scene(), self.held_out, trainer.config.settings, pictures=pictures, **options)
 
     def _follow_pace(self, pace: Pace, bar: Bar) -> None:
@@ -521,13 +527,16 @@ class _Loop:
         """One picture, and the PSNR of all held-out views, unless the fit is interrupted."""
         trainer, done = self.trainer, self.trainer.step_index
         frames = self.held_out or trainer.photographs()[:1]
+        as_photograph = self.evaluation().get("as_photograph")
         values = []
         for i, frame in enumerate(frames):
             if is_interrupted():
                 return
             with torch.no_grad():  # a picture
                 seen = colors_only(trainer.scene(), frame.camera.time)
-                image = render(seen, frame.camera, trainer.config.settings).rgb.cpu().clamp(0, 1)
+                out = render(seen, frame.camera, trainer.config.settings)
+                out = out if as_photograph is None else as_photograph(out, frame)
+            image = out.rgb.cpu().clamp(0, 1)
             values.append(metrics.psnr(image, frame.image(), frame.mask))
             if i == 0:
                 pair = torch.cat([frame.image(), image], dim=1)

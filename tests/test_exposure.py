@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import re
 
 import numpy as np
@@ -14,9 +15,11 @@ from drgs.cameras import orbit
 from drgs.data import load
 from drgs.files import load_state
 from drgs.fitting.components import exposure as exposures
-from drgs.fitting.components.exposure import Exposure, estimate_exposure, exposure_network
+from drgs.fitting.components.exposure import Exposure, Meter, estimate_exposure, exposure_network
+from drgs.fitting.evaluation import evaluate_run
 from drgs.fitting.frames import Frame
 from drgs.fitting.records import fit_record
+from drgs.fitting.resume import lock_run
 from drgs.tracing.call import Output
 from drgs.train import fit
 
@@ -178,6 +181,61 @@ def test_auto_is_as_photographs_that_short_fits_did_not_see_say(tmp_path, monkey
     assert (found["gained"] > 0) == ("estimated" in run.config())
     said = "each has its own" if found["gained"] > 0 else "off, all have the same"
     assert f"change by {found['gained']:+.2f} dB; {said}" in capsys.readouterr().err
+
+
+def test_a_meter_predicts_what_was_left_out():
+    """Log gains that follow the mean color come back, and `lowered` is what refitting without each photograph gives;
+    gains that follow nothing, and of few photographs, have no meter. None is predicted beyond those that were seen.
+    """
+    rng = np.random.default_rng(0)
+    seen = rng.normal(-1, 0.5, (20, 3))
+    law = np.array([[0.1, 0.0, -0.1], [-0.6, 0.1, 0.0], [0.0, -0.8, 0.2], [0.1, 0.0, -0.5]])
+    terms = np.column_stack([np.ones(20), seen])
+    gains = terms @ law + rng.normal(0, 0.05, (20, 3))
+    meter = Meter.fitted(seen, gains, (0.0, 0.0, 0.0))
+    assert np.abs(meter.coefficients - law).max() < 0.1
+    left = [np.linalg.lstsq(np.delete(terms, i, 0), np.delete(gains, i, 0))[0] for i in range(20)]
+    errors = gains - np.stack([terms[i] @ left[i] for i in range(20)])
+    assert meter.lowered == pytest.approx(1 - np.square(errors).sum() / np.square(gains).sum(), abs=1e-9)
+    assert meter.lowered > 0.9
+    assert Meter.fitted(seen, rng.normal(0, 0.3, (20, 3)), (0.0, 0.0, 0.0)) is None
+    assert Meter.fitted(seen[:7], gains[:7], (0.0, 0.0, 0.0)) is None
+    frame = _photographs(np.ones((1, 3)))[0][0]
+    dark = Output(rgb=torch.full((2, 2, 3), 1e-3), alpha=torch.ones(2, 2))
+    torch.testing.assert_close(meter(dark, frame).rgb[0, 0] / 1e-3, torch.tensor(gains.max(axis=0)).exp().float())
+
+
+def test_a_meter_reads_what_is_covered_and_leaves_the_background():
+    """Half an image of 0.25 in front of white, by its alpha channel, is metered as 0.25; the white half stays white.
+    Where nothing says what is empty, all of the image has the gain.
+    """
+    law = np.zeros((4, 3))
+    law[1:] = np.eye(3)
+    meter = Meter(law, np.full(3, -9.0), np.full(3, 9.0), (1.0, 1.0, 1.0), 1.0)
+    alpha = torch.tensor([[1.0, 0.0]])
+    out = Output(rgb=torch.tensor([[[0.25] * 3, [1.0] * 3]]), alpha=alpha)
+    frame = _photographs(np.ones((1, 3)))[0][0]
+    shown = meter(out, dataclasses.replace(frame, pixels=torch.ones(1, 2, 3), alpha=alpha)).rgb
+    torch.testing.assert_close(shown[0, :, 0], torch.tensor([0.0625, 1.0]))
+    torch.testing.assert_close(meter(out, frame).rgb[0, :, 0], torch.tensor([0.0625, 0.25]))
+
+
+def test_held_out_views_are_metered_in_fits_and_measured_again(tmp_path, monkeypatch):
+    """What a fit with gains measures of its held-out views, `drgs eval` finds again, in every renderer; without the
+    meter it is something else.
+    """
+    monkeypatch.setattr(exposures, "_LEAST_LOWERED", -math.inf)
+    write_photographs(tmp_path / "data", GAINS)
+    settings = config(max_steps=2, exposure="points", test_every=9)
+    result = fit(load(tmp_path / "data", test_every=9), tmp_path / "run", settings)
+    first = result.metrics
+    with lock_run(result.run, "eval") as output:
+        again = evaluate_run(result.run, output)
+        assert first["mean"]["psnr"] == pytest.approx(again["mean"]["psnr"], abs=1e-4)
+        rows = [[row["mean"]["psnr"] for row in one["renderers"]["rows"]] for one in (first, again)]
+        assert rows[0] == pytest.approx(rows[1], abs=1e-4)
+        monkeypatch.setattr(exposures, "_LEAST_LOWERED", math.inf)
+        assert abs(evaluate_run(result.run, output)["mean"]["psnr"] - first["mean"]["psnr"]) > 0.01
 
 
 def test_learned_gains_keep_zero_mean_and_held_ones_stay():

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from drgs.cameras.sizes import reduced_size
 from drgs.display.pictures import file_names
 from drgs.fitting.components.base import RunViews
+from drgs.fitting.components.exposure import NETWORK, Exposure
 from drgs.fitting.components.table import COMPONENTS
 from drgs.fitting.frames import frames_for, load_dataset
 from drgs.fitting.metrics import VIEW_PICTURES, Lpips, evaluate, through_renderers, write_metrics
@@ -18,6 +19,7 @@ from drgs.fitting.stages import moving_labels
 
 if TYPE_CHECKING:
     from drgs.data import Dataset, View
+    from drgs.fitting.components.exposure import Meter
     from drgs.fitting.frames import Frame
     from drgs.fitting.records import FitRecord, LoadedRun
     from drgs.fitting.segments import Segmentation
@@ -66,6 +68,7 @@ def evaluate_run(
     if not views:
         raise ValueError(f"eval: split {split} must hold a view, holds none ({dataset.split_rule()}); use --split")
     frames = frames_for(views, config.data, _most_pixels(views, config.data.max_pixels, scale))
+    meter = _meter(run, loaded, train)
     _check_pictures(output, recorded, split, frames)
     result = evaluate(
         scene,
@@ -75,6 +78,7 @@ def evaluate_run(
         pictures=run.renders / split,
         segmentation=_segmentation(loaded, dataset, frames),
         moving=moving_labels(dataset) if recorded.times else frozenset(),
+        as_photograph=meter,
     )
     cameras = [stated[view.name] for view in train], [view.camera for view in train]
     held_out = frames if split == "test" and scale == 1 else []
@@ -91,9 +95,19 @@ def evaluate_run(
         split_rule=dataset.split_rule(),
         gaussians=len(loaded.gaussians),
         **{name: getattr(loaded, name) for name in ("step", "seconds", "bad_steps")},
-        renderers=through_renderers(scene, frames, wanted, split),
+        renderers=through_renderers(scene, frames, wanted, split, as_photograph=meter),
         **more,
     )
+
+
+def _meter(run: Run, loaded: LoadedRun, views: list[View]) -> Meter | None:
+    """How the camera exposed the views that a run was fitted to; None as `Exposure.meter`, and without gains."""
+    if NETWORK not in loaded.networks:
+        return None
+    names, config = fitted_views(run, loaded.record), loaded.record.config
+    gains = loaded.networks[NETWORK]["log_gains"].numpy()
+    module = Exposure(names, gains, False, config.settings.background)
+    return module.meter(frames_for(views, config.data), loaded.scene, config.settings)
 
 
 def _check_pictures(output: LockedFolder, recorded: FitRecord, split: str, frames: list[Frame]) -> None:

@@ -6,7 +6,7 @@ Metrics that cannot be computed are None with a reason, never left out. `DEFINIT
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from drgs.fitting.segments import Segmentation
     from drgs.integrator import Output
     from drgs.io.run import Run
+
+    AsPhotograph = Callable[[Output, Frame], Output]
 
 __all__ = [
     "DEPTH",
@@ -264,6 +266,7 @@ def evaluate(
     pictures: Path | None = None,
     segmentation: Segmentation | str | None = None,
     moving: frozenset[int] = frozenset(),
+    as_photograph: AsPhotograph | None = None,
 ) -> dict:
     """All metrics of the given views.
 
@@ -276,6 +279,7 @@ def evaluate(
             segmentation, NAME.semantics.png: labels, reference, features, and labels over the photograph.
         segmentation: Result of `drgs.fitting.segments.segmentation_of`; in words: why there is none.
         moving: Numbers of the classes that move; if there are any, views have `psnr_moving`, too.
+        as_photograph: Changes a rendering as the camera would have (`drgs.fitting.components.exposure.Meter`).
     Returns:
         JSON-serializable: `views` (a list of name, size and metrics), `mean` and `median` over them, `variants`,
         `reasons` of what is None; of a run with features `segmentation` (`Segmentation.result`), whose views have
@@ -284,7 +288,7 @@ def evaluate(
     """
     with Bar("measuring views", len(frames)) as bar:
         measured = None if isinstance(segmentation, str) else segmentation
-        result = _evaluated(g, frames, settings, lpips, pictures, measured, moving, bar)
+        result = _evaluated(g, frames, settings, lpips, pictures, measured, moving, as_photograph, bar)
     result["scores"] = dict(result["mean"])
     if isinstance(segmentation, str):
         result["segmentation"] = None
@@ -304,6 +308,7 @@ def _evaluated(
     pictures: Path | None,
     segmentation: Segmentation | None,
     moving: frozenset[int],
+    as_photograph: AsPhotograph | None,
     bar: Bar,
 ) -> dict:
     """`evaluate`, under a bar that it has begun."""
@@ -316,6 +321,7 @@ def _evaluated(
     for frame, file_name in zip(frames, file_names([frame.name for frame in frames]), strict=True):
         with torch.no_grad():  # pictures of whatever an optimizer may hold
             out = render(g if segmentation else colors_only(g, frame.camera.time), frame.camera, settings)
+            out = out if as_photograph is None else as_photograph(out, frame)
         row, missing = _view_metrics(out, frame, settings.background if is_cut_out else None, lpips, moving)
         reasons |= missing
         if has_depth:
@@ -344,6 +350,8 @@ def _evaluated(
         reasons["psnr_moving"] = "no view shows anything with the label of a class that moves"
     if lpips is not None:
         variants["lpips"] += f", {lpips.backbone} backbone"
+    if as_photograph is not None:
+        variants["psnr"] += "; renderings have the exposure that the camera would have chosen for them"
     return {"views": views, "mean": mean, "median": median, "variants": variants, "reasons": reasons}
 
 
@@ -402,7 +410,12 @@ def _moving_psnr(image: torch.Tensor, frame: Frame, moving: frozenset[int]) -> f
 
 
 def through_renderers(
-    g: Scene, frames: list[Frame], renderers: Mapping[str, RenderSettings], split: str, limit: int | None = None
+    g: Scene,
+    frames: list[Frame],
+    renderers: Mapping[str, RenderSettings],
+    split: str,
+    limit: int | None = None,
+    as_photograph: AsPhotograph | None = None,
 ) -> dict | None:
     """How Gaussians look in several renderers, view by view, so that no mean hides one that fails.
 
@@ -415,6 +428,7 @@ def through_renderers(
         renderers: Name -> settings, as `drgs.fitting.renderers.renderers_to_measure` says.
         split: Split of the frames, to be recorded.
         limit: Largest number of views, which are evenly spaced; None takes all.
+        as_photograph: As of `evaluate`.
     Returns:
         JSON-serializable: `split`, `width` and `height` of the first view, `of` how many views these were taken, and
         `rows`, for each renderer its `name`, `mean` of each metric over the views, `worst` (the view of the lowest
@@ -433,7 +447,9 @@ def through_renderers(
             for frame in frames:
                 with torch.no_grad():  # pictures of whatever an optimizer may hold
                     seen = colors_only(g, frame.camera.time)
-                    image = render(seen, frame.camera, settings, outputs=()).rgb.cpu().clamp(0, 1)
+                    out = render(seen, frame.camera, settings, outputs=())
+                    out = out if as_photograph is None else as_photograph(out, frame)
+                image = out.rgb.cpu().clamp(0, 1)
                 background = settings.background if is_cut_out else None
                 views.append({"name": frame.name, **_photometric(image, frame, background)})
                 bar.advance()

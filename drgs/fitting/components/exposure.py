@@ -7,6 +7,9 @@ photographs show a point must be known (`drgs.sfm.points`): where half of the po
 robust weight finds the gains. What depends on the direction, like the light on a thing that is turned, looks like a
 gain, too; so `auto` uses a gain only if it lowers the error of the half of its photograph that it was estimated
 without.
+
+A photograph that is not fitted to has a gain that nobody knows. But a camera chose it by what is in view, and gains of
+the others say how; so held-out views are measured with the gain that the camera would have chosen for what is rendered.
 """
 
 from __future__ import annotations
@@ -19,11 +22,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from drgs.cameras.sizes import reduced_size
+from drgs.data.resampling import resize_area
 from drgs.display.progress import Bar
-from drgs.ellipsoids import Y_00
+from drgs.ellipsoids import Y_00, colors_only
 from drgs.fitting.components.base import Checkpoint, Component, Fit, Setup
 from drgs.fitting.frames import frames_for
-from drgs.fitting.losses import psnr_of
+from drgs.fitting.losses import psnr
 from drgs.fitting.networks import Network
 from drgs.fitting.rows import GaussianRows
 from drgs.integrator import render
@@ -31,14 +36,24 @@ from drgs.sfm.guided import Matches
 from drgs.sfm.points import shared_points
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from drgs.data import View
+    from drgs.ellipsoids import Scene
     from drgs.fitting.config import FitConfig
     from drgs.fitting.frames import Frame
     from drgs.integrator import Output
+    from drgs.settings import RenderSettings
 
-__all__ = ["NETWORK", "Exposure", "ExposureComponent", "ExposureEstimate", "estimate_exposure", "exposure_network"]
+__all__ = [
+    "NETWORK",
+    "Exposure",
+    "ExposureComponent",
+    "ExposureEstimate",
+    "Meter",
+    "estimate_exposure",
+    "exposure_network",
+]
 
 NETWORK = "exposure"
 """Name of the gains in a checkpoint."""
@@ -54,6 +69,9 @@ _HUBER_STEPS, _ROBUST_STEPS = 6, 15
 _LEAST_NOISE = 0.01  # of a log color: a byte's rounding at mid-gray
 _SHARED_POINTS = 8  # points that two photographs must share for their gains to be compared; chosen, not tuned
 _RATE = 1e-3  # learning rate of natural log gains: a factor of e in 1,000 steps; chosen
+_METERED = 48  # photographs that are rendered to find how the camera exposes; bounds seconds
+_METERED_PIXELS = 3_000  # of such a rendering, of which nothing but the mean is used; chosen
+_BLACK = 1 / 255  # least mean brightness whose logarithm is taken
 _CLEAR_STOPS = 0.1  # stops: three times what two sets of points of one capture differ by in what they say
 # Of a short fit that tries gains.
 _TRIAL = {"max_steps": 200, "max_gaussians": 8_000, "updates_per_step": 1, "num_downscales": 0}
@@ -224,14 +242,26 @@ class Exposure(torch.nn.Module):
 
     def forward(self, output: Output, frame: Frame) -> Output:
         """The output as its photograph shows it; gradients reach both."""
-        rgb = output.rgb
-        gain = self.log_gains[self._rows[frame.name]].exp().to(rgb.device)
-        shown = rgb * gain
-        if frame.empty() is not None:
-            behind = (1 - output.alpha)[..., None] * torch.tensor(self._background, device=rgb.device)
-            shown = shown + behind * (1 - gain)
-        target = frame.image().to(rgb.device)
+        shown = _exposed(output, frame, self.log_gains[self._rows[frame.name]], self._background)
+        target = frame.image().to(shown.device)
         return dataclasses.replace(output, rgb=torch.where((target >= _BRIGHT) & (shown > target), target, shown))
+
+    def meter(self, frames: list[Frame], scene: Scene, settings: RenderSettings) -> Meter | None:
+        """How the camera exposes what it sees; None where that does not predict the gains of photographs left out.
+
+        Args:
+            frames: Photographs that have a gain, of which as many are rendered as `_METERED` says.
+            scene, settings: What is rendered, and how.
+        """
+        frames = frames[:: -(-len(frames) // _METERED)]
+        seen = []
+        for frame in frames:
+            camera = frame.camera.resized(*reduced_size(frame.camera, _METERED_PIXELS))
+            with torch.no_grad():  # a measure
+                output = render(colors_only(scene, camera.time), camera, settings, outputs=())
+            seen.append(_brightness(output, frame, self._background))
+        rows = [self._rows[frame.name] for frame in frames]
+        return Meter.fitted(np.array(seen), self.log_gains.detach().double().cpu().numpy()[rows], self._background)
 
     def join(self, names: list[str], estimate: ExposureEstimate) -> torch.Tensor:
         """Go on with photographs that have been joined by others, each with a gain of its own.
@@ -269,6 +299,56 @@ class Exposure(torch.nn.Module):
             self.log_gains.sub_(self.log_gains.mean(dim=0))
 
 
+@dataclasses.dataclass(frozen=True)
+class Meter:
+    """How a camera exposes what it sees: log gain = (1, log R, log G, log B) @ coefficients of the mean color.
+
+    A photograph that is not fitted to has a gain that nobody knows, but a camera that meters chose it by what was in
+    view, of which the rendering has the mean color.
+
+    Attributes:
+        coefficients: (4, 3) for R, G and B.
+        least, most: (3,) log gains of the photographs that these are fitted to; no predicted one is beyond.
+        background: Color behind everything, which has no gain.
+        lowered: Share of the squared log gains that it predicts, each of a photograph that it is fitted without.
+    """
+
+    coefficients: np.ndarray
+    least: np.ndarray
+    most: np.ndarray
+    background: tuple[float, float, float]
+    lowered: float
+
+    @classmethod
+    def fitted(
+        cls, brightness: np.ndarray, log_gains: np.ndarray, background: tuple[float, float, float]
+    ) -> Meter | None:
+        """Least squares over V photographs; None where it does not predict the gains of those left out.
+
+        Args:
+            brightness: (V, 3) logarithms of the mean R, G and B of renderings with gain 1.
+            log_gains: (V, 3) their log gains.
+            background: Color behind everything.
+        """
+        terms = np.column_stack([np.ones(len(brightness)), brightness])
+        if len(terms) < 2 * terms.shape[1] or not log_gains.any():
+            return None
+        inverse = np.linalg.pinv(terms)
+        coefficients = inverse @ log_gains
+        # What is left of a photograph that was left out, without fitting anew: 1 - h, h on the diagonal of the hat.
+        left = np.maximum(1 - np.sum(terms * inverse.T, axis=1), 1e-12)[:, None]
+        lowered = 1 - float(np.square((log_gains - terms @ coefficients) / left).sum() / np.square(log_gains).sum())
+        if lowered < _LEAST_LOWERED:
+            return None
+        return cls(coefficients, log_gains.min(axis=0), log_gains.max(axis=0), background, lowered)
+
+    def __call__(self, output: Output, frame: Frame) -> Output:
+        """The rendering of a photograph's view as the camera would have exposed it."""
+        seen = np.append(1.0, _brightness(output, frame, self.background))
+        log_gain = torch.from_numpy((seen @ self.coefficients).clip(self.least, self.most)).to(output.rgb)
+        return dataclasses.replace(output, rgb=_exposed(output, frame, log_gain, self.background))
+
+
 def exposure_network(
     frames: list[Frame],
     learned: bool,
@@ -286,6 +366,31 @@ def exposure_network(
     start = np.zeros((len(frames), 3)) if log_gains is None else log_gains
     module = Exposure([frame.name for frame in frames], start, learned, background)
     return Network(NETWORK, module, _RATE if learned else 0.0, constraint=module.center if learned else None)
+
+
+def _exposed(
+    output: Output, frame: Frame, log_gain: torch.Tensor, background: tuple[float, float, float]
+) -> torch.Tensor:
+    """(H, W, 3) colors of a rendering with a (3,) log gain, but for a background behind what the photograph shows."""
+    rgb = output.rgb
+    gain = log_gain.exp().to(rgb.device)
+    shown = rgb * gain
+    if frame.empty() is not None:
+        behind = (1 - output.alpha)[..., None] * torch.tensor(background, device=rgb.device)
+        shown = shown + behind * (1 - gain)
+    return shown
+
+
+def _brightness(output: Output, frame: Frame, background: tuple[float, float, float]) -> np.ndarray:
+    """(3,) logarithms of the mean R, G and B of what Gaussians cover in a rendering, inside the photograph's mask."""
+    alpha, behind = output.alpha[..., None], torch.tensor(background, device=output.rgb.device)
+    weight = torch.ones_like(alpha)
+    if frame.mask is not None:  # at the size of the photograph
+        size = alpha.shape[1], alpha.shape[0]
+        weight = torch.from_numpy(resize_area(frame.mask.numpy(), *size))[..., None].to(alpha)
+    colors = output.rgb.clamp(0, 1) - (1 - alpha) * behind
+    mean = (weight * colors).sum(dim=(0, 1)) / (weight * alpha).sum().clamp(min=1e-12)
+    return mean.clamp(min=_BLACK).log().double().cpu().numpy()
 
 
 def _robust(logs: np.ndarray, there: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -479,6 +584,16 @@ class ExposureComponent(Component):
         """See `Component`."""
         return out if self.module is None else self.module(out, frame)
 
+    def meter(self, fit: Fit) -> Meter | None:
+        """How the camera exposes what it sees, as photographs of the fit say by their gains; None where they do not."""
+        if self.module is None:
+            return None
+        return self.module.meter(fit.photographs(), fit.scene(), fit.config.settings)
+
+    def evaluation(self, fit: Fit, held_out: list[Frame]) -> dict[str, Any]:
+        """See `Component`."""
+        return {"as_photograph": self.meter(fit)}
+
     def join(self, fit: Fit, frame: Frame, setup: Setup) -> list[dict]:
         """See `Component`: gains are estimated again, with the points of the new photograph."""
         use = fit.config.data.exposure
@@ -548,7 +663,7 @@ def _compared(setup: Setup, config: FitConfig) -> tuple[np.ndarray, np.ndarray |
 
 def _trial(fit: Fit, views: list[View], estimate: ExposureEstimate) -> float:
     """By how many dB gains change photographs that two short fits, with them and without, did not see: the
-    mean of what they change at gain 1, as held-out views are shown, and at the gain that suits each photograph best.
+    mean of what they change at the gain of a meter, as held-out views are shown, and at that which suits each best.
     Points say nothing of a white wall, which has none.
 
     Args:
@@ -580,18 +695,22 @@ def _trial(fit: Fit, views: list[View], estimate: ExposureEstimate) -> float:
             for _ in range(short.max_steps):
                 trial.step()
                 bar.advance()
-            errors.append([_psnr(trial, frame, suited) for frame in held_out for suited in (False, True)])
+            meter = component.meter(trial)
+            errors.append([_psnr(trial, frame, way) for frame in held_out for way in (meter, _suited)])
     return float(np.mean(errors[1]) - np.mean(errors[0]))
 
 
-def _psnr(fit: Fit, frame: Frame, suited: bool) -> float:
-    """Of a photograph that the fit has not seen, in dB; `suited`: with gains of R, G and B that suit it best."""
+def _psnr(fit: Fit, frame: Frame, as_photograph: Callable[[Output, Frame], Output] | None) -> float:
+    """Of a photograph that the fit has not seen, in dB, with the gain that a meter or `_suited` gives it."""
     with torch.no_grad():  # a measure
-        rgb = render(fit.scene(), frame.camera, fit.config.settings, outputs=()).rgb.cpu().clamp(0, 1)
-    target = frame.image()
-    weight = torch.ones_like(target) if frame.mask is None else frame.mask[..., None].expand_as(target)
-    if suited:
-        gain = (weight * rgb * target).sum(dim=(0, 1)) / (weight * rgb * rgb).sum(dim=(0, 1)).clamp(min=1e-12)
-        rgb = (gain * rgb).clamp(max=1)
-    error = (rgb - target).square()
-    return psnr_of(float((weight * error).sum() / weight.sum().clamp(min=1e-12)))
+        out = render(fit.scene(), frame.camera, fit.config.settings, outputs=())
+        out = out if as_photograph is None else as_photograph(out, frame)
+    return psnr(out.rgb.cpu().clamp(0, 1), frame.image(), frame.mask)
+
+
+def _suited(output: Output, frame: Frame) -> Output:
+    """A rendering with the gains of R, G and B that suit its photograph best."""
+    rgb, target = output.rgb.clamp(0, 1), frame.image().to(output.rgb.device)
+    weight = 1.0 if frame.mask is None else frame.mask[..., None].to(target)
+    gain = (weight * rgb * target).sum(dim=(0, 1)) / (weight * rgb * rgb).sum(dim=(0, 1)).clamp(min=1e-12)
+    return dataclasses.replace(output, rgb=gain * rgb)
