@@ -51,7 +51,12 @@ def scored(
     scoring = Scoring(settings=RenderSettings.preset("fast"), criterion=criterion)
     began = time.process_time()
     chosen = select(
-        scene, [at_most(x, pixels) for x in candidates], [at_most(x, pixels) for x in known], 1, scoring=scoring
+        scene,
+        [at_most(x, pixels) for x in candidates],
+        [at_most(x, pixels) for x in known],
+        1,
+        scoring=scoring,
+        halving=False,
     )
     return np.array(chosen.scores), time.process_time() - began
 

@@ -69,7 +69,9 @@ def picks(name: str, g: drgs.Gaussians, cameras: list[Camera]) -> list[dict]:
     known = views[::step][:_KNOWN]
     candidates = [view for i, view in enumerate(views) if i % step or i // step >= _KNOWN]
     settings = drgs.RenderSettings.preset("fast")
-    found = {kind: select(g, candidates, known, settings=settings, nuisances=x) for kind, x in KINDS.items()}
+    found = {
+        kind: select(g, candidates, known, settings=settings, nuisances=x, halving=False) for kind, x in KINDS.items()
+    }
     told = {kind: fisher.diagonal(g, known, settings, nuisances=x) for kind, x in KINDS.items()}
     plain = found["none"].scores
     rows = []

@@ -75,7 +75,8 @@ def drops(name: str, runs: Path) -> dict:
         known = [frame.camera for frame in train]
         told = {"settings": settings, "cache": cache, "masks": [frame.mask for frame in train]}
         done["scores"] = {
-            label: select(g, candidates, known, **told, **options).scores for label, options in SCORES.items()
+            label: select(g, candidates, known, halving=False, **told, **options).scores
+            for label, options in SCORES.items()
         }
         # What going on without a new view does is no merit of a view; the seeds say what chance does.
         control = [

@@ -70,6 +70,7 @@ def select(
     empty_outside: bool = False,
     cache: Cache | None = None,
     lazy: bool = True,
+    halving: bool = True,
     progress: Callable[[int, int], object] | None = None,
     information: Callable[[Camera], Information] | None = None,
     workers: Workers | None = None,
@@ -104,6 +105,10 @@ def select(
         cache: Cache where information of single views is looked for and kept.
         lazy: Score only candidates whose last score, an upper bound, could still win: same picks, margins included.
             Not done where scores can rise (a relative lambda, lambda = 0, or z-scores).
+        halving: Score candidates by a quarter of their pixels first, and by all only those within a tenth of the best
+            (docs/information.md has how often the pick is the same). Done for one pick by `v_opt` among 8 candidates or
+            more of a scene that stands still, of views of 40,000 pixels or more, without region, `information` and a
+            cache's bound. The pick is scored by all of its pixels, given estimates of what other candidates show.
         progress: Called with (views done, views) after each view.
         information: Camera -> Information, in place of `drgs.fisher`; the policy's own kind: {"coverage": (N,)} for
             `coverage`, {"blocks": (N, 13, 13)} for criterion `block_logdet`. lambda is in the units of its parameters.
@@ -134,6 +139,7 @@ def select(
         empty_outside=empty_outside,
         cache=cache,
         lazy=lazy,
+        halving=halving,
         progress=progress,
         information=information,
         workers=workers,

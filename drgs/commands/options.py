@@ -514,6 +514,12 @@ class Select(ComparedViews, Workers):
         " or dome."
     )
     k: int = of_views(1, "Number of views to pick, one after the other.", short="k")
+    halving: bool = of_views(
+        True,
+        "Score all candidates by all of their pixels, also those that a quarter of them tells from the best "
+        "(docs/information.md).",
+        rare=True,
+    )
     region: str | None = same_option(SelectionConfig, "region", rare=False, heading="Views")
     refine: int = option(
         0,

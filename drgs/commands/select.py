@@ -62,6 +62,7 @@ def run(args: Select) -> None:
             args.k,
             args.policy,
             scoring=scoring,
+            halving=args.halving,
             rng=torch.Generator().manual_seed(args.seed),
             progress=bar.update,
             workers=workers,

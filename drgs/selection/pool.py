@@ -66,6 +66,7 @@ class Selection:
         left_out: Group -> parameters not counted because lambda = 0 and no training view has information about them.
         evaluations: How often a candidate was scored.
         computed: Views whose information was computed, not taken from the cache.
+        pixels: Number of pixels that each candidate's score is of, where some are estimates by fewer; else empty.
         notes: What a reader of the result should know, one sentence each.
         prior: lambda as it counted, with its length; None for policies without.
         blocks: The blocks of the image that the information is of; empty for policies without.
@@ -83,6 +84,7 @@ class Selection:
     left_out: dict[str, int] = dataclasses.field(default_factory=dict)
     evaluations: int = 0
     computed: int = 0
+    pixels: list[int] = dataclasses.field(default_factory=list)
     notes: list[str] = dataclasses.field(default_factory=list)
     prior: Prior | None = None
     blocks: list[str] = dataclasses.field(default_factory=list)
@@ -129,8 +131,9 @@ class Selection:
         count = len(self.scores)
         parts: Sequence[Mapping | None] = self.parts or [no_parts] * count
         unseen: Sequence[float | None] = self.unseen or [None] * count
-        rows = zip(views, self.scores, parts, unseen, after or [{}] * count, strict=True)
-        return [{**view, "score": score, "parts": own, "unseen": x, **rest} for view, score, own, x, rest in rows]
+        pixels = [{"pixels": n} for n in self.pixels] or [{}] * count
+        rows = zip(views, self.scores, parts, unseen, pixels, after or [{}] * count, strict=True)
+        return [{**view, "score": s, "parts": own, "unseen": x, **of, **rest} for view, s, own, x, of, rest in rows]
 
 
 ViewRequest = tuple[Quantity, Camera, torch.Tensor | None]
@@ -160,6 +163,7 @@ class Pool:
         rng: Generator that policies that draw take their numbers from.
         cache: Cache where information of single views is looked up and kept; None: nowhere.
         lazy: Whether greedy policies leave out scores that cannot win; see `drgs.selection.greedy`.
+        halving: Whether they first score candidates by a quarter of their pixels, likewise.
         progress: Called with (views done, views) after each view whose information is known.
         information: Camera -> Information, in place of what `drgs.fisher` computes.
         workers: Processes that compute information; None: this one.
@@ -179,6 +183,7 @@ class Pool:
     empty_outside: bool = False
     cache: Cache | None = None
     lazy: bool = True
+    halving: bool = False
     progress: Callable[[int, int], object] | None = None
     information: Callable[[Camera], Information] | None = None
     workers: Workers | None = None
