@@ -492,3 +492,13 @@ def test_who_moves_is_learned(tmp_path, way):
     assert bool(scene.moving[front].all())
     assert moved["moving"] <= 6
     assert result.metrics["views"][2]["psnr"] > 24
+
+
+@pytest.mark.slow
+def test_superfluous_gaussians_go_at_the_end_of_the_dynamic_stage(dataset, tmp_path):
+    """Not of the static one, whose density control the dynamic one goes on with; the run holds what is left."""
+    result = fit(dataset, tmp_path / "run", config(prune_loss=1.0), progress=False)
+    (event,) = [event for event in result.run.events() if event["event"] == "pruned"]
+    assert event["step"] == 11  # 4 of the static stage, and 0.8 of the 8 others
+    assert event["gaussians"] == result.metrics["gaussians"] == len(load_run(result.run).scene.gaussians)
+    assert event["gaussians"] < event["before"]

@@ -49,11 +49,11 @@ _SOMETIMES = {
             "origin",
         },
     },
-    "metrics.json": {"segmentation", "motion", "transients", "dropout", "poses", "skybox", "scale"},
+    "metrics.json": {"segmentation", "motion", "transients", "dropout", "pruned", "poses", "skybox", "scale"},
     "fisher.json": {"nuisances"},
 }
 """Fields of data sets that the tests here do not make, videos, missing images, lenses, a teacher, several times; and of
-what is not asked for: exposure, poses, a skybox, transients, dropout, larger pictures, eliminated unknowns;
+what is not asked for: exposure, poses, a skybox, transients, dropout, pruning, larger pictures, eliminated unknowns;
 of a fit that begins with the Gaussians of another one, and of a world far from 0.
 """
 

@@ -231,6 +231,14 @@ class DensityConfig(Record):
         none="auto",
         metavar="SHARE|auto",
     )
+    prune_loss: float = option(
+        0.0,
+        "When density control ends, remove the Gaussians without which the PSNR of training photographs is lower by "
+        "less than this, in dB, which the last steps make up for; 0 removes none. 0.3 removes about half "
+        "(docs/real-data.md).",
+        within=(0.0, 100.0),
+        rare=True,
+    )
     jitter: float = option(
         0.1, "Displacement of copied Gaussians, in their own standard deviations.", within=(0.0, 1e3), rare=True
     )

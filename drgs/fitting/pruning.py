@@ -227,7 +227,7 @@ class _Views:
         """The same of all pixels."""
         return dataclasses.replace(self, shares=None)
 
-    def removal_error(self, gaussians: Scene) -> torch.Tensor:
+    def removal_error(self, gaussians: Gaussians | DynamicGaussians) -> torch.Tensor:
         """(N,) summed over the views."""
         total = torch.zeros(len(gaussians), dtype=torch.float64)
         # A mask multiplies an image, so that the error of a pixel is multiplied by a power of it.

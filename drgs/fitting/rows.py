@@ -7,7 +7,7 @@ Gaussian is fitted beside them (networks.py).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -147,6 +147,11 @@ class GaussianRows:
                 for moment in self._moments(name):
                     moment[index] = 0
 
+    def keep(self, index: torch.Tensor) -> None:
+        """Remove all Gaussians but those at `index`, sorted, with all of a shell; their moments stay."""
+        for name, values in self.take(index).items():
+            self._replace(name, values, lambda moment: moment[index])
+
     def take(self, index: torch.Tensor) -> dict[str, torch.Tensor]:
         """Copies of rows, values without a graph."""
         # Indexing copies, so that density control may change the tensors afterwards.
@@ -184,20 +189,21 @@ class GaussianRows:
         state = self.optimizer.state.get(self.tensors[name], {})
         return [state[key] for key in ("exp_avg", "exp_avg_sq") if key in state]
 
-    @torch.no_grad()  # the new tensor is a leaf of its own
     def _extend(self, name: str, more: torch.Tensor, dim: int) -> None:
         """Concatenate a tensor with `more` along `dim`, and its moments with 0."""
-        old = self.tensors[name]
-        new = torch.cat([old, more], dim).requires_grad_()
+        new = torch.cat([self.tensors[name].detach(), more.detach()], dim)  # values of a new leaf
+        self._replace(name, new, lambda moment: torch.cat([moment, torch.zeros_like(more)], dim))
+
+    def _replace(self, name: str, new: torch.Tensor, moments: Callable[[torch.Tensor], torch.Tensor]) -> None:
+        """Put other values in the place of a tensor's; `moments` makes those of the optimizer from the old ones."""
+        old, self.tensors[name] = self.tensors[name], new.requires_grad_()
         group = next(g for g in self.optimizer.param_groups if g["name"] == name)
         group["params"] = [new]
         state = self.optimizer.state.pop(old, {})
-        for key in ("exp_avg", "exp_avg_sq"):
-            if key in state:
-                state[key] = torch.cat([state[key], torch.zeros_like(more)], dim)
+        for key in {"exp_avg", "exp_avg_sq"} & state.keys():
+            state[key] = moments(state[key])
         if state:
             self.optimizer.state[new] = state
-        self.tensors[name] = new
 
 
 def _spacing(points: torch.Tensor) -> torch.Tensor:

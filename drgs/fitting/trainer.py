@@ -300,7 +300,7 @@ class Trainer:
 
     def _explore(self, done: int) -> None:
         """The noise of density control after step `done`."""
-        density, stage = self.config.density, self._stage()
+        density, stage = self.config.density, self.stage()
         if density.noise and done - stage.begin < density.refine_stop * stage.length:
             explore(self.rows, means_rate(self.config, self.part), self.extent, density.noise, self.generator)
 
@@ -320,6 +320,11 @@ class Trainer:
                 "learning rates"
             )
         return {"event": "skipped", "view": frame.name, "reason": f"{bad} not finite"}
+
+    def stage(self) -> Stage:
+        """See `Fit`."""
+        stages = [stage for component in self.components if (stage := component.stage(self)) is not None]
+        return stages[0] if stages else Stage(0, self.config.max_steps)
 
     def photographs(self) -> list[Frame]:
         """See `Fit`."""
@@ -446,7 +451,7 @@ class Trainer:
         while rows.sh_degree < min(config.sh_degree, done / apart - 1e-9):
             rows.raise_sh_degree()
             events.append({"event": "sh_degree", "degree": rows.sh_degree})
-        stage = self._stage()
+        stage = self.stage()
         every = max(1, round(density.refine_every * stage.length))
         start = density.refine_start * stage.length
         stop = density.refine_stop * stage.length
@@ -462,7 +467,7 @@ class Trainer:
         """Density control at step `done`; `start`: when the first is due in a stage. What it did, for the log."""
         density = self.config.density
         rows = self.rows
-        stage = self._stage()
+        stage = self.stage()
         moved = relocate(rows, density.min_opacity, density.jitter, self.generator)
         # Growth by a constant factor that reaches the budget at grow_until, whatever the schedule's length.
         full = max(density.grow_until * stage.length - start, 1)
@@ -473,11 +478,6 @@ class Trainer:
         added = add_gaussians(rows, missing, density.min_opacity, density.jitter, self.generator)
         self._changed()
         return {"event": "density", "moved": moved, "added": added, "gaussians": len(rows)}
-
-    def _stage(self) -> Stage:
-        """The steps that density control runs over now."""
-        stages = [stage for component in self.components if (stage := component.stage(self)) is not None]
-        return stages[0] if stages else Stage(0, self.config.max_steps)
 
     def _next_view(self) -> int:
         """Index of a photograph, each of those that are fitted to now once an epoch."""

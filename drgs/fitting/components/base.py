@@ -154,6 +154,9 @@ class Fit(Protocol):
     def part(self) -> float:
         """The fraction of the steps that is done."""
 
+    def stage(self) -> Stage:
+        """The steps that density control runs over now."""
+
     def photographs(self) -> list[Frame]:
         """The training photographs, with their cameras as estimated now."""
 

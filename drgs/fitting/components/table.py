@@ -29,6 +29,7 @@ COMPONENTS: Registry[type[Component]] = Registry(
         "dropout": f"{_HERE}.dropout:DropoutComponent",
         "motion": f"{_HERE}.motion:MotionComponent",
         "lifespans": f"{_HERE}.lifespans:LifespansComponent",
+        "pruning": f"{_HERE}.pruning:PruningComponent",
     },
     row=type,
 )
