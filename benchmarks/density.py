@@ -34,6 +34,7 @@ from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
 
 from drgs.data import load  # noqa: E402
 from drgs.ellipsoids import Y_00  # noqa: E402
+from drgs.fisher import removal_error  # noqa: E402
 from drgs.fitting import density  # noqa: E402
 from drgs.fitting import trainer as trainers  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
@@ -43,6 +44,7 @@ from drgs.fitting.rows import GaussianRows  # noqa: E402
 from drgs.fitting.start import start_plain  # noqa: E402
 from drgs.fitting.trainer import Trainer  # noqa: E402
 from drgs.integrator import render  # noqa: E402
+from drgs.pruning import POWER  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.studies.tables import markdown_table  # noqa: E402
 
@@ -154,6 +156,13 @@ class Looks:
         return error * o**self.by_opacity, o
 
 
+def removal(trainer: Trainer) -> Worths:
+    """Those are moved without which all training photographs change least, by the error of `drgs prune`."""
+    settings = trainer.renderers.settings_at(trainer.step_index)
+    cameras, masks = [x.camera for x in trainer.frames], [x.mask for x in trainer.frames]
+    return opacity(trainer), removal_error(trainer.gaussians(), cameras, settings, POWER, masks=masks)
+
+
 def gradient(name: str, power: float = 1, by_opacity: float = 0, size: bool = False) -> Rule:
     """What Adam keeps of the gradients of a tensor (root of their mean square), perhaps times the size of the Gaussian.
 
@@ -202,6 +211,7 @@ RULES: dict[str, tuple[Callable[[], Rule], float]] = {
     "error, 5 % by share": (lambda: Seen(lambda e, w, o: e), 0.05),
     "error^0.5, 2 % by share": (lambda: Seen(lambda e, w, o: e**0.5), 0.02),
     "squared error, 2 % by share": (lambda: Seen(lambda e, w, o: e, power=2), 0.02),
+    "opacity, 2 % by removal error": (lambda: removal, 0.02),
     "opacity, from half": (lambda: plain, 0),
     "error, from half": (lambda: Seen(lambda e, w, o: e), 0),
     "gradient, from half": (lambda: gradient("means", size=True), 0),
