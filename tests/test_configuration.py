@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import subprocess
 import sys
 
@@ -310,16 +311,35 @@ def test_defaults_are_as_a_person_writes_them():
     ]
 
 
-def test_help_loads_nothing_heavy():
-    """Neither torch, NumPy nor Dr.Jit; the test of its time is in test_cli.py."""
+@pytest.mark.parametrize("words", [["--help"], ["fit", "--help-all"]])
+def test_help_loads_nothing_heavy(words):
+    """Of what is not Python's own, drgs alone, and of that no command; the test of its time is in test_cli.py."""
+    loaded = _loaded_by(words)
+    others = {name.partition(".")[0] for name in loaded} - sys.stdlib_module_names
+    commands = {name for name in loaded if name.startswith("drgs.commands.") and name.count(".") == 2}
+    assert others == {"drgs"}
+    assert commands == {f"drgs.commands.{name}" for name in ("command_line", "options", "values")}
+
+
+def test_info_loads_no_torch():
+    """`drgs info` starts Dr.Jit, which says what libLLVM it compiles with, and loads nothing else of weight."""
+    loaded = _loaded_by(["info"], DRGS_VARIANT="llvm_ad_rgb")
+    assert "drjit" in loaded
+    assert not loaded & {"torch", "mitsuba", "cv2"}
+
+
+def _loaded_by(words: list[str], **environ: str) -> set[str]:
+    """Names of the modules that a command loads in a process of its own."""
     code = (
-        "import sys, drgs.cli\n"
-        "try: drgs.cli.main(['fit', '--help-all'])\n"
+        "import sys; before = {*sys.modules}\n"
+        "import drgs.cli\n"
+        f"try: drgs.cli.main({words!r})\n"
         "except SystemExit: pass\n"
-        "print([x for x in ('torch', 'numpy', 'drjit', 'mitsuba', 'cv2') if x in sys.modules])"
+        "print(*({*sys.modules} - before))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "[]"
+    environ = {**os.environ, **environ}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environ)
+    return set(done.stdout.splitlines()[-1].split())
 
 
 def test_records_are_not_made_of_themselves():

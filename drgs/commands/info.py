@@ -36,7 +36,7 @@ def _plain(report: dict) -> str:
         "libLLVM": f"{llvm['version']} ({llvm['path']})" if llvm["version"] else "not in use",
         "compiled for": f"{target['cpu']}, {target['lanes']} lanes" if target else "unknown",
         "also found": ", ".join(others) or "no other libLLVM",
-        "threads": ", ".join(f"{name} {count}" for name, count in report["threads"].items()),
+        "threads": ", ".join(f"{name} {count}" for name, count in report["threads"].items() if count) or "unknown",
         "CUDA": cuda["device"] or "yes" if cuda["available"] else f"no: {cuda['reason']}",
         "OptiX": "yes" if optix["available"] else f"no: {optix['reason']}",
         **{name: version or "not installed" for name, version in report["packages"].items()},

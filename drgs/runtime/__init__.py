@@ -261,7 +261,19 @@ def setup(variant: str | None = None, threads: int | None = None) -> Backend:
         ValueError: If an argument or environment variable is bad, or a loaded libLLVM would abort.
         FileNotFoundError: If no backend is usable.
     """
-    global _active, _owner
+    global _active
+    _active = _started(variant, threads)
+    import torch
+
+    count = _requested_threads(threads)
+    if count or torch.get_num_threads() > _usable_cores():
+        torch.set_num_threads(count or _usable_cores())
+    return _active
+
+
+def _started(variant: str | None, threads: int | None) -> Backend:
+    """`setup` of Dr.Jit alone. Loads torch, which takes ten times as long, only where there is a CUDA device."""
+    global _owner
     _refuse_fork()
     wanted = _requested_variant(variant)
     count = _requested_threads(threads)
@@ -269,12 +281,9 @@ def setup(variant: str | None = None, threads: int | None = None) -> Backend:
         require_llvm()
     prepare()
     import drjit as dr
-    import torch
 
     if wanted is None:
-        # Parameters live in torch tensors: a CPU build of torch would copy every frame.
-        cuda = cuda_status()[0] and torch.version.cuda is not None
-        wanted = "cuda_ad_rgb" if cuda else "llvm_ad_rgb"
+        wanted = "cuda_ad_rgb" if cuda_status()[0] and _torch_has_cuda() else "llvm_ad_rgb"
     if wanted == "cuda_ad_rgb":
         usable, reason = cuda_status()
         if not usable:
@@ -290,9 +299,7 @@ def setup(variant: str | None = None, threads: int | None = None) -> Backend:
 
     # Left alone, both size their pools by the machine, which oversubscribes a container.
     dr.set_thread_count(count or min(dr.thread_count(), _usable_cores()))
-    if count or torch.get_num_threads() > _usable_cores():
-        torch.set_num_threads(count or _usable_cores())
-    _active = Backend(
+    return Backend(
         variant=wanted,
         name=wanted.split("_")[0],
         types=types,
@@ -300,7 +307,13 @@ def setup(variant: str | None = None, threads: int | None = None) -> Backend:
         llvm_version=version,
         threads=dr.thread_count(),
     )
-    return _active
+
+
+def _torch_has_cuda() -> bool:
+    """Whether torch is a build for CUDA: parameters live in its tensors, and one for CPUs would copy every frame."""
+    import torch
+
+    return torch.version.cuda is not None
 
 
 def thread_count() -> int:
@@ -402,7 +415,8 @@ def info() -> dict:
 
     Returns:
         JSON-serializable dict with keys drgs, commit, python, platform, cpu, cores, backend, llvm,
-        threads, cuda, optix, packages. `backend["error"]` is None or says why nothing can run.
+        threads, cuda, optix, packages. `backend["error"]` is None or says why nothing can run. The threads of torch
+        are None where it is not loaded, which is not done for this.
     """
     import platform
     from importlib import metadata
@@ -426,7 +440,7 @@ def info() -> dict:
     }
     chosen, error = None, None
     try:
-        chosen = backend()
+        chosen = _active or _started(None, None)
     except (ValueError, OSError, ImportError) as problem:
         error = str(problem)
     report["backend"] = {"variant": chosen.variant if chosen else None, "error": error}
@@ -439,12 +453,11 @@ def info() -> dict:
         "target": {"cpu": target.cpu, "lanes": target.lanes} if target else None,
         "found": [{"path": x.path, "version": dotted(x.version)} for x in find_libraries(environ)],
     }
-    if chosen:
-        import torch
-
-        report["threads"] = {"drjit": chosen.threads, "torch": torch.get_num_threads()}
-    else:
-        report["threads"] = {"drjit": None, "torch": None}
+    torch = sys.modules.get("torch")
+    report["threads"] = {
+        "drjit": chosen.threads if chosen else None,
+        "torch": torch.get_num_threads() if chosen and torch else None,
+    }
     for key, status in (("cuda", cuda_status), ("optix", optix_status)):
         try:
             usable, reason = status()
