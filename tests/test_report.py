@@ -313,6 +313,16 @@ class Crossing:
         return {}
 
 
+def test_stills_take_the_tolerance_of_pictures(monkeypatch):
+    """Of preset `exact`, half a step of 8 bits; other settings stay as they are."""
+    taken, draw = [], pictures.render
+    monkeypatch.setattr(pictures, "render", lambda *a, **kw: taken.append(a[2]) or draw(*a, **kw))
+    camera, exact = orbit((0, 0, 0), 3.0, 1, width=32, height=24)[0], RenderSettings.preset("exact")
+    for settings in (exact, FAST):
+        pictures.stills(Crossing(), camera, (0.5,), settings)
+    assert taken == [exact.replace(tolerance=1 / 512), FAST]
+
+
 def test_stills_show_their_times():
     """Each is the scene at its time: what a fit of few steps has learned to move can be less than a level of gray."""
     camera = orbit((0, 0, 0), 3.0, 1, width=20, height=16)[0]

@@ -123,8 +123,8 @@ def _enlarged(values: np.ndarray) -> np.ndarray:
 
 
 def stills(scene: Scene, camera: Camera, times: Sequence[float], settings: RenderSettings) -> list[Picture]:
-    """One camera at several times, evenly over all."""
-    found = []
+    """One camera at several times, evenly over all, as accurate as 8 bits can show."""
+    found, settings = [], settings.for_pictures()
     with Bar("stills of the sequence", min(len(times), _MOST_STILLS)) as bar:
         for time in spread(times, _MOST_STILLS):
             now = dataclasses.replace(camera, time=time)
