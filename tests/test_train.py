@@ -5,6 +5,8 @@ import json
 import math
 import os
 import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from drgs.data import Dataset, View
 from drgs.display.pictures import write_png
 from drgs.ellipsoids import Gaussians
 from drgs.files import load_state
+from drgs.fitting.adam import Adam
 from drgs.fitting.density import add_gaussians, divide, explore, relocate
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.losses import Outside, Photometric, padded_ssim, ssim_map
@@ -285,6 +288,43 @@ def test_every_view_is_seen_once_an_epoch(dataset):
     seen = [trainer._next_view() for _ in range(21)]
     assert all(sorted(seen[i : i + 7]) == list(range(7)) for i in (0, 7, 14))
     assert seen[:7] != seen[7:14]
+
+
+# ---- Adam
+
+
+@pytest.mark.parametrize("fused", [True, None])
+def test_adam_is_that_of_torch(fused):
+    """The same bits and the same state, parameters without a gradient among them."""
+    found = []
+    for kind in (Adam, torch.optim.Adam):
+        moved, still = torch.linspace(-1, 1, 50).requires_grad_(), torch.ones(3).requires_grad_()
+        optimizer = kind([{"params": [moved, still]}], lr=0.1, eps=1e-15, fused=fused)
+        for _ in range(4):
+            optimizer.zero_grad(set_to_none=True)
+            (moved.square() * torch.arange(50)).sin().sum().backward()
+            optimizer.step()
+        found.append({"x": moved.detach(), **optimizer.state[moved]})
+        assert torch.equal(still, torch.ones(3))
+        assert still not in optimizer.state
+    assert found[0].keys() == found[1].keys()
+    assert all(torch.equal(x, found[1][name]) for name, x in found[0].items())
+
+
+def test_steps_do_not_load_the_compiler():
+    """Rows and networks step, with gradients of a rendering; torch's compiler takes as long to load as torch."""
+    code = (
+        "import sys, torch, drgs\n"
+        "from drgs.cameras import orbit; from drgs.fitting.networks import Network; from drgs.fitting.rows import *\n"
+        "rows = GaussianRows.from_points(torch.eye(3), torch.eye(3))\n"
+        "network = Network('a', torch.nn.Linear(3, 3), 0.1)\n"
+        "rgb = drgs.render(rows.gaussians(), orbit((0, 0, 0), 3.0, 1, width=8, height=8)[0]).rgb\n"
+        "network.module(rgb).sum().backward()\n"
+        "for optimizer in (rows.optimizer, network.optimizer): optimizer.step()\n"
+        "print('torch._dynamo' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"
 
 
 # ---- density control

@@ -7,6 +7,8 @@ from typing import TypeVar
 
 import torch
 
+from drgs.fitting.adam import Adam
+
 __all__ = ["Network", "Rate", "rate_at", "saved_networks"]
 
 _T = TypeVar("_T")
@@ -52,7 +54,7 @@ class Network:
         groups: dict[float, list] = {}
         for key, x in module.named_parameters():
             groups.setdefault(self._factors.get(key, 1.0), []).append(x)
-        self.optimizer = torch.optim.Adam(
+        self.optimizer = Adam(
             [{"params": listed, "factor": factor} for factor, listed in groups.items()],
             lr=rate_at(rate, 0.0),
             fused=fused or None,

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from drgs.ellipsoids import Y_00, Gaussians
+from drgs.fitting.adam import Adam
 
 __all__ = ["GaussianRows"]
 
@@ -39,7 +40,7 @@ class GaussianRows:
         self.tensors = {name: x.detach().clone().requires_grad_() for name, x in tensors.items()}
         groups = [{"params": [x], "name": name} for name, x in self.tensors.items()]
         # eps as in 3DGS: gradients of a mean over pixels are far below torch's default of 1e-8.
-        self.optimizer = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)
+        self.optimizer = Adam(groups, lr=0.0, eps=1e-15, fused=True)
 
     @classmethod
     def from_points(
