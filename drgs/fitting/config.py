@@ -669,6 +669,19 @@ class FitConfig(Record):
         if self.data.undistort == "off":
             _check_lenses(self)
 
+    def going_on(self, before: FitConfig) -> FitConfig:
+        """This configuration of a fit that was begun with `before`, which holds what `auto` turned out to be.
+
+        Not of `undistort`: photographs are there already, as this configuration has them.
+        """
+        config = self
+        if config.renderers == AUTO and config.settings == before.settings:
+            config = config.replace(renderers=before.renderers)
+        for name in ("updates_per_step", "num_downscales"):
+            if getattr(config.data, name) is None:
+                config = config.replace(**{name: getattr(before.data, name)})
+        return config
+
     def difference(self, other: FitConfig) -> tuple[str, Any, Any] | None:
         """The first field whose value in `other` makes another fit, and both values as JSON has them.
 

@@ -22,7 +22,7 @@ from drgs.fitting.density import add_gaussians, explore, relocate
 from drgs.fitting.losses import psnr_of, terms_of
 from drgs.fitting.networks import Network, rate_at
 from drgs.fitting.rates import means_rate, rates_of
-from drgs.fitting.renderers import AUTO, RendererSchedule
+from drgs.fitting.renderers import RendererSchedule
 from drgs.fitting.resolution import Resolution
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.stages import Stage
@@ -404,11 +404,7 @@ class Trainer:
         """
         # Options that an older version did not have are at their defaults.
         before = FitConfig.from_json(header["config"])
-        if config.renderers == AUTO and config.settings == before.settings:
-            config = config.replace(renderers=before.renderers)  # `auto` keeps the renderers that the fit began with
-        for name in ("updates_per_step", "num_downscales"):
-            if getattr(config.data, name) is None:
-                config = config.replace(**{name: getattr(before.data, name)})  # likewise
+        config = config.going_on(before)
         if other := config.difference(before):
             name, now, was = other
             raise ValueError(

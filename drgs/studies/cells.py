@@ -313,7 +313,7 @@ def _check_same(run: Run, config: FitConfig) -> None:
     was = fit_record(run).config
     if config.data.undistort == "auto":  # the run has recorded what that was
         was = was.replace(data=dataclasses.replace(was.data, undistort="auto"))
-    change = config.difference(was)
+    change = config.going_on(was).difference(was)
     if change is None and config.selection is not None:
         mine, theirs = config.selection.flat(), (was.selection or SelectionConfig()).flat()
         change = next(((name, x, theirs[name]) for name, x in mine.items() if x != theirs[name]), None)
