@@ -22,7 +22,7 @@ from drgs.codecs.ply import save_ply
 from drgs.data.view_checks import check_cameras, check_parallax
 from drgs.display.pictures import file_names, write_png
 from drgs.display.progress import Bar
-from drgs.ellipsoids import colors_only
+from drgs.ellipsoids import Gaussians, colors_only
 from drgs.fitting import metrics
 from drgs.fitting.active import ActiveViews
 from drgs.fitting.components.base import Component, Setup, check_conflicts
@@ -58,7 +58,6 @@ from drgs.runtime.memory import is_out_of_memory
 
 if TYPE_CHECKING:
     from drgs.data import Dataset
-    from drgs.ellipsoids import Gaussians
     from drgs.selection.pool import Workers
 
 __all__ = [

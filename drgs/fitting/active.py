@@ -28,7 +28,7 @@ import torch
 from drgs.cameras.sizes import at_most, resized_alike
 from drgs.data.camera_lists import camera_to_json
 from drgs.display.progress import Bar
-from drgs.ellipsoids import colors_only
+from drgs.ellipsoids import Scene, colors_only
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import Frame, frames_for
 from drgs.fitting.timetable import Timetable
@@ -43,15 +43,11 @@ if TYPE_CHECKING:
 
     from drgs.cameras import Camera
     from drgs.data import Semantics, View
-    from drgs.ellipsoids import Scene
     from drgs.features.decoder import Decoder
     from drgs.features.segmentation import Classes
-    from drgs.fitting.config import FitConfig
     from drgs.information.choices import Block
     from drgs.information.scoring import Scoring
     from drgs.selection.pool import Pool, Selection, Workers
-
-__all__ = ["SELECTION", "ActiveViews"]
 
 SELECTION = "selection.json"
 _COVERED = 0.5  # opacity from which on a pixel needs no new points: more of it is Gaussians than background

@@ -10,8 +10,6 @@ import inspect
 
 import torch
 
-__all__ = ["Adam"]
-
 
 class Adam(torch.optim.Adam):
     """`torch.optim.Adam`, whose numbers these are; not to be called from compiled code."""

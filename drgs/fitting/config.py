@@ -19,37 +19,6 @@ from drgs.settings import RenderSettings
 if TYPE_CHECKING:
     from drgs.information.semantics import SemanticMetric
 
-__all__ = [
-    "DataConfig",
-    "Degree",
-    "DensityConfig",
-    "DepthUse",
-    "Dynamics",
-    "ExposureUse",
-    "FeatureConfig",
-    "FeatureSize",
-    "FieldPreset",
-    "Filter3DUse",
-    "FitConfig",
-    "InitPoints",
-    "LivesUse",
-    "LossConfig",
-    "MaskUse",
-    "MotionConfig",
-    "PickPoints",
-    "PoseUse",
-    "RateConfig",
-    "Restart",
-    "SavingConfig",
-    "Schedule",
-    "SelectionConfig",
-    "SemanticUse",
-    "SkyboxUse",
-    "Start",
-    "TransientUse",
-    "UndistortUse",
-]
-
 InitPoints = Literal["auto", "views", "all"]
 Filter3DUse = Literal["off", "on"]
 ExposureUse = Literal["off", "auto", "points", "learned"]

@@ -16,8 +16,6 @@ from drgs.data.camera_layout import REFERENCE_EXTENT
 from drgs.ellipsoids import semi_axes
 from drgs.fitting.rows import GaussianRows
 
-__all__ = ["add_gaussians", "divide", "explore", "relocate"]
-
 _MAX_COPIES = 51  # of one Gaussian at a time [1]; binomials up to C(50, k) are exact enough in float64
 _MAX_OPACITY = 1 - 1e-6  # its logit is finite in float32
 

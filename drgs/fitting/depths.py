@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from drgs.integrator import Output
     from drgs.settings import RenderSettings
 
-__all__ = ["axis_cosines", "depth_error", "renders_z"]
-
 
 def renders_z(settings: RenderSettings) -> bool:
     """Whether `drgs.integrator.Output.depth` is z with these settings; else it is the distance along the ray."""

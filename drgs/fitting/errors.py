@@ -16,7 +16,7 @@ import torch
 
 from drgs.display.progress import Bar
 from drgs.fitting.components.exposure import NETWORK
-from drgs.fitting.frames import frames_for, load_dataset
+from drgs.fitting.frames import Frame, frames_for, load_dataset
 from drgs.fitting.records import fitted_views, load_run
 from drgs.fitting.resume import lock_run
 from drgs.information.expected_error import ErrorRecord, error_record
@@ -29,12 +29,9 @@ if TYPE_CHECKING:
     from drgs.data import Dataset, View
     from drgs.ellipsoids import Scene
     from drgs.fitting.config import DataConfig
-    from drgs.fitting.frames import Frame
     from drgs.fitting.trainer import Trainer
     from drgs.io.run import Run
     from drgs.settings import RenderSettings
-
-__all__ = ["error_record_of_views", "fit_errors", "is_cheap", "run_error_record", "saved_error_record"]
 
 _HEADER = {"scene": str, "photographs": int, "pixels": int, "views": int, "settings": dict, "length": float}
 _STEPS_A_PHOTOGRAPH = 100  # steps of a fit for which a record looks at one photograph more: it takes a few steps' time

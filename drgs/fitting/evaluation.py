@@ -8,25 +8,20 @@ from typing import TYPE_CHECKING, Any
 from drgs.cameras.sizes import reduced_size
 from drgs.display.pictures import file_names
 from drgs.fitting.components.base import RunViews
-from drgs.fitting.components.exposure import NETWORK, Exposure
+from drgs.fitting.components.exposure import NETWORK, Exposure, Meter
 from drgs.fitting.components.table import COMPONENTS
-from drgs.fitting.frames import frames_for, load_dataset
+from drgs.fitting.frames import Frame, frames_for, load_dataset
 from drgs.fitting.metrics import VIEW_PICTURES, Lpips, evaluate, through_renderers, write_metrics
 from drgs.fitting.near_planes import warn_of_near_planes
-from drgs.fitting.records import fit_record, fitted_views, load_run
+from drgs.fitting.records import FitRecord, LoadedRun, fit_record, fitted_views, load_run
 from drgs.fitting.renderers import renderers_to_measure
 from drgs.fitting.stages import moving_labels
 
 if TYPE_CHECKING:
     from drgs.data import Dataset, View
-    from drgs.fitting.components.exposure import Meter
-    from drgs.fitting.frames import Frame
-    from drgs.fitting.records import FitRecord, LoadedRun
     from drgs.fitting.segments import Segmentation
     from drgs.io.outputs import LockedFolder
     from drgs.io.run import Run
-
-__all__ = ["evaluate_run"]
 
 
 def evaluate_run(

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from drgs.data import Dataset, View
     from drgs.fitting.config import DataConfig, FitConfig, MaskUse, UndistortUse
 
-__all__ = ["Frame", "frames_for", "load_dataset", "load_frames", "warn_of_late_cameras"]
-
 _log = logging.getLogger(__name__)
 
 _Map = Callable[[], torch.Tensor]

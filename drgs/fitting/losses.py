@@ -20,19 +20,6 @@ if TYPE_CHECKING:
     from drgs.fitting.frames import Frame
     from drgs.integrator import Output
 
-__all__ = [
-    "LossTerm",
-    "Opacity",
-    "Outside",
-    "Photometric",
-    "Scale",
-    "padded_ssim",
-    "psnr",
-    "psnr_of",
-    "ssim_map",
-    "terms_of",
-]
-
 # As Wang et al. have them: a Gaussian window of 11x11 pixels, and (K1 L)^2, (K2 L)^2 with L = 1 the range of values.
 _RADIUS = 5  # pixels
 _SIGMA = 1.5  # pixels

@@ -15,20 +15,18 @@ import torch
 
 from drgs.display.pictures import file_names, write_png
 from drgs.display.progress import Bar
-from drgs.ellipsoids import colors_only
+from drgs.ellipsoids import Scene, colors_only
 from drgs.fitting.depths import depth_error
 from drgs.fitting.losses import psnr
-from drgs.integrator import render
+from drgs.integrator import Output, render
 from drgs.io.archives import check_archive
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import write_json
 from drgs.settings import RenderSettings
 
 if TYPE_CHECKING:
-    from drgs.ellipsoids import Scene
     from drgs.fitting.frames import Frame
     from drgs.fitting.segments import Segmentation
-    from drgs.integrator import Output
     from drgs.io.run import Run
 
     AsPhotograph = Callable[[Output, Frame], Output]

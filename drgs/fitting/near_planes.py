@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.settings import RenderSettings
 
-__all__ = ["share_cut", "warn_of_near_planes"]
-
 _WARNED_SHARE = 0.05  # of what photographs show; captures in COLMAP's units lose less than 0.01 to 0.2. Chosen
 _MOST_CAMERAS, _MOST_POINTS = 16, 10_000  # evenly chosen ones: a share needs no more
 _log = logging.getLogger("drgs.train")

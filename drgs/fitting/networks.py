@@ -9,8 +9,6 @@ import torch
 
 from drgs.fitting.adam import Adam
 
-__all__ = ["Network", "Rate", "rate_at", "saved_networks"]
-
 _T = TypeVar("_T")
 
 Rate = float | Callable[[float], float]

@@ -30,8 +30,6 @@ from drgs.integrator import render
 from drgs.io.json_files import check_json
 from drgs.sfm.proposals import propose_along_rays, random_subset
 
-__all__ = ["OnlineFit"]
-
 _log = logging.getLogger(__name__)
 
 # Chosen, not tuned.

@@ -38,8 +38,6 @@ from drgs.information.semantics import SemanticMetric
 from drgs.integrator import render
 from drgs.settings import RenderSettings
 
-__all__ = ["POWER", "ROUNDS", "Pruned", "Round", "Unseen", "check_amount", "fit_on", "prune"]
-
 Unseen = Literal["keep", "remove"]
 
 _S = TypeVar("_S", Gaussians, DynamicGaussians)

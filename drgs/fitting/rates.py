@@ -8,8 +8,6 @@ if TYPE_CHECKING:
     from drgs.fitting.config import FitConfig
     from drgs.fitting.networks import Rate
 
-__all__ = ["means_rate", "rates_of"]
-
 
 def rates_of(config: FitConfig, extent: float) -> dict[str, Rate]:
     """Learning rates by the name of the tensor in `GaussianRows`; `extent` of the scene is its unit of length."""

@@ -20,7 +20,7 @@ import torch
 from drgs.cameras.origins import check_origin
 from drgs.codecs.ply import load_ply
 from drgs.data.camera_lists import load_cameras_json
-from drgs.fitting.components.base import Checkpoint
+from drgs.fitting.components.base import Checkpoint, Setup
 from drgs.fitting.components.poses import CAMERAS
 from drgs.fitting.components.semantics import SemanticRecord
 from drgs.fitting.components.table import COMPONENTS
@@ -39,10 +39,8 @@ if TYPE_CHECKING:
     from drgs.features.decoder import Decoder
     from drgs.features.segmentation import Classes
     from drgs.fitting.active import ActiveViews
-    from drgs.fitting.components.base import Setup
     from drgs.fitting.frames import Frame
     from drgs.fitting.trainer import Trainer
-    from drgs.io.run import Run
 
 __all__ = [
     "FitRecord",

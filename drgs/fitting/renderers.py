@@ -14,18 +14,6 @@ from collections.abc import Sequence
 
 from drgs.settings import PRESETS, Preset, RenderSettings
 
-__all__ = [
-    "ANY",
-    "AUTO",
-    "VIEWERS",
-    "RendererSchedule",
-    "check_renderers",
-    "named_renderers",
-    "own_preset",
-    "planar_of",
-    "renderers_to_measure",
-]
-
 AUTO = ("auto",)
 """`any`; where a fit has other settings than those of preset `fast`, these alone."""
 ANY: tuple[Preset, ...] = ("exact", "fast", "inria", "gsplat", "3dgut")

@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from drgs.fitting.config import FitConfig
     from drgs.fitting.frames import Frame
 
-__all__ = ["FULL", "LARGE", "PIXELS_A_GAUSSIAN", "UPDATES", "WHOLE", "Resolution", "default_updates", "halved_size"]
-
 FULL = 1 / 2
 """Fraction of the steps from which on photographs have the size of the fit; chosen (docs/one-model.md has its gain)."""
 

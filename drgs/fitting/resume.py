@@ -6,21 +6,14 @@ import logging
 import os
 import shutil
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from drgs.fitting.components.poses import CAMERAS
 from drgs.fitting.components.semantics import EMBEDDINGS
 from drgs.fitting.records import check_checkpoint, is_fit_config
 from drgs.io.checkpoint import load_state
-from drgs.io.outputs import lock_folder, replacing
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from drgs.io.outputs import LockedFolder
-    from drgs.io.run import Run
-
-__all__ = ["FILES", "lock_run", "keep_previous", "last_checkpoint"]
+from drgs.io.outputs import LockedFolder, lock_folder, replacing
+from drgs.io.run import Run
 
 PREVIOUS = "state.previous.safetensors"
 _CHECKPOINTS = ("state.safetensors", PREVIOUS)

@@ -16,8 +16,6 @@ import torch
 from drgs.ellipsoids import Y_00, Gaussians
 from drgs.fitting.adam import Adam
 
-__all__ = ["GaussianRows"]
-
 
 class GaussianRows:
     """N Gaussians as leaf tensors, one a parameter group, with an Adam optimizer whose rows follow theirs.

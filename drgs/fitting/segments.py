@@ -11,15 +11,12 @@ import torch
 from drgs.display.pictures import to_bytes, write_png
 from drgs.display.progress import Bar
 from drgs.features.pictures import FeatureColors, label_picture, overlay, with_legend
-from drgs.features.segmentation import SCORE_DEFINITIONS, classify, scores
+from drgs.features.segmentation import SCORE_DEFINITIONS, Classes, classify, scores
 
 if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.features.decoder import Decoder
-    from drgs.features.segmentation import Classes
     from drgs.fitting.frames import Frame
-
-__all__ = ["Segmentation", "check_references", "feature_colors", "segmentation_of", "teacher_labels"]
 
 _KEPT_MASK = 0.5  # mask, or opacity of a Gaussian, from which on a pixel or the Gaussian counts
 _MOST_SAMPLES = 20_000  # Gaussians whose features give the principal components of pictures, at most; chosen, not tuned

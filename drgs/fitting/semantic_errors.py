@@ -11,7 +11,7 @@ import torch
 
 from drgs.display.progress import Bar
 from drgs.fitting.segments import segmentation_of
-from drgs.information.expected_error import expected_error, residual_record
+from drgs.information.expected_error import ErrorRecord, expected_error, residual_record
 from drgs.integrator import render
 
 if TYPE_CHECKING:
@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from drgs.features.decoder import Decoder
     from drgs.fitting.frames import Frame
     from drgs.fitting.records import LoadedRun
-    from drgs.information.expected_error import ErrorRecord
-
-__all__ = ["feature_record", "feature_residual", "label_record", "wrong_label"]
 
 _CHANNELS = 32  # channels that are decoded at once; chosen
 

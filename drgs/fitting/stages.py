@@ -15,17 +15,6 @@ if TYPE_CHECKING:
     from drgs.data import Dataset
     from drgs.fitting.config import FitConfig
 
-__all__ = [
-    "Stage",
-    "dynamic_stage",
-    "first_time",
-    "fitted_times",
-    "moving_labels",
-    "shows_first_time",
-    "spacing",
-    "times_of",
-]
-
 _FEWEST_PHOTOGRAPHS = 3  # photographs of one time that show the depth of things, with one to spare
 
 

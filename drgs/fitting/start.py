@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from drgs.data import scene_extent
+from drgs.data import Dataset, View, scene_extent
 from drgs.display.progress import Bar
 from drgs.fitting.components.base import Setup
 from drgs.fitting.components.table import components_of
@@ -24,11 +24,8 @@ from drgs.sfm.points import initial_points
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from drgs.data import Dataset, View
     from drgs.fitting.config import FitConfig
     from drgs.fitting.frames import Frame
-
-__all__ = ["start", "start_plain"]
 
 _log = logging.getLogger("drgs.train")
 

@@ -7,8 +7,6 @@ from collections.abc import Iterator
 
 import torch
 
-__all__ = ["fewer_torch_threads", "one_thread"]
-
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:

@@ -24,14 +24,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.cameras import places_in_time
+from drgs.cameras import Camera, places_in_time
 
 if TYPE_CHECKING:
-    from drgs.cameras import Camera
     from drgs.data import View
     from drgs.fitting.config import FitConfig, Schedule, SelectionConfig
-
-__all__ = ["VIEWS_TO_ADD", "Timetable", "initial_views"]
 
 _START_STREAM = 0x57A7  # any number: the random stream of the first view differs from all others of the same seed
 _PICK_EVERY = 200  # steps between two picks, as in [1]

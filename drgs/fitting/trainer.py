@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from drgs.ellipsoids import Gaussians
-from drgs.fitting.components.base import Checkpoint
+from drgs.ellipsoids import Gaussians, Scene
+from drgs.fitting.components.base import Checkpoint, Component, Setup
 from drgs.fitting.components.table import components_of
 from drgs.fitting.config import FitConfig
 from drgs.fitting.density import add_gaussians, explore, relocate
-from drgs.fitting.losses import psnr_of, terms_of
+from drgs.fitting.losses import LossTerm, psnr_of, terms_of
 from drgs.fitting.networks import Network, rate_at
 from drgs.fitting.rates import means_rate, rates_of
 from drgs.fitting.renderers import RendererSchedule
@@ -27,16 +27,10 @@ from drgs.fitting.resolution import Resolution
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.stages import Stage
 from drgs.information.nuisances import NUISANCES, Nuisance
-from drgs.integrator import render
+from drgs.integrator import Output, render
 
 if TYPE_CHECKING:
-    from drgs.ellipsoids import Scene
-    from drgs.fitting.components.base import Component, Setup
     from drgs.fitting.frames import Frame
-    from drgs.fitting.losses import LossTerm
-    from drgs.integrator import Output
-
-__all__ = ["StepResult", "Trainer"]
 
 _MAX_BAD_STEPS = 10  # steps in a row without finite gradients that end a fit, more than one bad view; chosen
 # Parts of names in a checkpoint, not of networks; components have more.

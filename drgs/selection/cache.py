@@ -24,8 +24,6 @@ from drgs.information.sums import Information
 from drgs.io.json_files import check_json
 from drgs.selection.drift import Shapes, change_of_view
 
-__all__ = ["Cache", "NotCached", "ViewKey", "camera_key", "named_by", "size_of", "view_key"]
-
 _COLORS = "sh"  # whose information about base colors is the sum of w^2
 _OF_GAUSSIANS = (*GAUSSIAN_GROUPS, "coverage")
 _STATE = {"answers": [{"question": str, "view": int, "shapes": int}], "sh": [int], "now": (None, int)}

@@ -12,21 +12,16 @@ import dataclasses
 import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import torch
 
 from drgs.information.blocks import SceneBlocks
 from drgs.information.criteria import criterion_named
 from drgs.information.gains import Gain, scorer
+from drgs.information.prior import Prior
 from drgs.information.quantity import Joint
+from drgs.information.scoring import Scoring
 from drgs.information.sums import Information
-
-if TYPE_CHECKING:
-    from drgs.information.prior import Prior
-    from drgs.information.scoring import Scoring
-
-__all__ = ["Combination", "joint_of"]
 
 _CONSTANT_BELOW = 1e-6  # relative standard deviation below which a block's scores are the same but for float32 images
 

@@ -17,17 +17,12 @@ that has come since counts as the average of these if its mean is in the image.
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
+from drgs.cameras import Camera
 from drgs.ellipsoids import Y_00, Gaussians
-
-if TYPE_CHECKING:
-    from drgs.cameras import Camera
-
-__all__ = ["Shapes", "change_of_view"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -41,8 +41,6 @@ from drgs.selection.combine import Combination
 from drgs.selection.pool import Pool, Selection
 from drgs.selection.refining import refined
 
-__all__ = ["PoolView", "ViewInformation", "greedy"]
-
 _MEMORY_SHARE = 0.25  # of the free memory, for information that could be computed again; chosen
 _WHOLE = 1e-5  # below 1, from which on a share of a pixel is all of it: rounding of float32 sums of weights
 _REDUCTION = 4  # pixels of a candidate for each one that it is first scored by; by 16, `office` kept 9 picks of 10

@@ -9,25 +9,20 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Hashable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
+from drgs.cameras import Camera
 from drgs.information.blocks import SceneBlocks
 from drgs.information.criteria import criterion_named
 from drgs.information.gains import DENSE
-from drgs.information.quantity import Joint, Quantity
+from drgs.information.quantity import Joint, Quantity, ViewContext
+from drgs.information.sums import Information
 from drgs.selection.combine import Combination, joint_of
 from drgs.selection.greedy import PoolView, ViewInformation, greedy
 from drgs.selection.pool import Pool, Selection
-
-if TYPE_CHECKING:
-    from drgs.cameras import Camera
-    from drgs.information.quantity import ViewContext
-    from drgs.information.sums import Information
-    from drgs.settings import RenderSettings
-
-__all__ = ["compute_candidates", "coverage", "fisher", "fisherrf"]
+from drgs.settings import RenderSettings
 
 _FEW_PROBES = 8  # probes of a network's information, up to which 1 / H is far too large on average
 

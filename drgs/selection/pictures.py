@@ -9,18 +9,12 @@ Reference:
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import torch
 
-from drgs.information.quantity import Quantity
+from drgs.information.quantity import Quantity, ViewContext
 from drgs.selection.pool import Pool, Selection
 from drgs.settings import RenderSettings
-
-if TYPE_CHECKING:
-    from drgs.information.quantity import ViewContext
-
-__all__ = ["blur", "moments", "renderers"]
 
 _COMPARED = ("exact", "fast", "gsplat", "3dgut")
 _LUMA = (0.299, 0.587, 0.114)  # of R, G and B, ITU-R BT.601

@@ -12,8 +12,6 @@ from drgs.checks.arguments import kind_of, must_be
 from drgs.information.choices import POLICIES, check_named
 from drgs.selection.pool import Pick, Pool, Selection
 
-__all__ = ["check_region", "choose", "policy_named"]
-
 _INFORMED = ("fisher", "fisherrf", "coverage")
 """Policies that score a camera by the information of its view."""
 

@@ -25,8 +25,6 @@ from drgs.selection.cache import Cache, view_key
 from drgs.selection.refining import Refine
 from drgs.settings import RenderSettings
 
-__all__ = ["Pick", "Pool", "Selection", "ViewRequest", "Workers"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Pick:

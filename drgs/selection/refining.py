@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from drgs.information.gains import Gain
     from drgs.information.sums import Information
 
-__all__ = ["Refine", "refined"]
-
 _AXES = ("right", "down", "forward")
 _MAX_HALVINGS = 4  # times that steps are halved, to a 16th of the first: finer ones change a score by little
 _MIN_GAIN = 1e-6  # relative rise of a score that is more than rounding

@@ -20,8 +20,6 @@ from drgs.cameras import Camera, places_in_time
 from drgs.cameras.origins import decimals
 from drgs.selection.pool import Pool, Selection
 
-__all__ = ["farthest", "random", "uniform"]
-
 _T = TypeVar("_T", bound=Hashable)
 _POSE_DIGITS = 9  # decimals of poses that are equal
 

@@ -8,8 +8,6 @@ from __future__ import annotations
 from types import ModuleType
 from typing import Any
 
-__all__ = ["Float", "Int32", "Lib", "Mask", "UInt32", "UInt64"]
-
 Lib = ModuleType  # the module of the backend's array types (runtime.dr_types)
 
 Float = Any  # Float, or Float64 where a Gaussian is projected

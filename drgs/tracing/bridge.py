@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from drgs.tracing.call import Call
     from drgs.tracing.frames import Frame
 
-__all__ = ["differentiable", "to_drjit"]
-
 
 def to_drjit(lib: ModuleType, x: torch.Tensor) -> Any:
     """A torch tensor as a Dr.Jit tensor of its precision; without its graph, which the functions below keep."""

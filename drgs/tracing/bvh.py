@@ -37,8 +37,6 @@ from drgs.tracing.sort_keys import EMPTY, positive
 from drgs.tracing.tiles import depth_order
 from drgs.tracing.walk import Part
 
-__all__ = ["BvhTraversal", "Proxies", "proxy_scene"]
-
 # relative rounding of the coordinates of a ray's origin: one unit in the last place of float32
 _ORIGIN_ROUNDING = 1.2e-7
 _GRAZING = 1e-7  # relative to (distance / radius)^2: what rounding takes from the discriminant, with a margin

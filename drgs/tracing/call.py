@@ -30,8 +30,6 @@ from drgs.tracing.tiles import TILE, TileTraversal
 from drgs.tracing.unscented import unscented_boxes
 from drgs.tracing.walk import Traversal
 
-__all__ = ["OF_VIEW", "Call", "Output", "checked_pixel_rays", "numbers"]
-
 OF_VIEW = (
     "w2c",
     "ray_origins",

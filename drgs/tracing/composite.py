@@ -26,8 +26,6 @@ from drgs.tracing.sums import add_row
 from drgs.tracing.walk import Part, Traversal, pixels_a_lane
 from drgs.tracing.weights import MATRIX, PIXELS, Weights, in_rows, without_graph
 
-__all__ = ["CHUNK", "Arguments", "Composite", "Compositor", "compositor_of"]
-
 CHUNK = 32  # feature channels of one traversal
 
 

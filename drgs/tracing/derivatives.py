@@ -32,8 +32,6 @@ from drgs.tracing.primitives import Ray
 from drgs.tracing.records import load_packed, packed_size
 from drgs.tracing.sums import add_row
 
-__all__ = ["Adjoint", "Tangent", "if_any_hit"]
-
 Gradient = tuple[dict[int, Float], list[Float]]  # of one hit: by entry of its record, and by what the ray carries
 
 

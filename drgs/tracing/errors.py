@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
-__all__ = ["own_errors"]
-
 
 @contextlib.contextmanager
 def own_errors() -> Iterator[None]:

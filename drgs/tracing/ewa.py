@@ -17,8 +17,6 @@ from drgs.tracing.peak import AlphaStrength, deviation
 from drgs.tracing.primitives import Activated, Patch, Projected, Ray, Screen
 from drgs.tracing.records import cross, dot
 
-__all__ = ["EWA", "Ewa"]
-
 _SHAPE = (layout.R11, layout.R12, layout.R13, layout.R22, layout.R23)
 
 

@@ -22,8 +22,6 @@ import torch
 if TYPE_CHECKING:
     from drgs.ellipsoids import DeformableScene
 
-__all__ = ["Field", "wrapped"]
-
 _Tensors = dict[str, torch.Tensor]
 
 

@@ -24,8 +24,6 @@ from drgs.tracing.sort_keys import ascending, compacted
 from drgs.tracing.walk import Part, pixels_a_lane
 from drgs.tracing.weights import PIXELS, signed
 
-__all__ = ["Frame", "View"]
-
 
 class View(NamedTuple):
     """What the steps of a frame depend on besides arrays.

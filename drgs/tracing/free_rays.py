@@ -26,8 +26,6 @@ from drgs.tracing.arrays import Float, Int32, Lib, Mask, UInt32
 from drgs.tracing.lens_rays import NARROW, LensRays, guides_of, tile_boxes
 from drgs.tracing.records import cross, dot
 
-__all__ = ["FreeRays"]
-
 _ROUNDING = 4e-7  # of float32, relative, in a difference of two numbers: a few units in the last place
 
 

@@ -10,8 +10,6 @@ import drjit as dr
 from drgs.ellipsoids import Y_00
 from drgs.tracing.arrays import Float
 
-__all__ = ["higher_harmonics", "sh_basis", "sh_color"]
-
 # Factors of the real spherical harmonics of degrees 1 to 3, as INRIA's code orders and signs them.
 _LINEAR = 0.4886025119029199
 _QUADRATIC = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)

@@ -19,8 +19,6 @@ from drgs.tracing.kernels import Channels, HitModel
 from drgs.tracing.primitives import Ray
 from drgs.tracing.walk import Part
 
-__all__ = ["Replayed", "Table", "along_lists", "replayed_hit"]
-
 
 class Replayed(Protocol):
     """A derivative that needs the transmittance in front of a hit and the sums behind it.

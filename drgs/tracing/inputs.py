@@ -9,8 +9,6 @@ from drgs.checks.arguments import ArgumentError, must_be
 from drgs.ellipsoids import Gaussians, Scene, check_any_scene, check_gaussians
 from drgs.settings import check_settings
 
-__all__ = ["check_scene", "check_view", "gaussians_at"]
-
 
 def check_scene(where: str, gaussians: Any, settings: Any) -> None:
     """Raise `ArgumentError` unless these are Gaussians and RenderSettings (or None)."""

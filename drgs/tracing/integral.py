@@ -19,8 +19,6 @@ from drgs.tracing.arrays import Float
 from drgs.tracing.peak import Peak, approach, times
 from drgs.tracing.primitives import Ray
 
-__all__ = ["INTEGRAL", "Integral"]
-
 _ROOT_HALF = 0.7071067811865476  # sqrt(1 / 2)
 _INV_SQRT_2PI = 0.3989422804014327  # 1 / sqrt(2 pi)
 

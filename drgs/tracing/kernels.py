@@ -25,8 +25,6 @@ from drgs.tracing.primitives import Ray
 from drgs.tracing.records import RECORD, load_record
 from drgs.tracing.responses import response_of
 
-__all__ = ["Channels", "Emit", "HitModel", "HitNumbers", "Primal", "numbers_of"]
-
 Emit = Callable[[UInt32, int, list, Float, Mask], None]
 
 

@@ -17,8 +17,6 @@ import torch
 from drgs.cameras import Camera
 from drgs.cameras.lenses import LENS_MODELS, distorted, equirectangular, linear_part
 
-__all__ = ["LensMotion"]
-
 # px by which a ray's projection may miss its pixel; beyond, the lens has no inverse there, and nothing moves
 _MAX_RESIDUAL = 1e-3
 _MIN_SLOPE = 1e-9  # a determinant or slope below has no inverse

@@ -32,18 +32,6 @@ from drgs.tracing.arrays import Float, Int32, Lib, Mask, UInt32
 from drgs.tracing.pose import local_rays
 from drgs.tracing.primitives import Patch, Ray
 
-__all__ = [
-    "NARROW",
-    "LensRays",
-    "equidistant",
-    "guides_of",
-    "lens_of",
-    "on_plane",
-    "on_side",
-    "pixels_of",
-    "tile_boxes",
-]
-
 NARROW = 0.17  # least d_z of the unit directions of a narrow lens: 80 degrees off the axis (cos 80 = 0.17)
 _CELL_PIXELS = 4  # pixels, about, across the smallest cells of a table of displacements; chosen
 _MAX_CELLS = 1024  # cells in a row of it; chosen: bounds memory

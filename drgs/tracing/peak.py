@@ -38,8 +38,6 @@ from drgs.tracing.primitives import Activated, Patch, Projected, Ray, Screen
 from drgs.tracing.records import cross, dot
 from drgs.tracing.silhouettes import silhouette
 
-__all__ = ["PEAK", "AlphaStrength", "Peak", "approach", "deviation", "entry", "times"]
-
 
 class AlphaStrength:
     """What stands for alpha in the record is alpha itself, and x = strength exp(-rho^2 / 2) the opacity of a hit."""

@@ -7,8 +7,6 @@ import torch
 
 from drgs.cameras import Camera, rigid
 
-__all__ = ["rigid_pose", "local_directions", "local_rays", "quaternion_product", "shifted", "turned", "twisted"]
-
 
 def rigid_pose(camera: Camera, name: str = "w2c") -> torch.Tensor:
     """(3, 4) of w2c, or of w2c_end, in float64, as the rigid motion that it means; a copy of an array, which may be

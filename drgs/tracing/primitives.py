@@ -18,20 +18,6 @@ from drgs.tracing.arrays import Float, Lib, Mask
 from drgs.tracing.harmonics import sh_basis, sh_color
 from drgs.tracing.records import dot
 
-__all__ = [
-    "LEAST_EXTENT2",
-    "TOLERANCE_LISTED",
-    "TOLERANCE_UNLISTED",
-    "Activated",
-    "Lens",
-    "Patch",
-    "Projected",
-    "Ray",
-    "Screen",
-    "ViewColor",
-    "trimmed_extent2",
-]
-
 _THINNEST = math.log(1e-30)  # of log-scales
 TOLERANCE = 1e-5
 """Of `exact`: the largest error of an image that it claims, and what the tails that it leaves out may add up to in any

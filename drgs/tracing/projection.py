@@ -21,8 +21,6 @@ from drgs.tracing.records import ALPHA
 from drgs.tracing.responses import Response, response_of
 from drgs.tracing.silhouettes import silhouette
 
-__all__ = ["Cull", "project_screen", "project_world"]
-
 Cull = Callable[[Activated], tuple[list[Float], Mask]]
 """Bounds x0, y0, x1, y1 in pixels that Gaussians are seen within, and which of them are there."""
 

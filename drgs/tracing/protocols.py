@@ -13,8 +13,6 @@ from typing import Any, Protocol
 from drgs.tracing.arrays import Float, Lib, Mask, UInt32
 from drgs.tracing.primitives import Ray
 
-__all__ = ["Candidates", "DividedStream", "Kernel", "Sink", "Stream"]
-
 
 class Candidates(Protocol):
     """Where the stream of a part comes from: the stream itself, or what is only made when it is walked along."""

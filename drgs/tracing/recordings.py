@@ -24,8 +24,6 @@ import drjit as dr
 from drgs import runtime
 from drgs.tracing.errors import own_errors
 
-__all__ = ["are_on", "padded", "replay", "without_recordings"]
-
 _MAX_RECORDINGS = 256  # steps that are kept; the one that was used least recently goes first
 _MAX_VARIANTS = 4  # of a step, by what Dr.Jit itself distinguishes: alignment, arrays that are the same one
 _STEPS_AN_OCTAVE = 8  # of `padded`

@@ -12,8 +12,6 @@ import drjit as dr
 
 from drgs.tracing.arrays import Float, Lib, Mask, UInt32
 
-__all__ = ["RECORD", "count_of", "cross", "dot", "load_packed", "load_record", "pack", "pack_records", "packed_size"]
-
 # Layout of a screen record (floats). ALPHA holds the opacity, or what stands for it in the response (its `strength`).
 RECORD = 24
 AX, AY, R11, R12, R13, R21, R22, R23, E2, E3, E4, E5, E6, H1, H2, H3, NORM, ALPHA, EXT2, RGB = range(20)

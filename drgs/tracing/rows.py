@@ -22,8 +22,6 @@ from drgs.tracing.sort_keys import BEYOND, EMPTY, name_of, positive, word_of
 from drgs.tracing.walk import ListStream, Part
 from drgs.tracing.weights import PIXELS, signed
 
-__all__ = ["MemoryBudget", "SortedHits", "SortedRows", "found_hits", "sort_rows"]
-
 _TILES_PER_TASK = 64  # tiles that a thread sorts at a time; chosen
 
 

@@ -8,8 +8,6 @@ from drgs.cameras import Camera
 from drgs.cameras.shutters import BY_COLUMN, line_times
 from drgs.tracing.pose import shifted
 
-__all__ = ["middle_pose", "rolling_view"]
-
 _SERIES_BELOW = 1e-6  # of a squared sine or angle, below which series replace quotients of zeros
 
 

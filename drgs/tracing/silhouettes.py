@@ -28,8 +28,6 @@ from drgs.tracing.arrays import Float, Mask
 from drgs.tracing.primitives import Activated, Screen
 from drgs.tracing.records import dot
 
-__all__ = ["silhouette"]
-
 _BOUND_PAD = 1e-3  # px added to bounds for the rounding of float32
 _NOWHERE = 1e30  # px, beyond the image
 _FULL_CIRCLE = 4.0  # radians, for no bound: the fisheye sees no farther than pi

@@ -10,8 +10,6 @@ from drgs import runtime
 from drgs.tracing.arrays import Float, Lib, UInt32, UInt64
 from drgs.tracing.recordings import padded
 
-__all__ = ["BEYOND", "EMPTY", "ascending", "compacted", "name_of", "positive", "push", "word_of"]
-
 EMPTY = -1.0  # "no hit"; order keys of hits are >= 0
 BEYOND = 1e308  # above the word of any hit
 _VECTOR_SORT_THREADS = 4  # threads up to which one sort in vector registers is faster than a radix sort by all of them

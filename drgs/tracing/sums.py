@@ -14,8 +14,6 @@ import drjit as dr
 
 from drgs.tracing.arrays import Float, Lib, Mask, UInt32
 
-__all__ = ["add_row"]
-
 _PACKET_FLOATS = 16  # floats that are added at once, at most
 _SINGLY_UP_TO = 2  # floats of a packet up to which adding them one by one is faster
 _MAX_COPY_BYTES = 256 << 20  # bytes that the copies of a buffer, one a thread, may take; chosen

@@ -12,8 +12,6 @@ from drgs.tracing.call import OF_VIEW, Call, Output, checked_pixel_rays, numbers
 from drgs.tracing.pose import quaternion_product, rigid_pose, shifted, turned, twisted
 from drgs.tracing.shutter import rolling_view
 
-__all__ = ["push_forward"]
-
 
 def push_forward(call: Call, tangents: dict) -> Output:
     """`render_jvp`: the images' tangents along those of the parameters."""

@@ -32,28 +32,6 @@ from drgs.tracing.sort_keys import ascending
 from drgs.tracing.walk import ListStream, Part, Slots, pixels_a_lane
 from drgs.tracing.weights import PIXELS, Weights, signed
 
-__all__ = [
-    "NO_KEY",
-    "TABLES",
-    "TILE",
-    "Lists",
-    "TileTraversal",
-    "build",
-    "check_pairs",
-    "depth_order",
-    "depth_words",
-    "is_one_band",
-    "is_tested",
-    "is_trimmed",
-    "keys_of_boxes",
-    "listed",
-    "lists_of_keys",
-    "order_bytes",
-    "remaining",
-    "screen_boxes",
-    "shorter",
-]
-
 # Pixels a side. With 4, 100,000 Gaussians in 512x512 pixels have 1.55 M entries to sort in place of 0.6 M.
 TILE = 8
 TABLES = 128 << 20

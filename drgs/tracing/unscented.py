@@ -21,18 +21,6 @@ from drgs.cameras.lenses import angle_polynomial, distorted, fisheye_polynomial
 from drgs.tracing.arrays import Float, Lib, Mask
 from drgs.tracing.primitives import Activated
 
-__all__ = [
-    "DILATION",
-    "EXTENT",
-    "LEAST_COMPENSATION",
-    "LEAST_OPACITY",
-    "MARGIN",
-    "COVARIANCE_WEIGHTS",
-    "MEAN_WEIGHTS",
-    "SPREAD",
-    "unscented_boxes",
-]
-
 _ALPHA, _BETA = 0.1, 2.0  # parameters of the transform, gsplat's defaults; kappa is 0
 SPREAD = _ALPHA * math.sqrt(3.0)
 """Distance of the six points from the mean, in standard deviations."""

@@ -30,8 +30,6 @@ from drgs.tracing.records import RECORD, load_record
 from drgs.tracing.sort_keys import BEYOND, EMPTY, ascending, name_of, positive, push, word_of
 from drgs.tracing.weights import PIXELS, Weights
 
-__all__ = ["BUFFER", "NOWHERE", "ListStream", "Part", "Slots", "Traversal", "pixels_a_lane"]
-
 BUFFER = 20  # hits that a ray is sorted among; a ray for which these are too few is walked again (docs/numerics.md)
 # the same where these were too few; with 16 hits that was so of 40 to 80 % of a fit's rays (commit 07ccb400)
 _DEEP_BUFFER = 48

@@ -25,8 +25,6 @@ import torch
 
 from drgs.tracing.arrays import Float, Lib, UInt32
 
-__all__ = ["MATRIX", "PIXELS", "Weights", "in_rows", "signed", "without_graph"]
-
 PIXELS = 64  # pixels of a tile, 8 x 8
 MATRIX = 128 << 20
 """Bytes of the weights that are held at once; more where the list of a single tile has more."""

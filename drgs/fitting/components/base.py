@@ -49,8 +49,6 @@ if TYPE_CHECKING:
     from drgs.settings import RenderSettings
     from drgs.sfm.guided import Matches
 
-__all__ = ["MODES", "Checkpoint", "Component", "Conflict", "Fit", "RunViews", "Setup", "check_conflicts"]
-
 MODES = {
     "selection": "where views are chosen on the way",
     "begin": "where the fit begins with the Gaussians of another",

@@ -41,8 +41,6 @@ if TYPE_CHECKING:
     from drgs.fitting.frames import Frame
     from drgs.integrator import Output
 
-__all__ = ["Comparison", "DepthComponent", "Line", "compare"]
-
 # Where nothing measured is named: chosen, not tuned.
 _SAME_DEPTH = 0.1  # relative difference of two depths of one point
 # Of the compared points whose depth is the same: `office` 0.81, the still life 0.88, a made room 0.98, and where each

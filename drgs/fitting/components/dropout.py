@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from drgs.ellipsoids import Gaussians
     from drgs.fitting.frames import Frame
 
-__all__ = ["DropoutComponent", "fewer"]
-
 _FEW, _SHARE = 3, 0.4  # photographs at most for which `auto` leaves Gaussians out, and their share at the end
 
 

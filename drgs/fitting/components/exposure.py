@@ -25,13 +25,13 @@ import torch
 from drgs.cameras.sizes import reduced_size
 from drgs.data.resampling import resize_area
 from drgs.display.progress import Bar
-from drgs.ellipsoids import Y_00, colors_only
+from drgs.ellipsoids import Y_00, Scene, colors_only
 from drgs.fitting.components.base import Checkpoint, Component, Fit, Setup
-from drgs.fitting.frames import frames_for
+from drgs.fitting.frames import Frame, frames_for
 from drgs.fitting.losses import psnr
 from drgs.fitting.networks import Network
 from drgs.fitting.rows import GaussianRows
-from drgs.integrator import render
+from drgs.integrator import Output, render
 from drgs.sfm.guided import Matches
 from drgs.sfm.points import shared_points
 
@@ -39,21 +39,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from drgs.data import View
-    from drgs.ellipsoids import Scene
     from drgs.fitting.config import FitConfig
-    from drgs.fitting.frames import Frame
-    from drgs.integrator import Output
     from drgs.settings import RenderSettings
-
-__all__ = [
-    "NETWORK",
-    "Exposure",
-    "ExposureComponent",
-    "ExposureEstimate",
-    "Meter",
-    "estimate_exposure",
-    "exposure_network",
-]
 
 NETWORK = "exposure"
 """Name of the gains in a checkpoint."""

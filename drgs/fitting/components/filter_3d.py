@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
 
-__all__ = ["VARIANCES", "Filter3D", "Filter3DComponent", "filtered", "sampling_rates"]
-
 VARIANCES = "filter_3d"
 """Name of the filter's variances in a checkpoint, one a Gaussian."""
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -20,12 +20,8 @@ from drgs.fitting.components.base import Component, Conflict, Fit, Setup
 from drgs.fitting.renderers import RendererSchedule, planar_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from drgs.data import View
     from drgs.fitting.config import FitConfig
-
-__all__ = ["LensChoice", "LensComponent", "lens_choice", "lost_share"]
 
 # Share of the rays that undistorting may crop; ordinary lenses lose 0.05, a fisheye of 180 degrees most.
 _MOST_LOST = 0.2

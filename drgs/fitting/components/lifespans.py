@@ -37,36 +37,21 @@ from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d
 
 from drgs.cameras.sizes import reduced_size
 from drgs.display.progress import Bar
-from drgs.ellipsoids import colors_only
+from drgs.ellipsoids import Gaussians, Scene, colors_only
 from drgs.fitting.components.base import Checkpoint, Component, Fit, Setup
 from drgs.fitting.components.motion import WARM_UP, MotionComponent, limited_lifespans
 from drgs.fitting.rates import means_rate
 from drgs.fitting.stages import dynamic_stage, shows_first_time, spacing
-from drgs.integrator import render
+from drgs.integrator import Output, render
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.dynamics.lifespans import Lifespans
-    from drgs.ellipsoids import Gaussians, Scene
     from drgs.fitting.config import FitConfig
     from drgs.fitting.frames import Frame
     from drgs.fitting.networks import Rate
     from drgs.fitting.rows import GaussianRows
-    from drgs.integrator import Output
     from drgs.settings import RenderSettings
-
-__all__ = [
-    "REFERENCE_TIMES",
-    "LifespansComponent",
-    "LifetimeTerm",
-    "NewGaussians",
-    "Search",
-    "add_new_gaussians",
-    "agreed_trajectories",
-    "checked_lifespans",
-    "find_new_gaussians",
-    "lifespans_of",
-]
 
 REFERENCE_TIMES = "births"
 """Name of the rows' tensor, and in checkpoints, of the time at which a Gaussian is where its mean is; not fitted."""

@@ -41,8 +41,6 @@ if TYPE_CHECKING:
     from drgs.fitting.rows import GaussianRows
     from drgs.integrator import Output
 
-__all__ = ["FIELD", "WARM_UP", "MotionComponent", "Rest", "Smoothness", "is_held_open", "limited_lifespans"]
-
 FIELD = ("deformation.grid", "deformation.mlp")
 """Names of the networks of a fit to what moves."""
 

@@ -23,8 +23,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -32,35 +32,18 @@ import torch
 from drgs.cameras.sizes import at_most
 from drgs.data.camera_lists import save_cameras_json
 from drgs.display.progress import Bar
-from drgs.ellipsoids import colors_only
+from drgs.ellipsoids import Gaussians, Scene, colors_only
 from drgs.fitting.components.base import Checkpoint, Component, Conflict, Fit, RunViews, Setup
 from drgs.fitting.losses import psnr
 from drgs.fitting.networks import Network
 from drgs.integrator import render, render_jvp
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from pathlib import Path
-    from typing import Any
 
     from drgs.cameras import Camera
-    from drgs.ellipsoids import Gaussians, Scene
     from drgs.fitting.frames import Frame
     from drgs.settings import RenderSettings
-
-__all__ = [
-    "CAMERAS",
-    "POSE_NETWORK",
-    "PoseEvidence",
-    "Poses",
-    "PosesComponent",
-    "displacement",
-    "is_due",
-    "motion",
-    "pose_network",
-    "refined_against",
-    "refined_scores",
-]
 
 POSE_NETWORK = "poses"
 """Name of the poses in a checkpoint."""

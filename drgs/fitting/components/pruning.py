@@ -16,8 +16,6 @@ from drgs.fitting.components.base import Checkpoint, Component, Fit
 from drgs.fitting.frames import Frame
 from drgs.fitting.pruning import prune
 
-__all__ = ["PruningComponent"]
-
 _PHOTOGRAPHS = 24  # training photographs, evenly spaced, that are looked at: each is rendered about ten times
 
 

@@ -28,7 +28,7 @@ import torch
 
 from drgs.fitting.components.base import Checkpoint, Component, Conflict, Fit, Setup
 from drgs.fitting.networks import Network
-from drgs.integrator import render
+from drgs.integrator import Output, render
 from drgs.io.json_files import check_json
 from drgs.io.outputs import atomic_write
 
@@ -40,10 +40,7 @@ if TYPE_CHECKING:
     from drgs.fitting.config import FeatureSize, FitConfig
     from drgs.fitting.frames import Frame
     from drgs.information.scoring import Scoring
-    from drgs.integrator import Output
     from drgs.settings import RenderSettings
-
-__all__ = ["EMBEDDINGS", "FeatureDistance", "SemanticRecord", "SemanticsComponent", "check_same_teacher", "features_of"]
 
 EMBEDDINGS = "text_embeddings.npy"
 """File of a run with the text embeddings of its classes."""

@@ -36,28 +36,15 @@ import torch
 
 from drgs.data import scene_extent
 from drgs.display.progress import Bar
-from drgs.ellipsoids import Y_00
+from drgs.ellipsoids import Y_00, Gaussians
 from drgs.fitting.components.base import Component, Conflict, Fit, Setup
 from drgs.integrator import render
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from drgs.ellipsoids import Gaussians
     from drgs.fitting.frames import Frame
     from drgs.settings import RenderSettings
-
-__all__ = [
-    "RADIUS",
-    "SHARE",
-    "FarEvidence",
-    "Skybox",
-    "SkyboxChoice",
-    "SkyboxComponent",
-    "far_evidence",
-    "visible_share",
-    "why_not",
-]
 
 _log = logging.getLogger("drgs.train")
 

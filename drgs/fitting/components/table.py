@@ -7,8 +7,6 @@ from collections.abc import Callable, Sequence
 from drgs.checks.registry import Registry
 from drgs.fitting.components.base import Component
 
-__all__ = ["COMPONENTS", "components_of"]
-
 _HERE = "drgs.fitting.components"
 
 COMPONENTS: Registry[type[Component]] = Registry(

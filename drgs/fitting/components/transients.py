@@ -16,7 +16,7 @@ Reference:
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -24,22 +24,18 @@ from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d
 
 from drgs.cameras.sizes import reduced_size
 from drgs.display.progress import Bar
-from drgs.ellipsoids import colors_only
+from drgs.ellipsoids import Gaussians, colors_only
 from drgs.fitting.components.base import Checkpoint, Component, Conflict, Fit, Setup
 from drgs.fitting.depths import axis_cosines, renders_z
 from drgs.integrator import render
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from typing import Any
 
     from drgs.cameras import Camera
-    from drgs.ellipsoids import Gaussians
     from drgs.fitting.config import TransientUse
     from drgs.fitting.frames import Frame
     from drgs.settings import RenderSettings
-
-__all__ = ["TENSOR", "TransientsComponent", "line_of", "masked_share", "transient_masks"]
 
 TENSOR = "transient."
 """What names of masks in a checkpoint begin with; the number of the photograph follows."""
