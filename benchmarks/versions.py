@@ -182,7 +182,8 @@ def fits_table() -> str:
     from drgs.studies.tables import markdown_table
 
     lines, gains = [], {}
-    for row in read_rows(FIT_ROWS):
+    rows = read_rows(FIT_ROWS)
+    for row in (row for row in rows if row["commit"] == rows[-1]["commit"]):
         line = [row["scene"], str(row["seconds"]), f"{row['before']['steps']:,} to {row['now']['steps']:,}"]
         for name in SEEN:
             old, new = row["before"]["psnr"][name], row["now"]["psnr"][name]

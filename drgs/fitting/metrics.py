@@ -122,22 +122,21 @@ def color_corrected(image: torch.Tensor, target: torch.Tensor, mask: torch.Tenso
     """
     colors = image.detach().double().reshape(-1, 3).numpy()  # a measure, not a loss
     wanted = target.detach().double().reshape(-1, 3).numpy()
-    # A weighted least squares is one of rows that are scaled by the roots of the weights.
-    scale = np.ones(len(colors)) if mask is None else mask.double().reshape(-1).sqrt().numpy()
-    candidates = [colors, *(_corrected(colors, wanted, scale, saturated) for saturated in (False, True))]
-    errors = [float(np.square((x - wanted) * scale[:, None]).sum()) for x in candidates]
+    weights = np.ones(len(colors)) if mask is None else mask.double().reshape(-1).numpy()
+    candidates = [colors, *(_corrected(colors, wanted, weights, saturated) for saturated in (False, True))]
+    errors = [float((np.square(x - wanted) * weights[:, None]).sum()) for x in candidates]
     return torch.from_numpy(candidates[int(np.argmin(errors))]).reshape(image.shape)
 
 
-def _corrected(colors: np.ndarray, wanted: np.ndarray, scale: np.ndarray, saturated: bool) -> np.ndarray:
+def _corrected(colors: np.ndarray, wanted: np.ndarray, weights: np.ndarray, saturated: bool) -> np.ndarray:
     """(P, 3) colors after the fits of `color_corrected`.
 
     Args:
         colors, wanted: (P, 3) of the rendering and of the photograph.
-        scale: (P,) roots of the weights.
+        weights: (P,) of the squared errors.
         saturated: Whether saturated values are fitted, too.
     """
-    usable = np.broadcast_to((scale > 0)[:, None], colors.shape)
+    usable = np.broadcast_to((weights > 0)[:, None], colors.shape)
     is_fitted = usable if saturated else usable & _unsaturated(colors) & _unsaturated(wanted)
     for _ in range(_COLOR_FITS):
         products = [colors[:, i] * colors[:, j] for i in range(3) for j in range(i, 3)]
@@ -147,9 +146,10 @@ def _corrected(colors: np.ndarray, wanted: np.ndarray, scale: np.ndarray, satura
         for channel in range(3):
             rows = chosen[:, channel]
             if rows.any():
-                weights = scale[rows]
-                # The solution of least norm, where there are fewer colors than terms.
-                fitted = np.linalg.lstsq(terms[rows] * weights[:, None], wanted[rows, channel] * weights)[0]
+                # The normal equations, ten of them, take an eighth of the time of a decomposition of all rows. Their
+                # solution of least norm is that of the rows, where there are fewer colors than terms.
+                weighted = terms * (rows * weights)[:, None]
+                fitted = np.linalg.lstsq(weighted.T @ terms, weighted.T @ wanted[:, channel])[0]
                 corrected[:, channel] = terms @ fitted
         colors = corrected.clip(0, 1)
     return colors
