@@ -65,7 +65,7 @@ class DataConfig(Record):
         None,
         "Optimizer updates of a step, each with another photograph: of half the width and height in the first half of"
         " the steps, then a quarter of it, whole ones in the last fifth; 1: whole ones always; auto: 3, which take as"
-        " long, of photographs of 30,000 pixels and two a Gaussian or more, where nothing moves, no teacher or depth"
+        " long, of photographs of 25,000 pixels and two a Gaussian or more, where nothing moves, no teacher or depth"
         " map is fitted to, and all views are there from the start.",
         within=(1, 64),
         rare=True,

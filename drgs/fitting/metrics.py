@@ -417,6 +417,8 @@ def through_renderers(
 ) -> dict | None:
     """How Gaussians look in several renderers, view by view, so that no mean hides one that fails.
 
+    `exact` has the tolerance of pictures, 1/512: PSNR changes by less than 3e-4 dB, in half of the time.
+
     Rasterizers widen every Gaussian by 0.3 px^2 on the screen, so what differs depends on the image size: it is most
     where Gaussians are smaller than a pixel.
 
@@ -445,7 +447,7 @@ def through_renderers(
             for frame in frames:
                 with torch.no_grad():  # pictures of whatever an optimizer may hold
                     seen = colors_only(g, frame.camera.time)
-                    out = render(seen, frame.camera, settings, outputs=())
+                    out = render(seen, frame.camera, settings.for_pictures(), outputs=())
                     out = out if as_photograph is None else as_photograph(out, frame)
                 image = out.rgb.cpu().clamp(0, 1)
                 background = settings.background if is_cut_out else None

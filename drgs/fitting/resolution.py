@@ -41,8 +41,9 @@ FULL = 1 / 2
 WHOLE = 0.8
 """Fraction of the steps from which on an update sees a whole photograph: density control ends there, too."""
 
-LARGE = 30_000
-"""Pixels of a photograph, the median, from which on a step of a plain fit is several updates (docs/one-model.md)."""
+LARGE = 25_000
+"""Pixels of a photograph, the median, from which on a step of a plain fit is several updates: measured with 30,000 at
+most, which makes some of them smaller (docs/one-model.md)."""
 
 PIXELS_A_GAUSSIAN = 2.0
 """Pixels of a photograph over the largest number of Gaussians, from which on likewise: what an update costs by Gaussian
