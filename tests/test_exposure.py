@@ -118,7 +118,6 @@ def test_light_from_one_side_is_no_gain():
     found = estimate_exposure(frames, points)
     assert found.is_clear
     assert not found.is_sound
-    assert not found.warning()
     assert not found.is_confirmed.all()
     kept = found.confirmed()
     assert not kept.log_gains[~found.is_confirmed].any()
@@ -181,6 +180,19 @@ def test_auto_is_as_photographs_that_short_fits_did_not_see_say(tmp_path, monkey
     assert (found["gained"] > 0) == ("estimated" in run.config())
     said = "each has its own" if found["gained"] > 0 else "off, all have the same"
     assert f"change by {found['gained']:+.2f} dB; {said}" in capsys.readouterr().err
+
+
+def test_by_default_gains_are_tried_where_the_fit_is_long(tmp_path, monkeypatch, capsys):
+    """The trial of `auto` runs unasked where it is a tenth of the fit; a shorter fit names the option instead."""
+    monkeypatch.setitem(exposures._TRIAL, "max_steps", 2)
+    write_photographs(tmp_path / "data", GAINS)
+    data = load(tmp_path / "data")
+    long = fit(data, tmp_path / "long", config(max_steps=40), progress=True).run
+    assert "gained" in long.config()["exposure"]
+    assert "dB; " in capsys.readouterr().err
+    short = fit(data, tmp_path / "short", config(max_steps=30), progress=True).run
+    assert "exposure" not in short.config()
+    assert "--exposure auto" in capsys.readouterr().err
 
 
 def test_a_meter_predicts_what_was_left_out():

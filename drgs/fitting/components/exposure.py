@@ -49,6 +49,7 @@ _DARK, _BRIGHT = 8 / 255, 250 / 255  # beyond these a tone curve, or saturation,
 _BORDER = 1.5  # pixels from the border, so that a patch of 3x3 is inside
 _LEAST_MASK = 0.99  # mask, and alpha, that the whole patch must have
 _MOST_OBSERVATIONS = 1_000_000  # photographs times points that are compared: bounds seconds and memory; chosen
+_FIRST_OBSERVATIONS = 250_000  # of them where nobody has asked for gains: 1.5 s; a gain still has hundreds of points
 _HUBER = 1.345  # times the noise: 95 % efficient where it is normal
 _TUKEY = 4.0  # times the noise, beyond which a color is of something else
 # Reweighted steps with Huber's weights, whose result does not depend on the start, and in all; chosen.
@@ -61,8 +62,9 @@ _METERED_PIXELS = 3_000  # of such a rendering, of which nothing but the mean is
 _BLACK = 1 / 255  # least mean brightness whose logarithm is taken
 _CLEAR_STOPS = 0.1  # stops: three times what two sets of points of one capture differ by in what they say
 # Of a short fit that tries gains.
-_TRIAL = {"max_steps": 200, "max_gaussians": 8_000, "updates_per_step": 1, "num_downscales": 0}
-_TRIAL_PIXELS = 12_000  # of its photographs; two such fits take 10 to 20 s on one core
+_TRIAL = {"max_steps": 100, "max_gaussians": 4_000, "updates_per_step": 1, "num_downscales": 0}
+_TRIAL_PIXELS = 6_000  # of its photographs; two such fits take 6 to 12 s on one core
+_TRIAL_SHARE = 0.1  # steps times pixels of both, at most, in those of a fit that tries gains on its own; chosen
 _TRIAL_EVERY = 5  # photographs of which it holds one out
 _LEAST_LOWERED = 0.05  # of the error of held-out halves, at least; captures of one exposure have up to 0.02, by chance
 
@@ -135,9 +137,7 @@ class ExposureEstimate:
         return f"they {change}{left}{trial}"
 
     def warning(self) -> str:
-        """What a fit without gains is to say of photographs that differ, in one line; empty where they do not."""
-        if not self.is_sound:
-            return ""
+        """What a fit without gains is to say of photographs that differ, in one line."""
         spread = " ".join(f"{x:.2f}" for x in self.spread)
         return (
             f"exposure: photographs differ by {spread} stops in R G B (standard deviation, {self.observations} colors "
@@ -166,7 +166,11 @@ class ExposureEstimate:
 
 
 def estimate_exposure(
-    frames: list[Frame], points: np.ndarray, seed: int = 0, shown: np.ndarray | None = None
+    frames: list[Frame],
+    points: np.ndarray,
+    seed: int = 0,
+    shown: np.ndarray | None = None,
+    most: int = _MOST_OBSERVATIONS,
 ) -> ExposureEstimate:
     """Gains of photographs from points of the scene, in closed form under robust weights.
 
@@ -179,10 +183,11 @@ def estimate_exposure(
         seed: Seed of this draw.
         shown: (V, P) bool, which photographs were found to show which points; None: unknown, and every photograph into
             which a point is projected may.
+        most: Photographs times points that are compared.
     """
-    most = max(1, _MOST_OBSERVATIONS // max(1, len(frames)))
-    if len(points) > most:
-        kept = np.sort(np.random.default_rng(seed).choice(len(points), most, replace=False))
+    count = max(1, most // max(1, len(frames)))
+    if len(points) > count:
+        kept = np.sort(np.random.default_rng(seed).choice(len(points), count, replace=False))
         points, shown = points[kept], None if shown is None else shown[:, kept]
     logs, there, columns = _observed(frames, points)
     if shown is not None:
@@ -528,19 +533,23 @@ class ExposureComponent(Component):
         """See `Component`: gains from the points that photographs share, if the option or their use says so."""
         config, use = fit.config, fit.config.data.exposure
         compared = _compared(setup, config)
-        if use == "off":
-            if compared is not None:
-                with Bar("exposure") as bar:
-                    if said := estimate_exposure(fit.frames, compared[0], config.seed, compared[1]).warning():
-                        bar.note(said)
-            return
+        if use in (None, "off"):  # a first look, which costs little
+            if compared is None:
+                return
+            with Bar("exposure") as bar:
+                first = estimate_exposure(fit.frames, compared[0], config.seed, compared[1], _FIRST_OBSERVATIONS)
+                if not first.is_sound:
+                    return
+                if use == "off" or not _is_trial_short(setup):
+                    bar.note(first.warning())
+                    return
         # A trial takes photographs that are there and stand still, and points of which it is known who shows them.
-        is_tried = use == "auto" and compared is not None and not setup.is_active
+        is_tried = use in (None, "auto") and compared is not None and not setup.is_active
         with Bar("exposure") as bar:
             assert setup.points is not None  # initial ones are there
             points, shown = compared or (setup.points, None)
             estimate = estimate_exposure(fit.frames, points, config.seed, shown)
-            is_on = use != "auto" or (estimate.is_sound if is_tried else estimate.is_clear)
+            is_on = use in ("points", "learned") or (estimate.is_sound if is_tried else estimate.is_clear)
             if is_tried and is_on:
                 estimate = estimate.confirmed()
                 gained = _trial(fit, setup.views, estimate)
@@ -584,7 +593,7 @@ class ExposureComponent(Component):
     def join(self, fit: Fit, frame: Frame, setup: Setup) -> list[dict]:
         """See `Component`: gains are estimated again, with the points of the new photograph."""
         use = fit.config.data.exposure
-        if use == "off" or setup.picked_points is None:
+        if use in (None, "off") or setup.picked_points is None:
             return []
         frames = [*fit.photographs(), frame]
         with Bar("exposure") as bar:
@@ -639,13 +648,22 @@ def _compared(setup: Setup, config: FitConfig) -> tuple[np.ndarray, np.ndarray |
         None for who shows them where every photograph may.
     """
     use = config.data.exposure
+    is_asked_for = use not in (None, "off")
     if setup.picked_points is not None:
-        return setup.picked_points(setup.dataset.points) if use != "off" else None
+        return setup.picked_points(setup.dataset.points) if is_asked_for else None
     if setup.times:  # photographs of other times do not show the same
         return None
-    matches = Matches() if setup.matches is None and use != "off" else setup.matches
+    matches = Matches() if setup.matches is None and is_asked_for else setup.matches
     with Bar("points that photographs share") as bar:
         return shared_points(setup.dataset, setup.views, config.seed, matches, bar.stage)
+
+
+def _is_trial_short(setup: Setup) -> bool:
+    """Whether a plain fit is long enough for a trial that nobody has asked for."""
+    config = setup.config
+    pixels = min(frame.camera.width * frame.camera.height for frame in setup.frames)
+    trial = 2 * _TRIAL["max_steps"] * min(_TRIAL_PIXELS, pixels)
+    return not setup.modes and trial <= _TRIAL_SHARE * config.max_steps * pixels
 
 
 def _trial(fit: Fit, views: list[View], estimate: ExposureEstimate) -> float:
