@@ -234,6 +234,19 @@ def refused(path: Path, match: str) -> None:
     assert str(error.value).startswith(str(path))
 
 
+def is_same_state(path: Path, other: Path) -> bool:
+    """Whether two files hold the same numbers: 1E-05 is 1e-05, and the 17th digit of a number may change nothing."""
+    try:
+        (tensors, header), (others, its) = load_state(path), load_state(other)
+    except ValueError:
+        return False
+    same = tensors.keys() == others.keys() and all(
+        x.dtype == others[name].dtype and x.numpy().tobytes() == others[name].numpy().tobytes()
+        for name, x in tensors.items()
+    )
+    return same and header == its
+
+
 def test_damaged_files(saved, tmp_path):
     """Cut short, or with a bit that differs, wherever: one line, and nothing is allocated that the file claims."""
     data = saved.read_bytes()
@@ -246,7 +259,8 @@ def test_damaged_files(saved, tmp_path):
         changed = bytearray(data)
         changed[at] ^= 1 << int(rng.integers(0, 7))
         path.write_bytes(changed)
-        refused(path, str(path))
+        if not is_same_state(path, saved):
+            refused(path, str(path))
 
 
 def test_values_that_cannot_be(saved, tmp_path):
