@@ -11,7 +11,8 @@ neighboring turns, which other work on the machine changes little. Scenes are th
 
 With `--fits` both checkouts run `drgs fit` on each data set, side by side, one thread each, with as many steps as take
 those seconds of processor time: a fit of one step and a short one say what a step takes, for schedules are fractions of
-the steps. Held-out views are those of `drgs fit`; renderers those that metrics.json has.
+the steps. Held-out views are those that both have measured (versions before 0.3 draw at most eight of them in several
+renderers); renderers those that metrics.json has.
 """
 
 from __future__ import annotations
@@ -164,7 +165,7 @@ def fit_for(checkout: Path, data: Path, seconds: int) -> dict:
         steps = max(LEAST, round((seconds - one) / step))
         took = fit_once(checkout, data, folder / "run", steps, seconds)
         metrics = json.loads((folder / "run" / "metrics.json").read_text())
-    seen = {row["name"]: [view["psnr"] for view in row["views"]] for row in metrics["renderers"]["rows"]}
+    seen = {row["name"]: {view["name"]: view["psnr"] for view in row["views"]} for row in metrics["renderers"]["rows"]}
     return {"steps": steps, "took": took, "psnr": seen}
 
 
@@ -186,7 +187,8 @@ def fits_table() -> str:
     for row in (row for row in rows if row["commit"] == rows[-1]["commit"]):
         line = [row["scene"], str(row["seconds"]), f"{row['before']['steps']:,} to {row['now']['steps']:,}"]
         for name in SEEN:
-            old, new = row["before"]["psnr"][name], row["now"]["psnr"][name]
+            before, now = row["before"]["psnr"][name], row["now"]["psnr"][name]
+            old, new = zip(*((before[view], now[view]) for view in before if view in now), strict=True)
             mean, worst = statistics.mean(new) - statistics.mean(old), min(new) - min(old)
             line.append(f"{statistics.mean(new):.2f} ({mean:+.2f} / {worst:+.2f})")
             gains.setdefault((row["seconds"], name), []).append((mean, worst))
