@@ -185,7 +185,9 @@ def fits_table() -> str:
     lines, gains = [], {}
     rows = read_rows(FIT_ROWS)
     for row in (row for row in rows if row["commit"] == rows[-1]["commit"]):
-        line = [row["scene"], str(row["seconds"]), f"{row['before']['steps']:,} to {row['now']['steps']:,}"]
+        both = row["before"], row["now"]
+        took, steps = (" / ".join(f"{round(x[key]):,}" for x in both) for key in ("took", "steps"))
+        line = [row["scene"], str(row["seconds"]), took, steps]
         for name in SEEN:
             before, now = row["before"]["psnr"][name], row["now"]["psnr"][name]
             old, new = zip(*((before[view], now[view]) for view in before if view in now), strict=True)
@@ -194,12 +196,12 @@ def fits_table() -> str:
             gains.setdefault((row["seconds"], name), []).append((mean, worst))
         lines.append(line)
     for seconds in dict.fromkeys(seconds for seconds, _ in gains):
-        line = ["**mean**", str(seconds), ""]
+        line = ["**mean**", str(seconds), "", ""]
         for name in SEEN:
             mean, worst = (statistics.mean(x) for x in zip(*gains[seconds, name], strict=True))
             line.append(f"{mean:+.2f} / {worst:+.2f}")
         lines.append(line)
-    return markdown_table(["data", "seconds", "steps", *(f"`{name}`" for name in SEEN)], lines)
+    return markdown_table(["data", "seconds", "taken", "steps", *(f"`{name}`" for name in SEEN)], lines)
 
 
 def page() -> None:

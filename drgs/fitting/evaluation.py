@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 from drgs.cameras.sizes import reduced_size
 from drgs.display.pictures import file_names
 from drgs.fitting.components.base import RunViews
-from drgs.fitting.components.exposure import NETWORK, Exposure, Meter
 from drgs.fitting.components.table import COMPONENTS
 from drgs.fitting.frames import Frame, frames_for, load_dataset
 from drgs.fitting.metrics import VIEW_PICTURES, Lpips, evaluate, through_renderers, write_metrics
@@ -56,15 +55,30 @@ def evaluate_run(
     stated = {view.name: view.camera for view in dataset.split()[0]}
     train, test = recorded.with_refined_poses(dataset).split()
     more: dict[str, Any] = {} if scale == 1 else {"scale": scale}
+    names = fitted_views(run, recorded)
     if recorded.is_active:  # the rest of the training split was never seen
-        more |= {"fitted": fitted_views(run), "pool_leak": run.config().get("pool_leak")}
-        train = [view for view in train if view.name in more["fitted"]]
+        more |= {"fitted": names, "pool_leak": run.config().get("pool_leak")}
+        train = [view for view in train if view.name in names]
     views = {"test": test, "train": train, "all": train + test}[split]
     if not views:
         raise ValueError(f"eval: split {split} must hold a view, holds none ({dataset.split_rule()}); use --split")
     frames = frames_for(views, config.data, _most_pixels(views, config.data.max_pixels, scale))
-    meter = _meter(run, loaded, train)
     _check_pictures(output, recorded, split, frames)
+    known = RunViews(
+        scene,
+        config.settings,
+        refined=bool(recorded.refined),
+        stated=[stated[view.name] for view in train],
+        cameras=[view.camera for view in train],
+        held_out=frames if split == "test" and scale == 1 else [],
+        names=names,
+        photographs=lambda: frames_for(train, config.data),
+        networks=loaded.networks,
+    )
+    options: dict[str, Any] = {}
+    for component in COMPONENTS.values():
+        options |= component.run_evaluation(known)
+        more |= component.run_metrics(known)
     result = evaluate(
         scene,
         frames,
@@ -73,11 +87,8 @@ def evaluate_run(
         pictures=run.renders / split,
         segmentation=_segmentation(loaded, dataset, frames),
         moving=moving_labels(dataset) if recorded.times else frozenset(),
-        as_photograph=meter,
+        **options,
     )
-    cameras = [stated[view.name] for view in train], [view.camera for view in train]
-    held_out = frames if split == "test" and scale == 1 else []
-    more |= _component_metrics(RunViews(scene, config.settings, bool(recorded.refined), *cameras, held_out))
     wanted = renderers_to_measure(config.renderers, config.settings, renderer, config.data.undistort == "off")
     seen = scene.at(frames[0].camera.time)
     means = seen.means.detach().double().cpu().numpy() + seen.origin
@@ -90,19 +101,9 @@ def evaluate_run(
         split_rule=dataset.split_rule(),
         gaussians=len(loaded.gaussians),
         **{name: getattr(loaded, name) for name in ("step", "seconds", "bad_steps")},
-        renderers=through_renderers(scene, frames, wanted, split, as_photograph=meter),
+        renderers=through_renderers(scene, frames, wanted, split, as_photograph=options.get("as_photograph")),
         **more,
     )
-
-
-def _meter(run: Run, loaded: LoadedRun, views: list[View]) -> Meter | None:
-    """How the camera exposed the views that a run was fitted to; None as `Exposure.meter`, and without gains."""
-    if NETWORK not in loaded.networks:
-        return None
-    names, config = fitted_views(run, loaded.record), loaded.record.config
-    gains = loaded.networks[NETWORK]["log_gains"].numpy()
-    module = Exposure(names, gains, False, config.settings.background)
-    return module.meter(frames_for(views, config.data), loaded.scene, config.settings)
 
 
 def _check_pictures(output: LockedFolder, recorded: FitRecord, split: str, frames: list[Frame]) -> None:
@@ -110,14 +111,6 @@ def _check_pictures(output: LockedFolder, recorded: FitRecord, split: str, frame
     kinds = VIEW_PICTURES if recorded.semantics else VIEW_PICTURES[:1]
     names = file_names([frame.name for frame in frames])
     output.check(f"renders/{split}/{name}.{kind}" for name in names for kind in kinds)
-
-
-def _component_metrics(run: RunViews) -> dict[str, Any]:
-    """The components' part of the metrics of a run that is measured again."""
-    metrics: dict[str, Any] = {}
-    for component in COMPONENTS.values():
-        metrics |= component.run_metrics(run)
-    return metrics
 
 
 def _dataset_of(recorded: FitRecord, strict: bool) -> Dataset:

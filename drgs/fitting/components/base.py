@@ -202,6 +202,9 @@ class RunViews:
         stated: Cameras of the training photographs that were fitted to, as the data set states them.
         cameras: The same as the run has them.
         held_out: Photographs that were not fitted to, at the size of the fit; none where others are measured.
+        names: Names of the photographs that were fitted to, in the order of the fit.
+        photographs: Reads these, at the size of the fit.
+        networks: Networks of the fit, by name: what `torch.nn.Module.load_state_dict` takes.
     """
 
     scene: Scene
@@ -210,6 +213,9 @@ class RunViews:
     stated: list[Camera]
     cameras: list[Camera]
     held_out: list[Frame]
+    names: list[str]
+    photographs: Callable[[], list[Frame]]
+    networks: Mapping[str, Mapping[str, torch.Tensor]]
 
 
 class Component:
@@ -390,6 +396,11 @@ class Component:
     def load_scene(cls, scene: Scene, checkpoint: Checkpoint) -> Scene:
         """As `scene`, of a checkpoint; for rendering, not fitted."""
         return scene
+
+    @classmethod
+    def run_evaluation(cls, run: RunViews) -> dict[str, Any]:
+        """Arguments of `drgs.fitting.metrics.evaluate` where a run is measured again."""
+        return {}
 
     @classmethod
     def run_metrics(cls, run: RunViews) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from drgs.cameras.sizes import reduced_size
 from drgs.data.resampling import resize_area
 from drgs.display.progress import Bar
 from drgs.ellipsoids import Y_00, Scene, colors_only
-from drgs.fitting.components.base import Checkpoint, Component, Fit, Setup
+from drgs.fitting.components.base import Checkpoint, Component, Fit, RunViews, Setup
 from drgs.fitting.frames import Frame, frames_for
 from drgs.fitting.losses import psnr
 from drgs.fitting.networks import Network
@@ -589,6 +589,14 @@ class ExposureComponent(Component):
     def evaluation(self, fit: Fit, held_out: list[Frame]) -> dict[str, Any]:
         """See `Component`."""
         return {"as_photograph": self.meter(fit)}
+
+    @classmethod
+    def run_evaluation(cls, run: RunViews) -> dict[str, Any]:
+        """See `Component`."""
+        if NETWORK not in run.networks:
+            return {}
+        module = Exposure(run.names, run.networks[NETWORK]["log_gains"].numpy(), False, run.settings.background)
+        return {"as_photograph": module.meter(run.photographs(), run.scene, run.settings)}
 
     def join(self, fit: Fit, frame: Frame, setup: Setup) -> list[dict]:
         """See `Component`: gains are estimated again, with the points of the new photograph."""
