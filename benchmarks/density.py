@@ -2,11 +2,12 @@
 
     python benchmarks/density.py [--scenes banana ...] [--rules error ...] [--steps 300] [--gaussians 8000] [--page]
 
-Appends one row a fit to benchmarks/density.jsonl as it ends and leaves out what is there; `--page` writes the table of
-docs/real-data.md and docs/data/density.csv. Rules were tried on CHOOSING, and those that were best there were then
-measured on SHOWING; `drgs fit` has none of them. A rule weighs the Gaussians at each step of density control by what a
-few photographs or the gradients say; copies of one share its weight. Seconds are those that the process computed in its
-steps, the photographs of the rule included. Made scenes are folders of `--made` (docs/real-data.md has their commands).
+Appends one row a fit to benchmarks/density.jsonl as it ends and leaves out what is there; `--page` writes
+docs/data/density.csv, of which docs/real-data.md tells. Rules were tried on CHOOSING, and those that were best there
+were then measured on SHOWING; `drgs fit` has none of them. A rule weighs the Gaussians at each step of density control
+by what a few photographs or the gradients say; copies of one share its weight. Seconds are those that the process
+computed in its steps, the photographs of the rule included. Made scenes are folders of `--made` (docs/real-data.md has
+their commands).
 """
 
 from __future__ import annotations
@@ -27,7 +28,6 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 import torch  # noqa: E402
 from fits import psnr_by_renderer, split_of  # noqa: E402
-from pages import fill_between  # noqa: E402
 from steps import PATHS, SEEN, gains, lines, took_of  # noqa: E402
 from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
@@ -46,14 +46,11 @@ from drgs.fitting.trainer import Trainer  # noqa: E402
 from drgs.integrator import render  # noqa: E402
 from drgs.pruning import POWER  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.studies.tables import markdown_table  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "density.jsonl"
-PAGE = ROOT / "docs" / "real-data.md"
 CHOOSING = ("banana", "fern", "office", "still0")
 SHOWING = ("head", "statue", "street", "lego", "watch", "room22")
 MADE = ("still0", "room22")
-TOLD = ("error", "error of 4", "error of 4, halved", "error of 1 in 10 steps", "gradient")
 KEY = ("scene", "rule", "trained", "seed", "offset", "max_steps", "max_pixels", "max_gaussians")
 
 Worths = tuple[torch.Tensor, torch.Tensor]
@@ -315,27 +312,21 @@ def fit(
     return {**dict(zip(KEY, key, strict=True)), "psnr": psnr, "seconds": seconds, **ran()}
 
 
-def write_page(rows: list[dict]) -> None:
-    """The page's table of the rules that were measured on both halves, and the data file of all."""
-    table, everything = [], []
+def write_data(rows: list[dict]) -> None:
+    """The data file: every rule by capture, then over its captures."""
+    seen = [f"{name}: mean / worst, dB" for name in SEEN]
+    everything = [["rule", "trained", "steps", "Gaussians", "scene", "fits", *seen, "time"]]
     for trained, steps, gaussians in sorted({(x["trained"], x["max_steps"], x["max_gaussians"]) for x in rows})[::-1]:
         own = [x for x in rows if (x["trained"], x["max_steps"], x["max_gaussians"]) == (trained, steps, gaussians)]
-        size = ["all" if trained == "any" else f"`{trained}`", f"{steps:,}", f"{gaussians:,}"]
         for rule in dict.fromkeys(row["rule"] for row in own if row["rule"] != "opacity"):
             scenes = [x for x in (*CHOOSING, *SHOWING) if gains(own, rule, trained, [x], "fast", "opacity")[0]]
-            for scene in scenes:
+            for some in [[scene] for scene in scenes] + ([scenes] if len(scenes) > 1 else []):
                 took = ""
-                if not any("cuda" in row["machine"] for row in own):  # cards were shared by many fits
-                    took = f"{took_of(own, rule, trained, scene) / took_of(own, 'opacity', trained, scene):.2f}"
-                cells = lines(own, rule, trained, [scene], "opacity")
-                everything.append([rule, trained, f"{steps}", f"{gaussians}", scene, *cells, took])
-            if len(scenes) > 1 and rule in TOLD:
-                table.append([rule, *size, ", ".join(scenes), *lines(own, rule, trained, scenes, "opacity")])
-    heads = ["drawn by", "fitted for", "steps", "Gaussians", "captures", "fits", *(f"`{seen}`" for seen in SEEN)]
-    fill_between(PAGE, "density", markdown_table(heads, table))
-    seen = [f"{name}: mean / worst, dB" for name in SEEN]
-    head = ["rule", "trained", "steps", "Gaussians", "scene", "fits", *seen, "time"]
-    write_csv(PAGE_DATA / "density.csv", [head, *everything])
+                if len(some) == 1 and not any("cuda" in row["machine"] for row in own):  # many fits shared a card
+                    took = f"{took_of(own, rule, trained, *some) / took_of(own, 'opacity', trained, *some):.2f}"
+                cells = lines(own, rule, trained, some, "opacity")
+                everything.append([rule, trained, f"{steps}", f"{gaussians}", ", ".join(some), *cells, took])
+    write_csv(PAGE_DATA / "density.csv", everything)
 
 
 def main() -> None:
@@ -350,7 +341,9 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=8_000)
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the captures")
     parser.add_argument("--made", type=Path, default=ROOT / "runs" / "made", help="folder of the made scenes")
-    parser.add_argument("--page", action="store_true", help="fit nothing, write the table of the rows that there are")
+    parser.add_argument(
+        "--page", action="store_true", help="fit nothing, write the data file of the rows that there are"
+    )
     args = parser.parse_args()
     size = {"max_steps": args.steps, "max_pixels": args.pixels, "max_gaussians": args.gaussians}
     for unit, (seed, offset) in enumerate(UNITS[: args.units]):
@@ -364,7 +357,7 @@ def main() -> None:
                 seen = [f"{sum(x) / len(x):.2f}/{min(x):.2f}" for x in row["psnr"].values()]
                 print(scene, seed, rule, *seen, f"{row['seconds']:.1f} s", flush=True)
     if args.page:
-        write_page(read_rows(ROWS))
+        write_data(read_rows(ROWS))
 
 
 if __name__ == "__main__":

@@ -4,9 +4,10 @@
                                 [--steps 300] [--page]
 
 Appends one row a fit to benchmarks/depths.jsonl as it ends, leaves out what is there of this machine, then writes the
-table of docs/real-data.md and docs/data/depths.csv. Ways are weights of the term, the first and the last, and whether
-what is behind a map counts as much (`both sides`); `relative` are maps m = 0.7 / z + 0.1 of the training views in place
-of z, so that scale and shift have to be found. All ways but `off` are `--depth on`; a row has what `auto` found, too.
+table of docs/real-data.md, docs/data/depths.csv and depths-means.csv. Ways are weights of the term, the first and the
+last, and whether what is behind a map counts as much (`both sides`); `relative` are maps m = 0.7 / z + 0.1 of the
+training views in place of z, so that scale and shift have to be found. All ways but `off` are `--depth on`; a row has
+what `auto` found, too.
 `--views 6` fits six training views, evenly spaced. Made rooms are COLMAP data sets, whose depth maps this script adds.
 Seconds are those that the process computed in its steps; the ways of a scene take turns. Fits of two machines are not
 compared.
@@ -65,6 +66,8 @@ WEIGHTS = {
 """Way -> the first and the last weight of the term, and the factor of what is behind the map."""
 DEFAULT = WEIGHTS["3 to 0.3"]
 KEY = ("scene", "way", "trained", "views", "steps", "seed", "offset")
+TOLD = (("3 to 0.3", "300"), ("3 to 0.3, both sides", "300"), ("1 to 0.1, both sides", "1500"))
+"""Ways and steps of the page's table, of fits of all views; all are in the data file."""
 
 
 def dataset_of(scene: str, data: Path, made: Path) -> Dataset:
@@ -189,7 +192,10 @@ def lines(rows: list[dict]) -> list[list[str]]:
 def write_page(rows: list[dict]) -> None:
     """The page's table, and the data file of all fits."""
     heads = ["weight", "fitted for", "views", "steps", "scenes", "fits", "PSNR", "worst", "depth error", "step"]
-    fill_between(PAGE, "depths", markdown_table(heads, lines(rows)))
+    found = lines(rows)
+    write_csv(PAGE_DATA / "depths-means.csv", [heads, *found])
+    told = [[way, *cells[:-1]] for way, _, views, *cells in found if views == "all" and (way, cells[0]) in TOLD]
+    fill_between(PAGE, "depths", markdown_table([heads[0], *heads[3:-1]], told))
     everything = [[*KEY, *(f"{seen}, dB" for seen in SEEN), "cc_psnr", "ssim", "depth_error", "used", "seconds"]]
     for row in rows:
         numbers = [*(row["psnr"][seen] for seen in SEEN), *(row[name] for name in ("cc_psnr", "ssim", "depth_error"))]

@@ -136,7 +136,7 @@ def cells(rows: list[dict], rule: str, views: int, steps: int, scenes: Sequence[
 
 
 def write_page(rows: list[dict]) -> None:
-    """The page's table of `SHOWN`, and the data file of every rule and scene."""
+    """The page's table of `SHOWN`, seen with `fast`, and the data file of every rule and scene."""
     kinds = sorted({(row["views"] or 99, row["views"], row["max_steps"]) for row in rows})
     rules = [rule for rule in dict.fromkeys(row["rule"] for row in rows) if rule != "none"]
     table, everything = [], [["rule", "views", "steps", "scene", "fits", *(f"{x}: mean / worst, dB" for x in SEEN)]]
@@ -144,18 +144,15 @@ def write_page(rows: list[dict]) -> None:
         told = [str(views or "all"), f"{steps:,}"]
         for half, scenes in (("tried on", CHOOSING), ("shown on", SHOWING)):
             own = [scene for scene in scenes if cells(rows, SHOWN, views, steps, [scene])]
-            table += [[*told, scene, *cells(rows, SHOWN, views, steps, [scene])] for scene in own]
-            if len(own) > 1:
-                table.append([*told, f"**{half} these {len(own)}**", *cells(rows, SHOWN, views, steps, own)])
+            if own:
+                name = f"{half} these {len(own)}" if len(own) > 1 else own[0]
+                table.append([*told, name, cells(rows, SHOWN, views, steps, own)[1]])
         for rule in rules:
-            for scene in (*CHOOSING, *SHOWING):
-                if found := cells(rows, rule, views, steps, [scene]):
-                    everything.append([rule, *told, scene, *found])
-    fill_between(
-        PAGE,
-        "overfitting",
-        markdown_table(["views", "steps", "capture", "fits", *(f"`{seen}`" for seen in SEEN)], table),
-    )
+            for scenes in (CHOOSING, SHOWING):
+                own = [scene for scene in scenes if cells(rows, rule, views, steps, [scene])]
+                for some in [[scene] for scene in own] + ([own] if len(own) > 1 else []):
+                    everything.append([rule, *told, ", ".join(some), *cells(rows, rule, views, steps, some)])
+    fill_between(PAGE, "overfitting", markdown_table(["views", "steps", "captures", f"`{SEEN[0]}`"], table))
     write_csv(PAGE_DATA / "overfitting.csv", everything)
 
 

@@ -132,14 +132,14 @@ def table(rows: list[dict]) -> str:
 
 def short_table(rows: list[dict]) -> str:
     """What the page has of `table`: fits of stated poses, with the rates that are the default."""
-    heads = ["fit", "for", "held out", "pixels", "steps", "Gaussians", "minutes", "PSNR"]
+    heads = ["fit", "for", "pixels", "steps", "Gaussians", "minutes", "PSNR"]
     lines = []
     for row in rows:
         if row["name"].endswith(("-sfm", "rates of 3DGS")):
             continue
         took = row.get("processor_seconds")
         minutes = f"{took / 60:.1f}" if took else f"{row['seconds'] / 60:.1f} (clock)"
-        cells = [row["name"], row["renderers"], str(row["views"][1]), "x".join(map(str, row["size"]))]
+        cells = [row["name"], row["renderers"], "x".join(map(str, row["size"]))]
         lines.append([*cells, f"{row['steps']:,}", f"{row['gaussians']:,}", minutes, f"{row['psnr']:.2f}"])
     return markdown_table(heads, lines)
 

@@ -2,11 +2,11 @@
 
     python benchmarks/steps.py [--scenes banana ...] [--rules size ...] [--units 3] [--trained fast] [--page]
 
-Appends one row a fit to benchmarks/steps.jsonl as it ends and leaves out what is there, then writes the table of
-docs/real-data.md and docs/data/steps.csv. Rules were tried on CHOOSING, and the one that was best there was then
-measured on SHOWING; fits of a scene take turns, one thread. Rules multiply the steps that Adam has made; `drgs fit` has
-none of them. Seconds are those that the process computed in its steps, whatever ran beside it. Averages over the last
-steps are of the same fits. Made scenes are folders of `--made` (docs/real-data.md has their commands).
+Appends one row a fit to benchmarks/steps.jsonl as it ends and leaves out what is there, then writes
+docs/data/steps.csv, of which docs/real-data.md tells. Rules were tried on CHOOSING, and the one that was best there was
+then measured on SHOWING; fits of a scene take turns, one thread. Rules multiply the steps that Adam has made; `drgs
+fit` has none of them. Seconds are those that the process computed in its steps, whatever ran beside it. Averages over
+the last steps are of the same fits. Made scenes are folders of `--made` (docs/real-data.md has their commands).
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 import torch  # noqa: E402
 from fits import psnr_by_renderer, split_of  # noqa: E402
-from pages import fill_between  # noqa: E402
 from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
 
@@ -39,10 +38,8 @@ from drgs.fitting.start import start_plain  # noqa: E402
 from drgs.fitting.trainer import Trainer  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.studies.statistics import Unit, estimate  # noqa: E402
-from drgs.studies.tables import markdown_table  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "steps.jsonl"
-PAGE = ROOT / "docs" / "real-data.md"
 CHOOSING = ("banana", "fern", "office", "still0")
 SHOWING = ("head", "statue", "lego", "bonsai", "street", "room22")
 MADE = ("still0", "still7", "room21", "room22")
@@ -236,24 +233,18 @@ def took_of(rows: list[dict], rule: str, trained: str, scene: str) -> float:
     return statistics.mean(row["seconds"] for row in same)
 
 
-def write_page(rows: list[dict]) -> None:
-    """The page's table of the rule that was best, and the data file of all."""
-    table = []
-    for trained, told in (("fast", "`fast`"), ("any", "all")):
-        for half, scenes in (("tried on", CHOOSING), ("shown on", SHOWING)):
-            own = [scene for scene in scenes if gains(rows, "size", trained, [scene], "fast")[0]]
-            table += [[told, scene, *lines(rows, "size", trained, [scene])] for scene in own]
-            if len(own) > 1:
-                table.append([told, f"**{half} these {len(own)}**", *lines(rows, "size", trained, own)])
-    heads = ["fitted for", "capture", "fits", *(f"`{seen}`" for seen in SEEN)]
-    fill_between(PAGE, "steps", markdown_table(heads, table))
+def write_data(rows: list[dict]) -> None:
+    """The data file: every rule by capture, then over those that it was tried on and those that it was shown on."""
     everything = [["rule", "trained", "scene", "fits", *(f"{seen}: mean / worst, dB" for seen in SEEN), "time"]]
     for trained in sorted({row["trained"] for row in rows}, reverse=True):
         for rule in dict.fromkeys(row["rule"] for row in rows if row["rule"] != "Adam"):
-            for scene in (*CHOOSING, *SHOWING):
-                if gains(rows, rule, trained, [scene], "fast")[0]:
+            for scenes in (CHOOSING, SHOWING):
+                own = [scene for scene in scenes if gains(rows, rule, trained, [scene], "fast")[0]]
+                for scene in own:
                     took = f"{took_of(rows, rule, trained, scene) / took_of(rows, 'Adam', trained, scene):.2f}"
                     everything.append([rule, trained, scene, *lines(rows, rule, trained, [scene]), took])
+                if len(own) > 1:
+                    everything.append([rule, trained, ", ".join(own), *lines(rows, rule, trained, own), ""])
     write_csv(PAGE_DATA / "steps.csv", everything)
 
 
@@ -265,7 +256,9 @@ def main() -> None:
     parser.add_argument("--units", type=int, default=1, help="seeds, each with other views held out")
     parser.add_argument("--trained", default="fast", help="as `drgs fit --for` takes it")
     parser.add_argument("--made", type=Path, default=ROOT / "runs" / "made", help="folder of the made scenes")
-    parser.add_argument("--page", action="store_true", help="fit nothing, write the table of the rows that there are")
+    parser.add_argument(
+        "--page", action="store_true", help="fit nothing, write the data file of the rows that there are"
+    )
     args = parser.parse_args()
     for unit, (seed, offset) in enumerate(UNITS[: args.units]):
         for scene in [] if args.page else args.scenes:
@@ -278,7 +271,7 @@ def main() -> None:
                     add_row(ROWS, row)
                 mean = [sum(row["psnr"]["fast"]) / len(row["psnr"]["fast"]) for row in rows]
                 print(scene, seed, rule, *(f"{x:.2f}" for x in mean), f"{rows[0]['seconds']:.1f} s", flush=True)
-    write_page(read_rows(ROWS))
+    write_data(read_rows(ROWS))
 
 
 if __name__ == "__main__":
