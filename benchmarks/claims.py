@@ -67,6 +67,13 @@ COLUMNS = {
     "forward": "forward mode",
     "fisher": "Fisher diagonal",
 }
+SHOWN = {
+    "image": ["image"],
+    "worst gradient": [key for key in COLUMNS if key not in ("image", "forward", "fisher")],
+    "forward mode": ["forward"],
+    "Fisher diagonal": ["fisher"],
+}
+"""Columns of the page, over all settings of a traversal; the data file has all of `COLUMNS` and settings."""
 
 Scene = tuple[Gaussians, Camera]
 
@@ -212,8 +219,14 @@ def text(result: dict[str, Any]) -> str:
         f"`exact` against the oracle without a cut. The largest error over {result['scenes']} scenes of each kind; the "
         "image's absolute, the others relative in norm, of the Fisher diagonal to the group's largest entry."
     )
-    lines = [[row["scene"], row["settings"], *(cell(row.get(key)) for key in COLUMNS)] for row in result["rows"]]
-    return f"{paragraph(told)}\n\n{markdown_table(['scene', 'settings', *COLUMNS.values()], lines)}"
+    lines = []
+    for kind in SCENES:
+        for traversal in ("tiles", "bvh"):
+            some = [x for x in result["rows"] if x["scene"] == kind and ("bvh" in x["settings"]) == (traversal == "bvh")]
+            worst = [max(row[key] for row in some for key in keys if key in row) for keys in SHOWN.values()]
+            lines.append([kind, f"`{traversal}`", *map(cell, worst)])
+    heads = ["scene", "traversal", *SHOWN]
+    return f"{paragraph(told)}\n\n{markdown_table(heads, lines)}"
 
 
 def main() -> int:
