@@ -222,7 +222,9 @@ def text(result: dict[str, Any]) -> str:
     lines = []
     for kind in SCENES:
         for traversal in ("tiles", "bvh"):
-            some = [x for x in result["rows"] if x["scene"] == kind and ("bvh" in x["settings"]) == (traversal == "bvh")]
+            some = [
+                x for x in result["rows"] if x["scene"] == kind and ("bvh" in x["settings"]) == (traversal == "bvh")
+            ]
             worst = [max(row[key] for row in some for key in keys if key in row) for keys in SHOWN.values()]
             lines.append([kind, f"`{traversal}`", *map(cell, worst)])
     heads = ["scene", "traversal", *SHOWN]

@@ -140,7 +140,7 @@ def feature_sentence(rows: list[dict]) -> str:
 
 def main() -> int:
     rows = rows_of_runs(ROWS, measured, __doc__)
-    text = [studies.stamp("label_errors"), label_table(rows), feature_sentence(rows)]
+    text = [f"`python benchmarks/label_errors.py`, {studies.made(rows)}.", label_table(rows), feature_sentence(rows)]
     print("\n\n".join(text))
     if PAGE.exists():
         fill_between(PAGE, "label-errors", "\n\n".join(text))

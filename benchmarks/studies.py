@@ -47,6 +47,7 @@ __all__ = [
     "dataset",
     "difference",
     "folder",
+    "made",
     "rank_correlation",
     "read_rows",
     "stamp",
@@ -135,6 +136,12 @@ def stamp(script: str) -> str:
     """The line that says where and when a study ran."""
     at = ran()
     return f"`python benchmarks/{script}.py`, {at['machine']}, {at['date']}, commit {at['commit']}."
+
+
+def made(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Where and when rows were measured, the last of them named."""
+    commits = dict.fromkeys(row["commit"] for row in rows)
+    return f"{rows[-1]['machine']}, {rows[-1]['date']}, commit{'s' * (len(commits) > 1)} {', '.join(commits)}"
 
 
 def write_rows(path: Path, rows) -> None:
