@@ -52,7 +52,7 @@ from drgs.selection.pool import Pool, Selection  # noqa: E402
 from drgs.selection.spread import farthest  # noqa: E402
 from drgs.studies.cells import FAILURES, Metric  # noqa: E402
 from drgs.studies.cells import Study as StudyOfFits  # noqa: E402
-from drgs.studies.statistics import FEWEST_UNITS, at_views, coverage, differences, estimate, over_views, unit_of  # noqa: E402
+from drgs.studies.statistics import FEWEST_UNITS, at_views, coverage, differences, estimate, over_views  # noqa: E402
 from drgs.studies.tables import markdown_table, paragraph  # noqa: E402
 from drgs.train import fit  # noqa: E402
 
@@ -456,11 +456,10 @@ def compared(rows: Rows, metric: Metric, other: str) -> str:
     return f"{f'**{mean}**' if is_clear else mean} {interval}"
 
 
-def main_table(rows: Rows) -> str:
-    """A row a group of scenes, metric and other policy."""
+def main_lines(rows: Rows) -> list[list[str]]:
+    """The heads, and a row a group of scenes, metric and other policy."""
     shown = [f"{count} views" for count in SHOWN]
-    heads = ["", "`region` less", "units", "wins", "3 to 12 views", *shown, "detectable"]
-    lines = []
+    lines = [["", "`region` less", "units", "wins", "3 to 12 views", *shown, "detectable"]]
     for metric in METRICS:
         over = [over_views(row, metric.key) for row in rows]
         for group, scenes_ in GROUPS.items():
@@ -474,22 +473,7 @@ def main_table(rows: Rows) -> str:
                 at = [compared([x for x in at_views(rows, n) if x["scene"] in scenes_], metric, other) for n in SHOWN]
                 counted = [str(whole.units), str(whole.positive), compared(own, metric, other)]
                 lines.append([f"{group}, {metric.title}", f"`{other}`", *counted, *at, detectable])
-    return markdown_table(heads, lines)
-
-
-def unit_table(rows: Rows) -> str:
-    """A row an object, or a capture: PSNR with 12 views, and picks of ten that see it, mean over starts and splits."""
-    heads = ["scene", "object", "units", *(f"`{policy}`" for policy in POLICIES)]
-    lines = []
-    for scene, name in dict.fromkeys((row["scene"], row["object"]) for row in rows):
-        mine = [row for row in rows if (row["scene"], row["object"]) == (scene, name)]
-        cells = []
-        for policy in POLICIES:
-            own = [row for row in mine if row["policy"] == policy]
-            mean = np.mean([row["metrics"]["psnr"] for row in own]) if own else None
-            cells.append("" if mean is None else f"{mean:.2f} ({np.mean([row['seeing'] for row in own]):.1f})")
-        lines.append([scene, name, str(len({unit_of(row) for row in mine})), *cells])
-    return markdown_table(heads, lines)
+    return lines
 
 
 def by_start(rows: Rows) -> str:
@@ -529,15 +513,17 @@ def write_page() -> None:
     head = (
         f"{len(told)} fits by `python benchmarks/regions.py`, {failed} of them failed, {processor:.0f} minutes of "
         f"processor, {told[0]['machine']}, {told[0]['date']}, commits {commits} ([rows](../benchmarks/regions.jsonl), "
-        "[by fit](data/active-region.csv)). `region` less another policy, mean and 95 % interval, bold where that "
-        f"excludes 0 and there are {FEWEST_UNITS} units; *wins*: units in which `region` is better, 3 to 12 views; "
-        f"*detectable*: what a t test over scenes would find in 80 % of such studies. {coverage(3, 18):.0%} of such "
-        "intervals of three scenes hold the true mean where scenes differ as much as their units do, 94 % where they "
-        "do not."
+        "[by fit](data/active-region.csv), [IoU, and what such a study finds](data/active-region-differences.csv)). "
+        "PSNR of the object with `region` less that of another policy, mean and 95 % interval, bold where that "
+        f"excludes 0 and there are {FEWEST_UNITS} units; *wins*: units in which `region` is better, 3 to 12 views. "
+        f"{coverage(3, 18):.0%} of such intervals of three scenes hold the true mean where scenes differ as much as "
+        "their units do."
     )
-    below = "PSNR with 12 views, and in parentheses how many of ten picks see the object; means over starts and splits:"
-    text = [paragraph(head), main_table(rows), paragraph(by_start(rows)), below, unit_table(rows)]
+    heads, *lines = main_lines(rows)
+    told = [[line[0].split(",")[0], *line[1:-1]] for line in lines if METRICS[0].title in line[0]]
+    text = [paragraph(head), markdown_table(["scenes", *heads[1:-1]], told), paragraph(by_start(rows))]
     fill_between(PAGE, "regions", "\n\n".join(text))
+    write_csv(PAGE_DATA / "active-region-differences.csv", [["scenes, metric", *heads[1:]], *lines])
     write_csv(PAGE_DATA / "active-region.csv", data_lines(rows))
 
 
