@@ -282,7 +282,7 @@ def updates_table(rows: list[dict]) -> list[list[str]]:
         scenes = list(dict.fromkeys(row["scene"] for row, _ in pairs))
         for some in [*([scene] for scene in scenes), *([scenes] if len(scenes) > 1 else [])]:
             own = [pair for pair in pairs if pair[0]["scene"] in some]
-            name = some[0] if len(some) == 1 else f"**these {len(some)}**"
+            name = some[0] if len(some) == 1 else f"**{', '.join(some)}**"
             ratio = statistics.mean(row["seconds"] / other["seconds"] for row, other in own)
             cells = [gain(own, seen) for seen in SEEN]
             lines.append([change, f"{pixels:,}", f"{steps:,}", name, *cells, f"{ratio:.2f}"])
@@ -295,7 +295,8 @@ def write_page() -> None:
     heads = ["a step has", "pixels", "steps", "capture", *(f"`{seen}`" for seen in SEEN), "time"]
     lines = updates_table(rows)
     write_csv(PAGE_DATA / "schedules-updates.csv", [heads, *lines])
-    fill_between(PAGE, "updates", markdown_table(heads[1:], [line[1:] for line in lines if line[0] == "3 updates"]))
+    told = [line[1:] for line in lines if line[0] == "3 updates" and line[3].startswith("**")]
+    fill_between(PAGE, "updates", markdown_table(heads[1:], told))
     timed, shares = [], []
     for row in read_rows(TIMES):
         took, size = row["seconds"], "x".join(map(str, row["size"]))
@@ -305,12 +306,12 @@ def write_page() -> None:
         half = others[1] + 0.1 * took["exact, 0.01"][1]
         share = f"{0.1 * took['exact'][0] / whole:.2f}"
         ratios = (whole / took["fast"][0], cut / took["fast"][0], half / cut)
-        shares.append([row["scene"], size, share, *(f"{x:.2f}" for x in ratios)])
+        shares.append([row["scene"], share, *(f"{x:.2f}" for x in ratios)])
     write_csv(
         PAGE_DATA / "schedule-times.csv",
         [["capture", "size", "renderer, tolerance", "ms", "ms at half the size", "ms at a quarter"], *timed],
     )
-    heads = ["capture", "size", "share of `exact`", "step / `fast`", "with a tolerance", "half the size"]
+    heads = ["capture", "share of `exact`", "step / `fast`", "with a tolerance", "half the size"]
     fill_between(PAGE, "step_times", markdown_table(heads, shares))
     everything = [
         ["change", "fitted for", "capture", "seed", "pixels", "Gaussians", "steps", "seconds", *SEEN, "machine"]
