@@ -107,7 +107,7 @@ def table(rows: list[dict]) -> str:
     for key in SETTINGS:
         found = {row["scene"]: row for row in rows if row["setting"] == key}
         worst = (max(row[kind] for row in found.values()) for kind in ("largest", "gradient"))
-        times = (f"{found[name]['backward']:.1f} ({found[name]['forward']:.1f})" for name in scenes)
+        times = (f"{found[name]['backward']:.1f}" for name in scenes)
         lines.append([key, *("-" if key == "exact" else f"{x:.0e}" for x in worst), *times])
     return markdown_table(["tolerance, or setting", "largest error", "gradient", *scenes], lines)
 
@@ -131,7 +131,7 @@ def main() -> None:
     made = rows[0]
     where = paragraph(
         f"`python benchmarks/tolerance.py`, {made['machine']} of a busy machine, {made['date']}, commit "
-        f"{made['commit']}. Time with gradients, and in brackets of an image, in multiples of `fast`; errors against "
+        f"{made['commit']}. Time with gradients in multiples of `fast`; errors against "
         "`exact`, the largest over the scenes: of a color, and relative of the worst group of gradients."
     )
     fill_between(PAGE, "tolerance", f"{where}\n\n{table(rows)}")
