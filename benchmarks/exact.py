@@ -290,14 +290,14 @@ def report(result: dict) -> str:
         paragraph(
             f"Preset `exact` sorts Gaussians along each ray. On one thread it takes {cost[0]} times as long as `fast` "
             f"for an image, {cost[1]} times with gradients and {cost[2]} times for a Fisher diagonal; it is "
-            f"{rest['exact']:.1f} times as fast as Mitsuba's `volprim_rf_basic`."
+            f"{rest['exact']:.1f} times as fast as Mitsuba's `volprim_rf_basic`. {result.get('note', '')}"
         ),
         "",
         paragraph(
             f"Made by `python benchmarks/exact.py` on {result['machine']}, {result['date']}, commit {result['commit']}"
             f"{again}. `exact` in multiples of `fast` on the same view, one thread; presets take turns in one process, "
-            "medians. The fits have 1,000 steps at 10,800 pixels. `forward` is without depth: with a depth, the tails "
-            "of Gaussians that a tile could do without are not left out ([numerics.md](numerics.md))."
+            "medians. The fits have 1,000 steps at 10,800 pixels. `forward` is without depth, with which tiles leave "
+            "fewer tails out ([numerics.md](numerics.md))."
         ),
         "",
         scene_rows(one),
@@ -310,16 +310,14 @@ def report(result: dict) -> str:
         "",
         paragraph(
             "`fast` cuts Gaussians at 3 standard deviations and stops at a transmittance of 0.01: `exact` composites "
-            f"{between(hit_ratios(one))} times as many hits. For each hit it takes {between(hit_costs(one))} times as "
-            "long as `fast`, finding and sorting it included, so that 4 times for an image, as was asked for dense "
-            "captures, would leave these no time there."
+            f"{between(hit_ratios(one))} times as many hits, and takes {between(hit_costs(one))} times as long for "
+            "each."
         ),
         "",
         paragraph(
-            f"The {CROP[0]}x{CROP[1]} pixels in the middle of views of {len(oracle)} scenes are compared with the "
-            f"float64 oracle, by brute force: colors are off by {min(errors):.1e} to {max(errors):.1e} at most. "
-            "Pixels near a tie or a cut-off, where float32 may decide otherwise, are left out: "
-            f"{min(ties)} to {max(ties)} of {oracle[0]['pixels']}."
+            f"Against the float64 oracle, by brute force, colors of {len(oracle)} scenes are off by {min(errors):.1e} "
+            f"to {max(errors):.1e} at most, without pixels near a tie or a cut-off ({min(ties)} to {max(ties)} of "
+            f"{oracle[0]['pixels']})."
         ),
         "",
         paragraph(
