@@ -41,6 +41,7 @@ ROWS = HERE / "recordings.jsonl"
 SIZES = ("200:32x24",)
 CARD_SIZES = ("100000:512x512", "1000000:1920x1080", "200:32x24")
 PRESETS = ("fast", "gsplat", "exact")
+SHOWN = ("fast", "exact")  # on the page
 KINDS = ("forward", "step")
 
 
@@ -183,7 +184,7 @@ def table(rows: dict[tuple, dict]) -> list[str]:
     named = {"forward": "forward", "step": "with gradients", "fit": "a step of a fit"}
     where = ""
     for (kind, count, preset), r in rows.items():
-        if kind not in named:
+        if kind not in named or preset not in SHOWN:
             continue
         ms = [f"{r['times'][name]['processor_ms']:.1f}" for name in ("traced", "recorded")]
         what = r["scene"] if kind == "fit" else "x".join(map(str, r["size"]))
