@@ -31,6 +31,8 @@ RESULTS = ROOT / "benchmarks" / "numerics.json"
 PAGE = ROOT / "docs" / "numerics.md"
 PICTURE = ROOT / "docs" / "pictures" / "extremes.png"
 DATA = ROOT / "docs" / "data" / "extremes.csv"
+SHOWN = [key for key in COLUMNS if key != "duality"]
+"""Columns of the page."""
 SETTINGS = ("exact", "center", "integral", "ewa", "inria", "gsplat")
 """How the names of cases end, in backticks; those of `exact` have no such end, `center` is its order alone."""
 
@@ -66,13 +68,13 @@ def table(found: Rows) -> str:
             some = [row for row in mine if case_of(row)[0] == scene]
             warns = " (warns)" if any(row["verdict"] == "warns" for row in some) else ""
             lines.append(_line(f"`{traversal}`, {scene}{warns}", some))
-    return markdown_table(["settings or scene", "rows", *COLUMNS.values()], lines)
+    return markdown_table(["settings or scene", *(COLUMNS[key] for key in SHOWN)], lines)
 
 
 def _line(name: str, some: Rows) -> list[str]:
     """The largest errors of some rows."""
-    errors = [max(row[key] for row in some if row[key] is not None) for key in COLUMNS]
-    return [name, str(len(some)), *(f"{error:.0e}" for error in errors)]
+    errors = [max(row[key] for row in some if row[key] is not None) for key in SHOWN]
+    return [name, *(f"{error:.0e}" for error in errors)]
 
 
 def text(result: dict[str, Any]) -> str:
