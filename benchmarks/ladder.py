@@ -46,7 +46,7 @@ CROP = {"wolf": 16, "office": 24}
 SHOWN = "inria"  # in the figure
 FULL = 70  # degrees: the field of view at which wolf gets more pixels
 WIDTHS = (160, 320, 640, 1280)
-TABLED = (20, 70, 120)  # degrees, of the table on the page
+TABLED = (70, 120)  # degrees, of the table on the page
 ROWS = {
     "dilation": ("dilation",),
     "EWA linearization": ("EWA",),
