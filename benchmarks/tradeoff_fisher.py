@@ -137,8 +137,6 @@ SHOWN = (
     "fast",
     "fast, half resolution",
     "fisherrf",
-    "probes on exact, K = 1",
-    "probes on exact, K = 16",
     "probes on fast, K = 1",
     "probes on fast, K = 16",
 )
