@@ -196,7 +196,7 @@ def test_without_features_nothing_is_held(rng, monkeypatch):
     def fails(*arguments):
         raise AssertionError("weights are held")
 
-    for name in ("__init__", "zeros", "survey", "image", "gradient", "scalars", "totals", "push"):
+    for name in ("__init__", "zeros", "survey", "image", "gradient", "push"):
         monkeypatch.setattr(weights.Weights, name, fails)
     render(g, cam, Preset("fast"), outputs=OUTPUTS).rgb.sum().backward()
     render_jvp(g, cam, {"means": torch.ones(12, 3)}, Preset("fast"))

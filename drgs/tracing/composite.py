@@ -391,11 +391,11 @@ class Compositor:
         if buffer is None:
             buffer = weights.zeros()
             dr.eval(part.run(Primal(self.model, self._channels(), frozenset(), _emit_weights(part, buffer))), buffer)
-        weights.gradient(buffer, g, slopes)
-        if not self.couple:
+        features = in_rows(self.buffers["features"], self.width) if self.couple else None
+        found = weights.gradient(buffer, g, slopes, features)
+        if found is None:
             return None, []
-        scalars = weights.scalars(in_rows(self.buffers["features"], self.width), g)
-        totals = weights.totals(buffer, scalars)
+        scalars, totals = found
         tile = dr.arange(lib.UInt32, dr.width(slots.columns[0])) // (PIXELS // len(slots.columns))
         return scalars, [dr.gather(lib.Float64, totals, tile * PIXELS + column) for column in slots.columns]
 

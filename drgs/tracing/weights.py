@@ -28,7 +28,7 @@ from drgs.tracing.arrays import Float, Lib, UInt32
 PIXELS = 64  # pixels of a tile, 8 x 8
 MATRIX = 128 << 20
 """Bytes of the weights that are held at once; more where the list of a single tile has more."""
-_PRODUCT_BYTES = 4 << 20  # bytes of the features of the entries that one product takes; chosen
+_PRODUCT_BYTES = 1 << 20  # bytes of the features of the entries that one product takes: a core's cache; chosen
 _GROUPING_SLACK = 8  # tiles of one product: the most entries may be more than the fewest by 1/8, or by as many entries
 
 
@@ -37,12 +37,14 @@ class _Group:
     """Tiles with about the same number of entries that count: a batch of equal matrices.
 
     Attributes:
+        tiles: (tiles,) their numbers.
         rows: (tiles, entries) rows in the buffer; those left over are the last row, which is 0.
         index: Gaussians, laid out as `rows` are.
         pixels: (tiles 64) row-major pixels, 0 where outside of the image.
         inside: (tiles 64) bool: inside of the image.
     """
 
+    tiles: torch.Tensor
     rows: torch.Tensor
     index: torch.Tensor
     pixels: torch.Tensor
@@ -106,46 +108,32 @@ class Weights:
             if bool(slopes.any()):
                 self.image(buffer, slopes, image)
 
-    def gradient(self, buffer: Float, cotangent: torch.Tensor, out: torch.Tensor) -> None:
-        """Add W dL/dF to the rows of `out` (N, D); `cotangent` dL/dF is (pixels, D)."""
+    def gradient(
+        self, buffer: Float, cotangent: torch.Tensor, out: torch.Tensor, features: torch.Tensor | None
+    ) -> tuple[Float, Float] | None:
+        """Add W dL/dF to the rows of `out` (N, D); `cotangent` dL/dF is (pixels, D).
+
+        Args:
+            features: (N, D), or None: nothing is returned.
+        Returns:
+            s = f (dL/dF)^T, laid out like the weights, 0 where these are; and (T 64) float64 sums of w s over entries.
+        """
         flat = _matrix(buffer)
         width = cotangent.shape[1]
+        scalars = None if features is None else _matrix(self.zeros())
+        totals = cotangent.new_zeros(len(self.lengths), PIXELS, dtype=torch.float64)
         for group in self._grouped(width):
             g = _gathered(cotangent, group)
             for rows, index in group.slices(width):
                 W = flat.index_select(0, rows).view(len(g), -1, PIXELS)
                 out.index_add_(0, index, torch.bmm(W, g).view(-1, width))
-
-    def scalars(self, features: torch.Tensor, cotangent: torch.Tensor) -> Float:
-        """f (dL/dF)^T, laid out like the weights; 0 where these are."""
-        width = features.shape[1]
-        flat = _matrix(self.zeros())
-        for group in self._grouped(width):
-            g = _gathered(cotangent, group).mT
-            for rows, index in group.slices(width):
-                f = features.index_select(0, index).view(len(g), -1, width)
-                flat.index_copy_(0, rows, torch.bmm(f, g).view(-1, PIXELS))
-        return self.lib.Float(flat.view(-1))
-
-    def totals(self, buffer: Float, scalars: Float) -> Float:
-        """(T 64) Float64: sum over the entries of w s, as precise as the adjoint takes it apart again."""
-        lib = self.lib
-        if not len(self._touched):  # as where all rays are walked again: Dr.Jit gathers nothing from an empty array
-            return dr.zeros(lib.Float64, len(self.lengths) * PIXELS)
-        rows, starts, ends = (_unsigned(lib, x) for x in (self._touched, *self._bounds()))
-        lane = dr.arange(lib.UInt32, len(self.lengths) * PIXELS)
-        start, end = (dr.gather(lib.UInt32, x, lane // PIXELS) for x in (starts, ends))
-
-        def body(k: UInt32, total: Float) -> tuple[UInt32, Float]:
-            at = dr.gather(lib.UInt32, rows, k) * PIXELS + lane % PIXELS
-            # The adjoint subtracts these products again, hit by hit: what float32 left would be all that remains.
-            w, s = (lib.Float64(dr.gather(lib.Float, x, at)) for x in (buffer, scalars))
-            return k + 1, dr.fma(w, s, total)
-
-        with dr.suspend_grad():  # part of a derivative
-            total = dr.while_loop((start, dr.zeros(lib.Float64, dr.width(lane))), lambda k, total: k < end, body)[1]
-        dr.eval(total)
-        return total
+                if features is None or scalars is None:
+                    continue
+                s = torch.bmm(features.index_select(0, index).view(len(g), -1, width), g.mT)
+                scalars.index_copy_(0, rows, s.view(-1, PIXELS))
+                # The adjoint subtracts these products again, hit by hit: what float32 left would be all that remains.
+                totals.index_add_(0, group.tiles, W.double().mul_(s).sum(1))
+        return None if scalars is None else (self.lib.Float(scalars.view(-1)), self.lib.Float64(totals.view(-1)))
 
     def survey(self, buffer: Float) -> None:
         """Find out which entries any pixel composites; products need it."""
@@ -189,7 +177,7 @@ class Weights:
                 inside = torch.cat([inside, torch.zeros_like(inside)])
             rows = touched[at]
             index = self.index[rows].long()  # what int32 would take to add is twice the time
-            self._groups.append(_Group(rows, index, self.pixels[own].view(-1), inside))
+            self._groups.append(_Group(own, rows, index, self.pixels[own].view(-1), inside))
             k += count
         return self._groups
 
@@ -225,8 +213,3 @@ def _matrix(buffer: Float) -> torch.Tensor:
 def signed(x: UInt32) -> torch.Tensor:
     """The same bits as int32 in torch, which knows few operations of unsigned integers."""
     return x.torch().view(torch.int32)
-
-
-def _unsigned(lib: Lib, x: torch.Tensor) -> UInt32:
-    """Numbers >= 0 of torch as unsigned integers of Dr.Jit."""
-    return lib.UInt32(lib.Int32(x.to(torch.int32)))
