@@ -67,7 +67,9 @@ Cost = Sequence[float] | Callable[[Camera, Camera], float]
 
 _FAST = Scoring(settings=RenderSettings.preset("fast"))
 _RNG = torch.Generator()  # a pool must have one; policies that score by information draw nothing from it
-_DURATIONS_KEPT = 9  # latest durations whose median is what the next one takes: odd; the number is chosen, not tuned
+_DURATIONS_KEPT = 3  # latest durations whose median is what the next one takes: the fewest that one compilation leaves
+_ANSWER_SHARE = 0.5  # duration of an answer, in those of its views, before one was measured: 0.2 to 0.5 on `office`
+_REGION_SHARE = 1.2  # the same of a region, whose information is computed in the answer: 1.1 to 1.4
 
 _ADVICE = "restore the file, or begin anew"
 _KIND = "planner"
@@ -150,7 +152,7 @@ class ViewPlan:
         changed: Largest change, in [0, 1], of a view's rendering since its information was computed; 0: all is of now.
         computed: Views whose information was computed for this answer.
         left_out: Known views whose information was not computed in time.
-        seconds: Wall time.
+        seconds: Wall time from the call on, also of waiting for other threads.
         note: What is to be said of the region, a sentence; "" where there is nothing.
     """
 
@@ -223,7 +225,7 @@ class Planner:
         self._callers_scene: Gaussians | None = None
         self._fit_scene: Gaussians | None = None  # a copy of the fit's Gaussians, as long as these do not change
         self._num_observed = 0
-        self._view_seconds, self._answer_seconds = _Duration(), _Duration()
+        self._view_seconds, self._answer_share = _Typical(), _Typical(_REGION_SHARE if region else _ANSWER_SHARE)
         self._fit_lock = threading.RLock()
         self._answer_lock = threading.RLock()
         if scene is not None:
@@ -313,13 +315,15 @@ class Planner:
         Args:
             candidates: Cameras at the places where it could go.
             cost: Cost of going to each, >= 0; a function is called with the last place and the candidate.
-            seconds: Wall time for the answer; None: the information of all views that have changed is computed.
+            seconds: Wall time for the answer; None: the information of all views that have changed is computed. One
+                view is computed however little it is, and what is kept is always scored.
         Returns:
             A plan without picks.
         Raises:
             ValueError: If there are no candidates, costs or `seconds` are not numbers >= 0, or there is no model yet;
                 then `next` picks from the candidates before.
         """
+        begun = time.monotonic()
         _check_seconds("Planner.scores", seconds)
         pool = camera_list("Planner.scores", "candidates", candidates)
         if not pool:
@@ -329,7 +333,7 @@ class Planner:
             self._pool, self._cost = [at_most(camera, self.info_pixels) for camera in pool], cost
             try:
                 self._costs(list(range(len(pool))), self._last_camera)  # refuses what is no cost
-                return self._plan(0, seconds)
+                return self._plan(0, seconds, begun)
             except BaseException:
                 self._pool, self._cost = before
                 raise
@@ -346,6 +350,7 @@ class Planner:
         Raises:
             ValueError: If there are fewer candidates than k, or `seconds` is not a number >= 0.
         """
+        begun = time.monotonic()
         _check_seconds("Planner.next", seconds)
         with self._answer_lock:
             if not (type(k) is int and 1 <= k <= len(self._pool)):
@@ -353,7 +358,7 @@ class Planner:
                     f"Planner.next: k must be a whole number in 1..{len(self._pool)} candidates, got {k!r}; give "
                     "candidates to Planner.scores"
                 )
-            return self._plan(k, seconds)
+            return self._plan(k, seconds, begun)
 
     def refine(self, camera: Camera, refine: Refine | None = None) -> Pick:
         """Move a place to where its view scores higher, within bounds; see `drgs.select.Refine`.
@@ -409,8 +414,8 @@ class Planner:
                 "pool": records(self._pool),
                 "costs": True if callable(costs) else costs,
                 "scoring": named_by(self._scoring) or "",
-                "asked_in": list(self._view_seconds.seconds),
-                "answered_in": list(self._answer_seconds.seconds),
+                "asked_in": list(self._view_seconds.latest),
+                "answered_in": list(self._answer_share.latest),
                 "origin": origin,
                 "fit": fit_header,
                 "photographs": records(photographs),
@@ -458,11 +463,10 @@ class Planner:
         planner._num_observed = header["counted"]
         costs = header["costs"]
         planner._cost = _unknown_cost if isinstance(costs, bool) else costs
-        for name, durations in (("asked_in", planner._view_seconds), ("answered_in", planner._answer_seconds)):
-            for seconds in header[name]:
-                durations.note(seconds)
         expected = cameras("expected", planner.info_pixels)
-        if header["version"] == runtime.version():  # other versions may compute other information
+        if header["version"] == runtime.version():  # other versions may compute other information, in other times
+            planner._view_seconds.latest.extend(header["asked_in"])
+            planner._answer_share.latest.extend(header["answered_in"])
             planner._cache.restore(tensors, header["cache"], expected, str(where))
         planner.notes = header.get("notes")
         if len(planner._known) > planner.max_views:  # saved by one thread while another had just taken a photograph
@@ -518,14 +522,18 @@ class Planner:
 
     # -------------------------------------------------- answers
 
-    def _plan(self, k: int, seconds: float | None) -> ViewPlan:
-        """Compute information of as many views as there is time for, and answer by what there is then."""
-        begun = time.monotonic()
+    def _plan(self, k: int, seconds: float | None, begun: float) -> ViewPlan:
+        """Compute information of as many views as there is time for, and answer by what there is then.
+
+        Args:
+            k: How many to pick.
+            seconds: Wall time for the answer, from `begun` on.
+            begun: When the answer was asked for, as of `time.monotonic`.
+        """
         scene, known = self._model_and_views()
         self._expect([*known, *self._pool])
         calls = 1 if self._cost is None else max(k, 1)
-        until = math.inf if seconds is None else begun + seconds - self._answer_seconds.usual * calls
-        computed = self._evaluate_changed(scene, known, until)
+        computed = self._evaluate_changed(scene, known, math.inf if seconds is None else begun + seconds, calls)
         answering = time.monotonic()
         self._cache.computes = False
         try:
@@ -535,19 +543,28 @@ class Planner:
         now = time.monotonic()
         if self._cache.forgot_saved:  # a file of another version named quantities otherwise: they are computed now
             self._cache.forgot_saved = False
-            return self._plan(k, None if seconds is None else max(seconds - (now - begun), 0.0))
-        self._answer_seconds.note((now - answering) / calls)
+            return self._plan(k, seconds, begun)
+        scored = sum(score is not None for score in plan.scores)
+        views = calls * (len(known) - plan.left_out + scored) * self._view_seconds.usual
+        if computed and scored and views:  # else the machine may have been faster when views were computed
+            self._answer_share.note((now - answering) / views)
         return dataclasses.replace(plan, computed=computed, seconds=now - begun)
 
-    def _evaluate_changed(self, scene: Gaussians, known: list[Camera], until: float) -> int:
-        """Compute information of the views that have changed most, known views and candidates in turn, until a time.
+    def _evaluate_changed(self, scene: Gaussians, known: list[Camera], until: float, calls: int) -> int:
+        """Compute information of the views that have changed most, known views and candidates in turn.
 
+        Args:
+            scene, known: The model, and the known views.
+            until: When the answer is due: a view is computed if there is time for it and for scoring all views then.
+            calls: How often these are scored.
         Returns:
             How many views.
         """
         queues = []
+        there = 0  # views that have information
         for cameras in (known, self._pool):
             changes = {i: self._cache.change(scene, camera) for i, camera in enumerate(cameras)}
+            there += sum(change < math.inf for change in changes.values())
             stale = sorted((i for i in changes if changes[i] > self._cache.bound), key=lambda i: (-changes[i], -i))
             queues.append(([cameras[i] for i in stale], len(cameras)))
         queues = [queue for queue, _ in sorted(queues, key=lambda x: -len(x[0]) / x[1])]  # where more is left first
@@ -555,7 +572,9 @@ class Planner:
         done = 0
         for camera in turns:
             began = time.monotonic()
-            if done and began + self._view_seconds.usual > until:  # one at least, so that every call brings something
+            there += self._cache.change(scene, camera) == math.inf
+            views = 1 + calls * there * self._answer_share.usual  # that take as long: this one, and scoring all
+            if done and began + views * self._view_seconds.usual > until:  # one at least: every call brings something
                 break
             self._evaluate(scene, camera)
             self._view_seconds.note(time.monotonic() - began)
@@ -591,8 +610,9 @@ class Planner:
             best = int(np.argmax(values))
             here = self._pool[places[best]]
             picks.append(PlannedView(places[best], here, selection.scores[best], costs[best], values[best]))
-            there = [*there, here]
-            selection, places, there = self._selected(scene, [i for i in places if i != places[best]], there, 1)
+            if len(picks) < k:
+                left = [i for i in places if i != places[best]]
+                selection, places, there = self._selected(scene, left, [*there, here], 1)
         changed = max(self._cache.changes.values(), default=0.0)
         return ViewPlan(picks, scores, changed, 0, left_out, 0.0, note)
 
@@ -652,24 +672,26 @@ class Planner:
         return costs
 
 
-class _Duration:
-    """How long something usually takes: a median, which a single compilation of a kernel does not change.
+class _Typical:
+    """What a measured number usually is: a median, which a single compilation of a kernel does not change.
 
     Attributes:
-        seconds: The latest durations, the oldest first.
+        latest: The latest numbers, the oldest first.
+        first: What it is taken for before there is any.
     """
 
-    def __init__(self) -> None:
-        self.seconds: deque[float] = deque(maxlen=_DURATIONS_KEPT)
+    def __init__(self, first: float = 0.0) -> None:
+        self.first = first
+        self.latest: deque[float] = deque(maxlen=_DURATIONS_KEPT)
 
-    def note(self, seconds: float) -> None:
-        """Add a duration."""
-        self.seconds.append(seconds)
+    def note(self, number: float) -> None:
+        """Add a number."""
+        self.latest.append(number)
 
     @property
     def usual(self) -> float:
-        """The median, seconds; 0 as long as nothing is known."""
-        return statistics.median(self.seconds) if self.seconds else 0.0
+        """The median, of two the lower."""
+        return statistics.median_low(self.latest) if self.latest else self.first
 
 
 def _region_of(where: str, saved: Any, given: Region | None) -> Region | None:

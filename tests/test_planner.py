@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import threading
@@ -99,6 +100,72 @@ def test_a_budget(world):
     plan = fresh.next(3, seconds=0)
     assert len(plan.picks) == sum(x is not None for x in plan.scores) < 3
     assert {pick.index for pick in plan.picks} == {i for i, x in enumerate(plan.scores) if x is not None}
+
+
+class Clock:
+    """Stands for the module `time`: only what a test says takes time.
+
+    Attributes:
+        now: Seconds.
+        slow: How many times as long as usual everything takes.
+        begun: When each view began.
+    """
+
+    def __init__(self, monkeypatch):
+        self.now, self.slow, self.begun = 100.0, 1.0, []
+        evaluate, answer = Planner._evaluate, Planner._answer
+
+        def slow_evaluate(planner, scene, camera):
+            self.begun.append(self.now)
+            evaluate(planner, scene, camera)
+            self.now += self.slow
+
+        def slow_answer(planner, scene, known, k):
+            plan = answer(planner, scene, known, k)
+            views = len(known) - plan.left_out + sum(score is not None for score in plan.scores)
+            self.now += 0.7 * self.slow * views
+            return plan
+
+        monkeypatch.setattr(Planner, "_evaluate", slow_evaluate)
+        monkeypatch.setattr(Planner, "_answer", slow_answer)
+        monkeypatch.setattr(drgs.planner, "time", self)
+
+    def monotonic(self):
+        return self.now
+
+
+def test_a_budget_holds_when_the_machine_slows_down(world, monkeypatch):
+    """From the first answer on, and where all takes four times as long: no view begins without the time to score all.
+
+    A view takes a second, and an answer 0.7 seconds for each view that it scores.
+    """
+    _, _, candidates = world
+    clock = Clock(monkeypatch)
+    planner = planner_of(world, bound=0.0)
+    for slow, seconds in ((1, 8), (1, 8), (4, 40), (4, 40)):
+        planner._cache.invalidate()
+        clock.slow = slow
+        clock.begun.clear()
+        asked = clock.now
+        plan = planner.scores(candidates, seconds=seconds)
+        assert plan.seconds == clock.now - asked <= seconds + slow, "later by one view at most"
+        assert 8 > plan.computed >= 4, "the time is used"
+        assert plan.computed == len(clock.begun) == 8 - plan.left_out - plan.scores.count(None)
+
+
+def test_waiting_for_another_thread_counts(world, monkeypatch):
+    """An answer that has waited for longer than its budget computes the one view that every answer does."""
+    clock = Clock(monkeypatch)
+    planner = planner_of(world)
+
+    @contextlib.contextmanager
+    def busy():
+        clock.now += 100
+        yield
+
+    planner._answer_lock = busy()
+    plan = planner.scores(world[2], seconds=50)
+    assert (plan.computed, plan.seconds >= 100) == (1, True)
 
 
 def test_enough_time_is_enough(world):
