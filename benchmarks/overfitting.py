@@ -128,30 +128,32 @@ def watched(trainer: Trainer, frames: list[Frame], measured: list[Frame], fast: 
     ]
 
 
-def cells(rows: list[dict], rule: str, views: int, steps: int, scenes: Sequence[str]) -> list[str]:
+def cells(rows: list[dict], rule: str, scenes: Sequence[str]) -> list[str]:
     """Fits, and what a rule adds in each renderer, with the interval over several scenes; empty where none was made."""
-    own = [row for row in rows if (row["views"], row["max_steps"]) == (views, steps)]
-    found = lines(own, rule, "fast", scenes, "none")
+    found = lines(rows, rule, "fast", scenes, "none")
     return found if any(found) else []
 
 
 def write_page(rows: list[dict]) -> None:
     """The page's table of `SHOWN`, seen with `fast`, and the data file of every rule and scene."""
-    kinds = sorted({(row["views"] or 99, row["views"], row["max_steps"]) for row in rows})
+    kinds = sorted({(row["views"] or 99, row["views"], row["max_steps"], row["max_pixels"]) for row in rows})
     rules = [rule for rule in dict.fromkeys(row["rule"] for row in rows) if rule != "none"]
-    table, everything = [], [["rule", "views", "steps", "scene", "fits", *(f"{x}: mean / worst, dB" for x in SEEN)]]
-    for _, views, steps in kinds:
+    heads = ["rule", "views", "steps", "pixels", "scene", "fits", *(f"{x}: mean / worst, dB" for x in SEEN)]
+    table, everything = [], [heads]
+    for _, *kind in kinds:
+        views, steps, pixels = kind
+        alike = [row for row in rows if [row["views"], row["max_steps"], row["max_pixels"]] == kind]
         told = [str(views or "all"), f"{steps:,}"]
         for half, scenes in (("tried on", CHOOSING), ("shown on", SHOWING)):
-            own = [scene for scene in scenes if cells(rows, SHOWN, views, steps, [scene])]
+            own = [scene for scene in scenes if cells(alike, SHOWN, [scene])]
             if own:
                 name = f"{half} these {len(own)}" if len(own) > 1 else own[0]
-                table.append([*told, name, cells(rows, SHOWN, views, steps, own)[1]])
+                table.append([*told, name, cells(alike, SHOWN, own)[1]])
         for rule in rules:
             for scenes in (CHOOSING, SHOWING):
-                own = [scene for scene in scenes if cells(rows, rule, views, steps, [scene])]
+                own = [scene for scene in scenes if cells(alike, rule, [scene])]
                 for some in [[scene] for scene in own] + ([own] if len(own) > 1 else []):
-                    everything.append([rule, *told, ", ".join(some), *cells(rows, rule, views, steps, some)])
+                    everything.append([rule, *told, f"{pixels:,}", ", ".join(some), *cells(alike, rule, some)])
     fill_between(PAGE, "overfitting", markdown_table(["views", "steps", "captures", f"`{SEEN[0]}`"], table))
     write_csv(PAGE_DATA / "overfitting.csv", everything)
 

@@ -3,10 +3,11 @@
     python benchmarks/steps.py [--scenes banana ...] [--rules size ...] [--units 3] [--trained fast] [--page]
 
 Appends one row a fit to benchmarks/steps.jsonl as it ends and leaves out what is there, then writes
-docs/data/steps.csv, of which docs/real-data.md tells. Rules were tried on CHOOSING, and the one that was best there was
-then measured on SHOWING; fits of a scene take turns, one thread. Rules multiply the steps that Adam has made; `drgs
-fit` has none of them. Seconds are those that the process computed in its steps, whatever ran beside it. Averages over
-the last steps are of the same fits. Made scenes are folders of `--made` (docs/real-data.md has their commands).
+docs/data/steps.csv, of which docs/real-data.md tells. Rules were tried on CHOOSING, and those that were best there were
+then measured on SHOWING; fits of a scene take turns, one thread. Rules multiply the steps that Adam has made, and of
+"pairs" two photographs make one update, as many photographs in all; `drgs fit` has none of them. Seconds are those that
+the process computed in its steps, whatever ran beside it. Averages over the last steps are of the same fits. Made
+scenes are folders of `--made` (docs/real-data.md has their commands).
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
+import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from fits import psnr_by_renderer, split_of  # noqa: E402
 from studies import PAGE_DATA, write_csv  # noqa: E402
@@ -47,6 +49,7 @@ PATHS = {"street": "street/sparse_dev/0"}
 SIZE = {"max_steps": 300, "max_pixels": 12_000, "max_gaussians": 8_000}
 SEEN = ("fast", "exact", "gsplat")
 WINDOWS = (0.05, 0.1, 0.2)  # shares of the steps, the last ones, that averages are of; density control ends at 0.8
+AVERAGED = ("Adam", "size")  # rules whose averages are measured, too
 KEY = ("scene", "rule", "trained", "seed", "offset", *SIZE)
 
 Factors = dict[str, torch.Tensor | float]
@@ -79,22 +82,30 @@ def axes(trainer: Trainer) -> Factors:
     return {"means": rotation @ (scale[:, :, None] * rotation.transpose(1, 2))}
 
 
-class BySeen:
-    """SH above degree 0, by the share of the photographs that show the mean, over its median."""
+class ByPhotographs:
+    """By a power of how many photographs show a mean, or of its Gaussian's size in their pixels, over the median."""
 
-    def __init__(self) -> None:
-        self.count, self.factor = 0, torch.ones(0)
+    def __init__(self, power: float, *names: str, pixels: bool = False) -> None:
+        self.power, self.names, self.pixels = power, names, pixels
+        self.factor = torch.ones(0)
 
     def __call__(self, trainer: Trainer) -> Factors:
-        if self.count != len(trainer.rows):
-            self.count = len(trainer.rows)
+        if len(self.factor) != len(trainer.rows) or trainer.step_index % 10 == 0:
             places = trainer.rows.places().numpy()
-            seen = torch.zeros(self.count)
+            shown, scale = np.zeros(len(places)), np.zeros(len(places))
             for frame in trainer.frames:
                 pixels, depth = frame.camera.project(places)
-                seen += torch.from_numpy(frame.camera.contains(pixels, depth))
-            self.factor = (seen / seen.median().clamp(min=1)).clamp(1 / 8, 8)
-        return {"sh_rest": self.factor[:, None, None]}
+                here = frame.camera.contains(pixels, depth)
+                shown += here
+                scale[here] += frame.camera.K[0, 0] / depth[here]
+            is_shown = torch.from_numpy(shown > 0)
+            values = (
+                torch.from_numpy(scale / shown.clip(1)) * sizes(trainer) if self.pixels else torch.from_numpy(shown)
+            )
+            factor = (values / values[is_shown].median()) ** self.power
+            self.factor = torch.where(is_shown, factor.clamp(1 / 8, 8), 1.0).float()
+        shapes = {name: trainer.rows.tensors[name].dim() - 1 for name in self.names}
+        return {name: self.factor.reshape(-1, *[1] * more) for name, more in shapes.items()}
 
 
 def opacity(trainer: Trainer) -> Factors:
@@ -113,6 +124,11 @@ def cooled(share: float, *names: str) -> Rule:
     return lambda trainer: {name: min(1.0, (1 - trainer.part) / share) for name in names}
 
 
+def faster(factor: float) -> Rule:
+    """All rates times a factor."""
+    return lambda trainer: dict.fromkeys(trainer.rows.tensors, factor)
+
+
 REST = ("quats", "log_scales", "logit_opacities", "sh_dc", "sh_rest")
 RULES: dict[str, Callable[[], Rule]] = {
     "Adam": lambda: lambda trainer: {},
@@ -121,12 +137,29 @@ RULES: dict[str, Callable[[], Rule]] = {
     "axes": lambda: axes,
     "scales by size^0.5": lambda: scales(0.5),
     "scales by size^-0.5": lambda: scales(-0.5),
-    "SH by photographs": BySeen,
+    "scales by pixels": lambda: ByPhotographs(1.0, "log_scales", pixels=True),
+    "scales by pixels^0.5": lambda: ByPhotographs(0.5, "log_scales", pixels=True),
+    "scales by pixels^-0.5": lambda: ByPhotographs(-0.5, "log_scales", pixels=True),
+    "scales by photographs^0.5": lambda: ByPhotographs(0.5, "log_scales"),
+    "scales by photographs^-0.5": lambda: ByPhotographs(-0.5, "log_scales"),
+    "SH by photographs": lambda: ByPhotographs(1.0, "sh_rest"),
     "opacity": lambda: opacity,
+    "opacity by photographs^0.5": lambda: ByPhotographs(0.5, "logit_opacities"),
+    "opacity by photographs^-0.5": lambda: ByPhotographs(-0.5, "logit_opacities"),
+    "pairs": lambda: faster(1.0),
+    "pairs, rates x 1.4": lambda: faster(2**0.5),
     "all but means fall to 0.1": lambda: falling(0.1, *REST),
     "all fall to 0 in the last 0.2": lambda: cooled(0.2, "means", *REST),
     "all fall to 0 in the last 0.4": lambda: cooled(0.4, "means", *REST),
 }
+
+
+def paired(trainer: Trainer) -> None:
+    """Let an update have the gradient of two photographs, whose sum moves as their mean does: Adam divides by it."""
+    optimizer = trainer.rows.optimizer
+    step, zero_grad = optimizer.step, optimizer.zero_grad
+    optimizer.step = lambda: step() if trainer.step_index % 2 else None
+    optimizer.zero_grad = lambda set_to_none: None if trainer.step_index % 2 else zero_grad(set_to_none)
 
 
 def hooked(trainer: Trainer, rule: Rule) -> None:
@@ -166,11 +199,14 @@ def fit(scene: str, rule: str, trained: str, seed: int, offset: int, made: Path)
     frames = frames_for(train, config.data)
     trainer = start_plain(dataset, train, frames, config)
     hooked(trainer, RULES[rule]())
+    if rule.startswith("pairs"):
+        paired(trainer)
+    windows = WINDOWS if rule in AVERAGED else ()
     sums: dict[float, dict[str, torch.Tensor]] = {}
     began = time.process_time()
     for step in range(config.max_steps):
         trainer.step()
-        for window in WINDOWS:
+        for window in windows:
             if step >= config.max_steps - round(window * config.max_steps):
                 old = sums.setdefault(window, {})
                 for name, x in trainer.rows.tensors.items():
@@ -179,7 +215,7 @@ def fit(scene: str, rule: str, trained: str, seed: int, offset: int, made: Path)
     held_out = frames_for(test, config.data)
     renderers = {name: RenderSettings.preset(name) for name in SEEN}
     rows = []
-    for window in (0.0, *WINDOWS):
+    for window in (0.0, *windows):
         for name, x in sums.get(window, {}).items():
             trainer.rows.tensors[name].data.copy_(x / round(window * config.max_steps))
         key = (scene, f"{rule}{f', mean of the last {window:g}' if window else ''}", trained, seed, offset)
@@ -233,6 +269,18 @@ def took_of(rows: list[dict], rule: str, trained: str, scene: str) -> float:
     return statistics.mean(row["seconds"] for row in same)
 
 
+def over_adam(rows: list[dict], rule: str, trained: str, scene: str) -> str:
+    """Seconds of a fit over Adam's of the same unit and day, means; empty without: what runs beside differs by day."""
+    same = [row for row in rows if (row["trained"], row["scene"]) == (trained, scene)]
+    pairs = [
+        (own["seconds"], adam["seconds"])
+        for own in same
+        for adam in same
+        if own["rule"] == rule and adam["rule"] == "Adam" and all(own[k] == adam[k] for k in ("seed", "offset", "date"))
+    ]
+    return f"{sum(own for own, _ in pairs) / sum(adam for _, adam in pairs):.2f}" if pairs else ""
+
+
 def write_data(rows: list[dict]) -> None:
     """The data file: every rule by capture, then over those that it was tried on and those that it was shown on."""
     everything = [["rule", "trained", "scene", "fits", *(f"{seen}: mean / worst, dB" for seen in SEEN), "time"]]
@@ -241,7 +289,7 @@ def write_data(rows: list[dict]) -> None:
             for scenes in (CHOOSING, SHOWING):
                 own = [scene for scene in scenes if gains(rows, rule, trained, [scene], "fast")[0]]
                 for scene in own:
-                    took = f"{took_of(rows, rule, trained, scene) / took_of(rows, 'Adam', trained, scene):.2f}"
+                    took = over_adam(rows, rule, trained, scene)
                     everything.append([rule, trained, scene, *lines(rows, rule, trained, [scene]), took])
                 if len(own) > 1:
                     everything.append([rule, trained, ", ".join(own), *lines(rows, rule, trained, own), ""])
