@@ -163,7 +163,7 @@ def fit_for(checkout: Path, data: Path, seconds: int) -> dict:
         one = fit_once(checkout, data, folder / "one", 1, seconds)
         pilot = max(LEAST, round(PILOT * seconds * (LEAST - 1) / max(compiled - one, 1)))
         step = (fit_once(checkout, data, folder / "pilot", pilot, seconds) - one) / (pilot - 1)
-    return fit_of(checkout, data, seconds, max(LEAST, round((seconds - one) / step)))
+    return fit_of(checkout, data, seconds, max(LEAST, round((seconds - one) / step))) | {"first": one}
 
 
 def fit_of(checkout: Path, data: Path, seconds: int, steps: int) -> dict:
@@ -176,18 +176,24 @@ def fit_of(checkout: Path, data: Path, seconds: int, steps: int) -> dict:
     return {"steps": steps, "took": took, "psnr": seen}
 
 
+def fit_as_long(checkout: Path, data: Path, seconds: int, fit: dict, took: float) -> dict:
+    """A fit of as many steps as are to take so many processor seconds, by what another of them took."""
+    steps = round(fit["steps"] * (took - fit["first"]) / (fit["took"] - fit["first"]))
+    return fit_of(checkout, data, seconds, steps) | {"first": fit["first"]}
+
+
 def fits_compared(before: Path, data: Path, seconds: int) -> dict:
     """Fits of both checkouts, side by side: other work on the machine slows both.
 
     A short fit says badly what a step takes. Where one has taken much less than the other it is fitted again, with as
-    many steps as are to take as long as the other.
+    many steps as are to take as long as the other; `first` is what a fit of one step takes.
     """
     with ThreadPoolExecutor(2) as pool:
         old, new = pool.map(lambda checkout: fit_for(checkout, data, seconds), (before, ROOT))
     if old["took"] < ALIKE * new["took"]:
-        old = fit_of(before, data, seconds, round(old["steps"] * new["took"] / old["took"]))
+        old = fit_as_long(before, data, seconds, old, new["took"])
     elif new["took"] < ALIKE * old["took"]:
-        new = fit_of(ROOT, data, seconds, round(new["steps"] * old["took"] / new["took"]))
+        new = fit_as_long(ROOT, data, seconds, new, old["took"])
     return {"scene": data.name, "seconds": seconds, "before": old, "now": new}
 
 
