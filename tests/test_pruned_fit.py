@@ -56,6 +56,14 @@ def test_superfluous_gaussians_go_when_density_control_ends(dataset):  # noqa: F
     assert len(run_to(trainer, 20).rows) == left
 
 
+def test_a_photograph_whose_mask_keeps_nothing_is_left_out(dataset):  # noqa: F811
+    """It has no PSNR: a fit must not end in an error, with most of its steps done."""
+    trainer = run_to(trainer_of(dataset, prune_loss=0.3, refine_stop=0.8), 16)
+    trainer.frames[0].mask = torch.zeros(trainer.frames[0].pixels.shape[:2])
+    (event,) = trainer.component("pruning").before_density(trainer)
+    assert event["gaussians"] < event["before"]
+
+
 @pytest.mark.same_bits
 def test_off_has_the_bits_of_a_fit_without_it(dataset):  # noqa: F811
     assert same(*(run_to(trainer_of(dataset, with_row=x), 20) for x in (True, False)))
