@@ -42,7 +42,7 @@ from drgs.fitting.errors import fit_errors, is_cheap
 from drgs.fitting.frames import Frame, frames_for, warn_of_late_cameras
 from drgs.fitting.records import config_record, pick_seconds, seconds_of
 from drgs.fitting.renderers import renderers_to_measure
-from drgs.fitting.resolution import default_updates
+from drgs.fitting.resolution import updates_of
 from drgs.fitting.resume import keep_previous, last_checkpoint, lock_run
 from drgs.fitting.stages import fitted_times
 from drgs.fitting.start import start
@@ -214,8 +214,7 @@ def _fit(
         trainer = Trainer.from_state(setup.config, setup.frames, tensors, header, str(run.path), components)
         source, seconds = header["point_source"], seconds_of(run, header) or 0.0
     else:
-        if setup.config.data.updates_per_step is None:
-            setup.config = setup.config.replace(updates_per_step=default_updates(setup))
+        setup.config = setup.config.replace(updates_per_step=updates_of(setup))
         setup.views = plan.start_views() if plan else setup.train
         trainer, source = start(setup, begin)
         seconds = 0.0

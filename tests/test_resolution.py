@@ -18,9 +18,10 @@ from drgs.cameras import Camera, intrinsics, look_at
 from drgs.deform import FieldConfig
 from drgs.files import Run, load_state
 from drgs.fitting import metrics, resolution, trainer
+from drgs.fitting.components.base import Setup
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.losses import ssim_map
-from drgs.fitting.resolution import Resolution, halved_size
+from drgs.fitting.resolution import Resolution, halved_size, updates_of
 from drgs.selection import policies
 from drgs.train import FitConfig, Trainer, fit
 
@@ -219,6 +220,27 @@ def test_large_photographs_have_several_updates_by_default(dataset, tmp_path, mo
     monkeypatch.setattr(resolution, "LARGE", SIZE * SIZE + 1)
     assert updates("large", resume=True) == resolution.UPDATES
     assert updates("small") == 1
+
+
+@pytest.mark.parametrize(
+    ("field", "on", "off"),
+    [
+        ("teacher", {}, {"semantics": "ignore"}),
+        ("depth", {"depth": "auto"}, {}),
+        ("relative_depth", {"depth": "on"}, {}),
+    ],
+)
+def test_maps_are_not_fitted_to_by_parts(dataset, rng, field, on, off):  # noqa: F811
+    """A quarter of a photograph would be compared with the whole map of a teacher, or of depth."""
+    frames = [photograph(32, 24, rng, **{field: lambda: None})]
+
+    def updates(**use) -> int:
+        return updates_of(Setup(dataset, config(**use), [], [], [], (), [], frames=frames))
+
+    with pytest.raises(ValueError, match=r"updates_per_step must be 1 where .* fitted to, got 3; leave it out"):
+        updates(updates_per_step=3, **on)
+    assert updates(updates_per_step=3, **off) == 3
+    assert updates(updates_per_step=1, **on) == updates(**on) == 1
 
 
 def test_steps_alone_see_small_pictures(dataset, tmp_path, seen):  # noqa: F811

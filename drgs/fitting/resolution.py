@@ -158,15 +158,29 @@ class Resolution:
         )
 
 
-def default_updates(setup: Setup) -> int:
-    """`updates_per_step` of a fit that states none: several where photographs are large, in fits of the kind that this
-    was measured in: nothing moves, no teacher or depth map is fitted to, all views are fitted to from the start, and it
-    begins with points.
+def updates_of(setup: Setup) -> int:
+    """`updates_per_step` of a fit. Where it is not stated, several if photographs are large, in fits of the kind that
+    this was measured in: nothing moves, no teacher or depth map is fitted to, all views are fitted to from the start,
+    and it begins with points.
+
+    Raises:
+        ValueError: If several are stated and a teacher or depth maps are fitted to: of these a quarter has no part.
     """
-    config = setup.config
-    pixels = [frame.camera.width * frame.camera.height for frame in setup.frames]
-    is_plain = not (setup.modes & {"selection", "begin"} or setup.times or config.loss.depth != "off")
-    is_plain = is_plain and all(frame.teacher is None for frame in setup.frames)
+    config, frames, stated = setup.config, setup.frames, setup.config.data.updates_per_step
+    maps = {
+        "--semantics ignore": config.features.semantics != "ignore" and any(x.teacher for x in frames),
+        "--depth off": config.loss.depth != "off" and any(x.depth or x.relative_depth for x in frames),
+    }
+    without = " ".join(option for option, is_there in maps.items() if is_there)
+    if stated is not None:
+        if stated > 1 and without:
+            raise ValueError(
+                f"fit: updates_per_step must be 1 where a teacher or depth maps are fitted to, got {stated}; leave it "
+                f"out, or use {without}"
+            )
+        return stated
+    pixels = [frame.camera.width * frame.camera.height for frame in frames]
+    is_plain = not (setup.modes & {"selection", "begin"} or setup.times or without)
     least = max(LARGE, PIXELS_A_GAUSSIAN * config.density.max_gaussians)
     return UPDATES if is_plain and statistics.median(pixels) >= least else 1
 
