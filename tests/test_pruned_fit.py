@@ -64,6 +64,12 @@ def test_a_photograph_whose_mask_keeps_nothing_is_left_out(dataset):  # noqa: F8
     assert event["gaussians"] < event["before"]
 
 
+def test_density_control_must_end_before_the_fit(dataset, tmp_path):  # noqa: F811
+    """Else nothing would ever be removed."""
+    with pytest.raises(ValueError, match="refine_stop must be below 1 for prune_loss"):
+        fit(dataset, tmp_path / "run", config(prune_loss=0.3, refine_stop=1.0), progress=False)
+
+
 @pytest.mark.same_bits
 def test_off_has_the_bits_of_a_fit_without_it(dataset):  # noqa: F811
     assert same(*(run_to(trainer_of(dataset, with_row=x), 20) for x in (True, False)))

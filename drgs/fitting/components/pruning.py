@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from drgs.fitting.components.base import Checkpoint, Component, Fit
+from drgs.fitting.components.base import Checkpoint, Component, Fit, Setup
 from drgs.fitting.frames import Frame
 from drgs.fitting.pruning import prune
 
@@ -33,6 +33,19 @@ class PruningComponent(Component):
 
     def __init__(self) -> None:
         self.counts: list[int] = []
+
+    def prepare(self, setup: Setup) -> None:
+        """See `Component`.
+
+        Raises:
+            ValueError: If density control lasts as long as the fit.
+        """
+        density = setup.config.density
+        if density.prune_loss and density.refine_stop == 1:
+            raise ValueError(
+                "fit: refine_stop must be below 1 for prune_loss, which removes Gaussians when density control ends, "
+                "got 1; use --refine-stop 0.8, or leave --prune-loss out"
+            )
 
     def resume(self, fit: Fit, checkpoint: Checkpoint) -> None:
         """See `Component`."""
