@@ -3,7 +3,7 @@
     python benchmarks/planner.py DATA --frames 500           rows as they come, kept: benchmarks/planner.jsonl
     python benchmarks/planner.py DATA --frames 200 --bounds
     python benchmarks/planner.py DATA --frames 200 --memory
-    python benchmarks/planner.py --page                      the tables of docs/planner.md
+    python benchmarks/planner.py --page                      docs/planner.md and its data files
 
 DATA is a sequence with depth: `drgs scene room --views 560 --size 120x90 --test-every 10 -o DATA`, or a capture. Its
 training views come in their order, 10 steps of the fit after each, and after each one 30 of the held-out views are
@@ -37,7 +37,7 @@ import dataclasses  # noqa: E402
 import numpy as np  # noqa: E402
 from pages import fill_between  # noqa: E402
 from plan_views import depth_of, psnr  # noqa: E402
-from studies import rank_correlation  # noqa: E402
+from studies import PAGE_DATA, rank_correlation, write_csv  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
 import drgs  # noqa: E402
@@ -51,7 +51,7 @@ CANDIDATES = 30
 STEPS = 10
 SECONDS = 1.0
 COMPARED_EVERY = 10
-WINDOW = 100  # photographs of a line of the table
+WINDOW = 100  # photographs of a line of the data file
 
 
 def measure(path: Path, frames: int, bounds: bool, memory: bool) -> None:
@@ -170,61 +170,58 @@ def compared(
     return rows
 
 
-def tables(rows: list[dict]) -> str:
-    """Latency and memory by hundreds of photographs, and bounds against what is asked and how right it is."""
+def summary(rows: list[dict]) -> str:
+    """What the page says: ranges over the hundreds of photographs but the first, in which the planner fills up."""
+    heads, *lines = photographs(rows)
     parts = []
     for name in dict.fromkeys(row["data"] for row in rows):
-        mine = [row for row in rows if row["data"] == name]
-        frames = [row for row in mine if row["what"] == "photograph"]
+        frames = [row for row in rows if row["data"] == name and row["what"] == "photograph"]
         last = frames[-1]
+        columns = zip(*[line for line in lines if line[0] == name][1:], strict=True)
+        told = {
+            head: f"{min(cells, key=float)} to {max(cells, key=float)}"
+            for head, cells in zip(heads, columns, strict=True)
+            if head.endswith("_median") or head == "computed"
+        }
         parts.append(
             paragraph(
-                f"`{name}`: {len(frames)} photographs, {last['machine']}, {last['date']}, commit {last['commit'][:7]}. "
-                "Seconds are medians, in brackets the largest; memory is the peak of the process so far."
+                f"`{name}`: {len(frames)} photographs, {last['gaussians']:,} Gaussians, {last['machine']}, "
+                f"{last['date']}, commit {last['commit'][:7]}. From photograph {WINDOW + 1} on, as medians of "
+                f"hundreds, `observe` takes {told['observe_median']} s, `scores` {told['scores_median']} s and `next` "
+                f"{told['next_median']} s; `scores` computes {told['computed']} views on average; the process has "
+                f"held {last['memory'] / 1e9:.2f} GB at most ([by hundreds](data/planner.csv))."
             )
         )
-        lines = []
+    return "\n\n".join(parts)
+
+
+def photographs(rows: list[dict]) -> list[list[str]]:
+    """A data file: latency and memory by hundreds of photographs."""
+    timed = ("observe", "scores", "next")
+    heads = [f"{name}_{kind}" for name in timed for kind in ("median", "largest")]
+    lines = [["data", "last", "gaussians", "kept", *heads, "computed", "changed_median", "memory_gb", "held_out_db"]]
+    for name in dict.fromkeys(row["data"] for row in rows):
+        frames = [row for row in rows if row["data"] == name and row["what"] == "photograph"]
         for begin in range(0, len(frames), WINDOW):
             own = frames[begin : begin + WINDOW]
-            cells = [f"{np.median([x[k] for x in own]):.2f} ({max(x[k] for x in own):.1f})"
-                     for k in ("observe", "scores", "next")]  # fmt: skip
-            quality = [x["psnr"] for x in own if "psnr" in x]
-            lines.append(
-                [
-                    f"{begin + 1} to {begin + len(own)}",
-                    f"{own[-1]['gaussians']:,}",
-                    str(own[-1]["known"]),
-                    *cells,
-                    f"{np.mean([x['computed'] for x in own]):.1f}",
-                    f"{np.median([x['changed'] for x in own]):.2f}",
-                    f"{own[-1]['memory'] / 1e9:.2f} GB",
-                    f"{quality[-1]:.1f} dB" if quality else "",
-                ]
-            )
-        heads = ["photographs", "Gaussians", "kept", "observe", "scores", "next, 3 picks", "views computed", "changed",
-                 "memory", "held out"]  # fmt: skip
-        parts.append(markdown_table(heads, lines))
-        compared = [row for row in mine if row["what"] == "bound"]
-        lines = []
-        for bound in BOUNDS:
-            own = [row for row in compared if row["bound"] == bound]
-            if own:
-                asked, seconds, tau, short = (
-                    np.mean([x[k] for x in own]) for k in ("computed", "seconds", "tau", "short")
-                )
-                worst = min(x["tau"] for x in own)
-                lines.append(
-                    [f"{bound:g}", f"{asked:.1f}", f"{seconds:.2f}", f"{tau:.3f} ({worst:.2f})", f"{100 * short:.1f} %"]
-                )
-        if lines:
-            count = len({row["number"] for row in compared})
-            parts.append(paragraph(f"Bounds, {count} models, ten photographs apart; in brackets the worst:"))
-            parts.append(
-                markdown_table(
-                    ["bound", "views computed", "seconds", "Kendall's tau", "best view falls short by"], lines
-                )
-            )
-    return "\n\n".join(parts)
+            cells = [f"{of([x[key] for x in own]):.2f}" for key in timed for of in (np.median, max)]
+            cells += [f"{np.mean([x['computed'] for x in own]):.1f}", f"{np.median([x['changed'] for x in own]):.2f}"]
+            quality = [f"{x['psnr']:.1f}" for x in own if "psnr" in x]
+            cells += [f"{own[-1]['memory'] / 1e9:.2f}", quality[-1] if quality else ""]
+            lines.append([name, str(begin + len(own)), str(own[-1]["gaussians"]), str(own[-1]["known"]), *cells])
+    return lines
+
+
+def bounds_sheet(rows: list[dict]) -> list[list[str]]:
+    """A data file: bounds against what is computed and how right it is, as means over models."""
+    lines = [["data", "bound", "models", "computed", "seconds", "tau", "worst_tau", "short_percent"]]
+    compared = [row for row in rows if row["what"] == "bound"]
+    for name, bound in sorted({(row["data"], row["bound"]) for row in compared}):
+        own = [row for row in compared if (row["data"], row["bound"]) == (name, bound)]
+        asked, seconds, tau, short = (np.mean([x[k] for x in own]) for k in ("computed", "seconds", "tau", "short"))
+        cells = [f"{bound:g}", str(len(own)), f"{asked:.1f}", f"{seconds:.2f}", f"{tau:.3f}"]
+        lines.append([name, *cells, f"{min(x['tau'] for x in own):.2f}", f"{100 * short:.1f}"])
+    return lines
 
 
 def memory_table(rows: list[dict]) -> list[str]:
@@ -251,15 +248,17 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=500)
     parser.add_argument("--bounds", action="store_true", help="compare bounds")
     parser.add_argument("--memory", action="store_true", help="measure memory alone")
-    parser.add_argument("--page", action="store_true", help="write the tables of what is there")
+    parser.add_argument("--page", action="store_true", help="write what is there to the page and its data files")
     args = parser.parse_args()
     if args.data is not None:
         measure(args.data, args.frames, args.bounds, args.memory)
     rows = read_rows(ROWS)
-    text = tables(rows)
+    text = summary(rows)
     print("\n\n".join([text, *memory_table([row for row in rows if row["what"] == "memory"])]))
     if args.page:
         fill_between(PAGE, "planner", text)
+        write_csv(PAGE_DATA / "planner.csv", photographs(rows))
+        write_csv(PAGE_DATA / "planner-bounds.csv", bounds_sheet(rows))
 
 
 if __name__ == "__main__":
