@@ -77,7 +77,7 @@ WAYS: dict[str, dict] = {
     "pieces kept": {"min_piece": 0.0},
 }
 """Name -> what is done in another way than by default; but for the first, nothing is cut that is uncertain."""
-SHOWN = ("default", "no crop", "expected depth", "trunc 2", "trunc 8", "voxel / 2", "voxel x 2", "crop 0.5")
+SHOWN = ("default", "expected depth", "voxel / 2", "crop 0.5")
 """Ways of the page; the others are in the data file."""
 
 
