@@ -3,9 +3,9 @@
     python benchmarks/share.py runs/scene [runs/other ...] [--views 3] [--pixels 250000]
     python benchmarks/share.py --page
 
-Appends one row a run and view to benchmarks/share.jsonl, leaves out what is there, then writes the table of
-docs/share.md. Three numbers a view, in dB: `page` is a screenshot in headless Chromium beside `gsplat` of the run's own
-Gaussians; it is made of `archive`, what SOG loses (our `gsplat` of what the page holds beside that of the run's), and
+Appends one row a run and view to benchmarks/share.jsonl, leaves out what is there, then writes the paragraph of
+docs/share.md and docs/data/share.csv. Three numbers a view, in dB: `page` is a screenshot in headless Chromium
+beside `gsplat` of the run's own Gaussians; it is made of `archive`, what SOG loses (our `gsplat` of what the page holds beside that of the run's), and
 `rules`, how Spark draws (the screenshot beside our `gsplat` of what the page holds). Needs playwright and Chromium.
 """
 
@@ -29,6 +29,7 @@ import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from pages import fill_between  # noqa: E402
+from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
 from drgs.cameras import Camera  # noqa: E402
@@ -41,6 +42,7 @@ from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.integrator import render  # noqa: E402
 from drgs.pages.sharing.write import write_page  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
+from drgs.studies.tables import paragraph  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "share.jsonl"
 PAGE = ROOT / "docs" / "share.md"
@@ -52,7 +54,7 @@ _KINDS = ("page", "archive", "rules")
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("runs", nargs="*", type=Path)
-    parser.add_argument("--page", action="store_true", help="measure nothing, write the table of what is there")
+    parser.add_argument("--page", action="store_true", help="measure nothing, write what is there")
     parser.add_argument("--views", type=int, default=3, help="views of each, evenly over its photographs")
     parser.add_argument("--pixels", type=int, default=250_000, help="of a picture, at most")
     parser.add_argument("--chromium", default="/usr/bin/chromium")
@@ -65,21 +67,41 @@ def main() -> None:
             browser = driver.chromium.launch(executable_path=args.chromium, args=_FLAGS)
             for run in args.runs:
                 _measure(browser, run, Path(folder), args)
-    text = table(read_rows(ROWS))
+    lines = sheet(read_rows(ROWS))
+    text = summary(lines)
     print(text)
     fill_between(PAGE, "share", text)
+    write_csv(PAGE_DATA / "share.csv", lines)
 
 
-def table(rows: list[dict]) -> str:
-    """A row a run, with the least and the largest of its views."""
-    lines = ["| run | Gaussians | bytes each | page (MB) | page (dB) | archive (dB) | rules (dB) |", "|---" * 7 + "|"]
+def sheet(rows: list[dict]) -> list[list[str]]:
+    """The data file: a line a run, with the least and the largest PSNR of its views."""
+    ends = [f"{kind}_{end}_db" for kind in _KINDS for end in ("least", "most")]
+    lines = [["run", "gaussians", "bytes_a_gaussian", "page_mb", *ends]]
     for run in dict.fromkeys(row["run"] for row in rows):
         mine = [row for row in rows if row["run"] == run]
         first = mine[0]
-        ranges = (f"{min(x):.1f} to {max(x):.1f}" for x in ([row[key] for row in mine] for key in _KINDS))
-        size = f"{first['archive_bytes'] / first['gaussians']:.1f} | {first['page_bytes'] / 1e6:.1f}"
-        lines.append(f"| `{run}` | {first['gaussians']:,} | {size} | {' | '.join(ranges)} |")
-    return "\n".join(lines)
+        size = [f"{first['archive_bytes'] / first['gaussians']:.1f}", f"{first['page_bytes'] / 1e6:.1f}"]
+        numbers = [f"{end(row[kind] for row in mine):.1f}" for kind in _KINDS for end in (min, max)]
+        lines.append([run, str(first["gaussians"]), *size, *numbers])
+    return lines
+
+
+def summary(lines: list[list[str]]) -> str:
+    """Ranges over all runs, for the page."""
+    heads, *runs = lines
+    columns = dict(zip(heads, zip(*runs, strict=True), strict=True))
+    page, archive, rules = (
+        f"{min(columns[f'{kind}_least_db'], key=float)} to {max(columns[f'{kind}_most_db'], key=float)} dB"
+        for kind in _KINDS
+    )
+    few, many = (f"{end(map(int, columns['gaussians'])):,}" for end in (min, max))
+    return paragraph(
+        f"In {len(runs)} runs of {few} to {many} Gaussians the PSNR of a screenshot in headless Chromium (WebGL in "
+        f"software) against `drgs.render`, preset `gsplat`, of the run's Gaussians is {page}. For packing as SOG alone it "
+        f"is {archive}; of the screenshot against preset `gsplat` of the packed Gaussians {rules} ([each "
+        f"run](data/share.csv))."
+    )
 
 
 def _measure(browser, run: Path, folder: Path, args: argparse.Namespace) -> None:
