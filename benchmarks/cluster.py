@@ -1,7 +1,8 @@
 """A pick among 80 candidates by 1, 2 and 5 worker processes: seconds, bytes, and whether the bits are the same.
 
     python benchmarks/cluster.py [--candidates 80] [--gaussians 4000] [--counts 1 2 5] [--print]
-                                                        the table of docs/many-machines.md, benchmarks/cluster.json
+
+Writes benchmarks/cluster.json, docs/data/cluster.csv and the paragraph of docs/many-machines.md.
 
 Run it with DRGS_THREADS=1, so that the process without workers computes as one worker does, on a machine that does
 little else: the load beside each row says whether it did. The same pick is made once before it is timed, in each
@@ -15,7 +16,6 @@ import dataclasses
 import json
 import os
 import sys
-import textwrap
 import time
 from pathlib import Path
 
@@ -25,6 +25,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: tor
 
 import numpy as np  # noqa: E402
 from pages import fill_between  # noqa: E402
+from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
@@ -33,6 +34,7 @@ from drgs.cluster.connect import opened  # noqa: E402
 from drgs.cluster.payloads import Payload  # noqa: E402
 from drgs.io.outputs import write_json  # noqa: E402
 from drgs.select import Selection, select  # noqa: E402
+from drgs.studies.tables import paragraph  # noqa: E402
 
 KNOWN = 4
 SIZE = 160, 120
@@ -144,31 +146,32 @@ def measured(arguments: argparse.Namespace) -> dict:
     }
 
 
-def report(r: dict) -> str:
-    """The table, and a line above it."""
-    where = r["ran"]
-    about = (
-        f"`python benchmarks/cluster.py`, {where['machine']}, {where['date']}, commit {where['commit']}: "
-        f"{r['candidates']} candidates, {r['known']} training views, {r['size'][0]}x{r['size'][1]}, {r['gaussians']} "
-        f"Gaussians, criterion v_opt with a backdrop. The scene is {r['scene_bytes'] / 1e6:.2f} MB for each worker."
-    )
-    lines = [
-        *textwrap.wrap(about, 120),
-        "",
-        "| workers | load before | start, s | pick, s | a view on its worker, s | of these CPU "
-        "| this process, CPU a view, s | back, KB a view | same bits |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+def sheet(r: dict) -> list[list[str]]:
+    """The data file: a line for each number of workers; the first is of none."""
+    heads = ["workers", "load_before", "start_s", "pick_s", "view_on_worker_s", "view_on_worker_cpu_s"]
+    lines = [[*heads, "own_cpu_a_view_s", "kilobytes_a_view", "same_bits"]]
     for row in r["rows"]:
-        count, views = row["workers"], row["views"]
-        each = "-" if not count else f"{row['worker_seconds'] / views:.3f}"
-        cpu = "-" if not count else f"{row['worker_cpu_seconds'] / views:.3f}"
-        back = "-" if not count else f"{row['received_bytes'] / views / 1e3:.0f}"
-        lines.append(
-            f"| {count or 'none'} | {row['load']:.1f} | {row['start_seconds']:.1f} | {row['seconds']:.1f} | {each} "
-            f"| {cpu} | {row['own_cpu_seconds'] / views:.4f} | {back} | {'yes' if row['same_bits'] else '**no**'} |"
-        )
-    return "\n".join(lines)
+        views = row["views"]
+        of_workers = ("worker_seconds", "worker_cpu_seconds")
+        each = [f"{row[key] / views:.3f}" if row["workers"] else "" for key in of_workers]
+        back = f"{row['received_bytes'] / views / 1e3:.0f}" if row["workers"] else ""
+        seconds = [f"{row[key]:.1f}" for key in ("load", "start_seconds", "seconds")]
+        own = f"{row['own_cpu_seconds'] / views:.4f}"
+        lines.append([str(row["workers"]), *seconds, *each, own, back, "yes" if row["same_bits"] else "no"])
+    return lines
+
+
+def report(r: dict) -> str:
+    """The paragraph of the page."""
+    where, (alone, *others) = r["ran"], r["rows"]
+    seconds = ", ".join(f"{row['seconds']:.1f} s with {row['workers']}" for row in others)
+    same = all(row["same_bits"] for row in others)
+    return paragraph(
+        f"A pick among {r['candidates']} candidates with {r['known']} training views, {r['size'][0]}x{r['size'][1]}, "
+        f"of {r['gaussians']:,} Gaussians by `v_opt` takes {alone['seconds']:.1f} s without workers, {seconds}, with "
+        f"{'the same' if same else '**other**'} bits ([all numbers](data/cluster.csv); `python benchmarks/cluster.py`, "
+        f"{where['machine']}, {where['date']}, commit {where['commit']})."
+    )
 
 
 def main() -> None:
@@ -176,13 +179,14 @@ def main() -> None:
     parser.add_argument("--candidates", type=int, default=80)
     parser.add_argument("--gaussians", type=int, default=4000)
     parser.add_argument("--counts", type=int, nargs="+", default=[1, 2, 5])
-    parser.add_argument("--print", action="store_true", help="only make the table of what was measured before")
+    parser.add_argument("--print", action="store_true", help="only write what was measured before")
     arguments = parser.parse_args()
     path = ROOT / "benchmarks" / "cluster.json"
     if not arguments.print:
         write_json(path, measured(arguments))
     text = report(json.loads(path.read_text()))
     fill_between(ROOT / "docs" / "many-machines.md", "cluster", text)
+    write_csv(PAGE_DATA / "cluster.csv", sheet(json.loads(path.read_text())))
     print(text)
 
 
