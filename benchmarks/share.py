@@ -5,8 +5,9 @@
 
 Appends one row a run and view to benchmarks/share.jsonl, leaves out what is there, then writes the paragraph of
 docs/share.md and docs/data/share.csv. Three numbers a view, in dB: `page` is a screenshot in headless Chromium
-beside `gsplat` of the run's own Gaussians; it is made of `archive`, what SOG loses (our `gsplat` of what the page holds beside that of the run's), and
-`rules`, how Spark draws (the screenshot beside our `gsplat` of what the page holds). Needs playwright and Chromium.
+beside `gsplat` of the run's own Gaussians; it is made of `archive`, what SOG loses (our `gsplat` of what the page holds
+beside that of the run's), and `rules`, how Spark draws (the screenshot beside our `gsplat` of what the page holds).
+Needs playwright and Chromium.
 """
 
 from __future__ import annotations
@@ -98,8 +99,8 @@ def summary(lines: list[list[str]]) -> str:
     few, many = (f"{end(map(int, columns['gaussians'])):,}" for end in (min, max))
     return paragraph(
         f"In {len(runs)} runs of {few} to {many} Gaussians the PSNR of a screenshot in headless Chromium (WebGL in "
-        f"software) against `drgs.render`, preset `gsplat`, of the run's Gaussians is {page}. For packing as SOG alone it "
-        f"is {archive}; of the screenshot against preset `gsplat` of the packed Gaussians {rules} ([each "
+        f"software) against `drgs.render`, preset `gsplat`, of the run's Gaussians is {page}. For packing as SOG alone "
+        f"it is {archive}; of the screenshot against preset `gsplat` of the packed Gaussians {rules} ([each "
         f"run](data/share.csv))."
     )
 
