@@ -4,7 +4,7 @@
     python benchmarks/chain.py --page            measures nothing
 
 Random scenes of 12 Gaussians (SH degree 0, 156 parameters), Jacobians of the float64 oracle at 12x10 pixels; 1, 2 or 4
-training views and 8 candidates in random directions. Both write docs/data/criteria.csv and the table of docs/
+training views and 8 candidates in random directions. Both write docs/data/criteria.csv and the paragraph of docs/
 information.md.
 """
 
@@ -28,7 +28,7 @@ from where import ran  # noqa: E402
 from drgs import reference  # noqa: E402
 from drgs.gain import dense  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.studies.tables import markdown_table, paragraph  # noqa: E402
+from drgs.studies.tables import paragraph  # noqa: E402
 
 RESULTS = ROOT / "benchmarks" / "chain.json"
 DATA = ROOT / "docs" / "data" / "criteria.csv"
@@ -96,24 +96,19 @@ def groups(rows: list[dict]) -> dict[tuple, dict[str, float]]:
 def text(result: dict) -> str:
     """What the page says: ranges over lambda and the numbers of training views."""
     found = groups(result["rows"])
-    lines = []
+    told = []
     for form in FORMS:
         own = [x for (_, _, name), x in found.items() if name == form]
-        ratios = [x["ratio_median"] for x in own]
-        taus = [x["tau"] for x in own]
-        means = [100 * x["regret"] for x in own]
-        lines.append(
-            [
-                f"`{form}`",
-                f"{min(ratios):.2g} to {max(ratios):.2g}",
-                f"{min(taus):.2f} to {max(taus):.2f}",
-                f"{min(means):.1f} to {max(means):.1f} %",
-                f"{100 * max(x['worst_regret'] for x in own):.0f} %",
-            ]
+        ratios, means = [x["ratio_median"] for x in own], [100 * x["regret"] for x in own]
+        worst = 100 * max(x["worst_regret"] for x in own)
+        told.append(
+            f"`{form}` {min(ratios):.2g} to {max(ratios):.2g}, {min(means):.1f} to {max(means):.1f} % ({worst:.0f} %)"
         )
-    heads = ["form", "median ratio", "Kendall tau", "mean regret", "worst"]
-    made = f"`python benchmarks/chain.py`, {result['machine']}, {result['date']}, commit {result['commit']}."
-    return f"{paragraph(made)}\n\n{markdown_table(heads, lines)}"
+    return paragraph(
+        f"Median ratio to the mutual information, mean regret and the worst one: {'; '.join(told)} ([each "
+        f"case](data/criteria.csv); `python benchmarks/chain.py`, {result['machine']}, {result['date']}, commit "
+        f"{result['commit']})."
+    )
 
 
 def main():

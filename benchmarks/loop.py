@@ -86,10 +86,7 @@ def report(r: dict) -> str:
     ]
     for preset, row in r["rows"].items():
         (all_a, all_b), (one_a, one_b) = row["all"], row["later"]
-        told.append(
-            f"`{preset}` {all_a:.0f} and {all_b:.0f} s ({all_a / all_b:.1f} times less), a later pick {one_a:.1f} and "
-            f"{one_b:.1f} s ({one_a / one_b:.1f} times);"
-        )
+        told.append(f"`{preset}` {all_a:.0f} and {all_b:.0f} s, a later pick {one_a:.1f} and {one_b:.1f} s;")
     told.append(
         f"the picks are the same, {r['bytes'] / 1e6:.0f} MB were kept (`python benchmarks/loop.py`, {r['machine']}, "
         f"{r['date']}, commit {r['commit']})."
