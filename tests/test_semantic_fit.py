@@ -162,13 +162,14 @@ def test_features_leave_the_geometry_alone(taught, size, monkeypatch):
 
     What the features say about the weights of compositing is computed where it is coupled only.
     """
-    grads, computed, scalars = [], [], Weights.scalars
+    grads, computed, gradient = [], [], Weights.gradient
 
-    def noted(weights, *arguments):
-        computed.append(len(grads))
-        return scalars(weights, *arguments)
+    def noted(weights, buffer, cotangent, out, features):
+        if features is not None:
+            computed.append(len(grads))
+        return gradient(weights, buffer, cotangent, out, features)
 
-    monkeypatch.setattr(Weights, "scalars", noted)
+    monkeypatch.setattr(Weights, "gradient", noted)
     for fields in ({}, {"couple_features": True}):
         trainer = semantic_trainer(taught, feature_resolution=size, **fields)
         # Features of 0 have no gradient with respect to where they are.
