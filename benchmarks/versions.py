@@ -48,6 +48,9 @@ ALIKE = 0.85  # share of the other's processor seconds from which on two fits ha
 SIZES = {60: (30_000, 12_000), 300: (60_000, 20_000), 900: (130_000, 30_000)}
 """Processor seconds of a fit -> pixels of a photograph and Gaussians, at most: what that time is enough for."""
 SEEN = ("fast", "exact", "gsplat", "3dgut")
+CHOOSING = ("banana", "fern", "statue", "office", "watch", "blowtorch")
+"""Captures on which updates a step (the first three), the trial of gains and guesses beside points (the last three)
+were chosen; a mean of its own is of the others."""
 
 
 def frames(scene: str) -> dict[str, Callable[[], object]]:
@@ -214,12 +217,13 @@ def fits_table() -> str:
             old, new = zip(*((before[view], now[view]) for view in before if view in now), strict=True)
             mean, worst = statistics.mean(new) - statistics.mean(old), min(new) - min(old)
             line.append(f"{statistics.mean(new):.2f} ({mean:+.2f} / {worst:+.2f})")
-            gains.setdefault((row["seconds"], name), []).append((mean, worst))
+            for of in ("mean", *(["mean of those that chose nothing"] * (row["scene"] not in CHOOSING))):
+                gains.setdefault((of, row["seconds"], name), []).append((mean, worst))
         lines.append(line)
-    for seconds in dict.fromkeys(seconds for seconds, _ in gains):
-        line = ["**mean**", str(seconds), "", ""]
+    for of, seconds in dict.fromkeys(key[:2] for key in gains):
+        line = [f"**{of}**", str(seconds), "", ""]
         for name in SEEN:
-            mean, worst = (statistics.mean(x) for x in zip(*gains[seconds, name], strict=True))
+            mean, worst = (statistics.mean(x) for x in zip(*gains[of, seconds, name], strict=True))
             line.append(f"{mean:+.2f} / {worst:+.2f}")
         lines.append(line)
     return markdown_table(["data", "seconds", "taken", "steps", *(f"`{name}`" for name in SEEN)], lines)

@@ -42,8 +42,8 @@ WHOLE = 0.8
 """Fraction of the steps from which on an update sees a whole photograph: density control ends there, too."""
 
 LARGE = 25_000
-"""Pixels of a photograph, the median, from which on a step of a plain fit is several updates: measured with 30,000 at
-most, which makes some of them smaller (docs/one-model.md)."""
+"""Pixels of a photograph, the median, from which on a step of a plain fit is several updates: measured at
+`--max-pixels` 30,000, which leaves photographs of some shapes a little smaller (docs/one-model.md)."""
 
 PIXELS_A_GAUSSIAN = 2.0
 """Pixels of a photograph over the largest number of Gaussians, from which on likewise: what an update costs by Gaussian
@@ -164,7 +164,8 @@ def updates_of(setup: Setup) -> int:
     and it begins with points.
 
     Raises:
-        ValueError: If several are stated and a teacher or depth maps are fitted to: of these a quarter has no part.
+        ValueError: If several are stated and a teacher or depth maps are fitted to: a quarter of a photograph would be
+            compared with the whole map.
     """
     config, frames, stated = setup.config, setup.frames, setup.config.data.updates_per_step
     maps = {
