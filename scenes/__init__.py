@@ -12,6 +12,7 @@ import json
 import numpy as np
 
 from drgs.display.srgb import linear_from_srgb, srgb_from_linear
+from drgs.io import interrupts
 from drgs.scenes.output import DEPTH_UNIT, write_depth, write_png
 
 __all__ = [
@@ -239,6 +240,17 @@ def sensor(K, width, height):
     )
 
 
+def traced(scene, camera, integrator, spp, seed):
+    """(height, width, 3) linear radiance of a view.
+
+    Mitsuba makes a RuntimeError of what is raised inside: a signal ends the command there.
+    """
+    import mitsuba as mi
+
+    with interrupts.in_native_code():
+        return np.asarray(mi.render(scene, sensor=camera, integrator=integrator, spp=spp, seed=seed))
+
+
 def aim(sensor, c2w):
     """Give a sensor the pose c2w (4, 4). Mitsuba's camera has +x to the left and +y up."""
     import mitsuba as mi
@@ -345,8 +357,7 @@ def write_views(folder, scene, K, poses, width, height, *, spp, max_depth, expos
         name = f"{i:03d}.png"
         if not (folder / "images" / name).exists():  # written last: with it, the view is finished
             aim(camera, c2w)
-            image = mi.render(scene, sensor=camera, integrator=integrator, spp=spp, seed=seed * 65536 + i)
-            image = encode_srgb(np.asarray(image) * exposure)
+            image = encode_srgb(traced(scene, camera, integrator, spp, seed * 65536 + i) * exposure)
             write_depth(folder / "depth" / name, z_depth(scene, K, c2w, width, height))
             write_png(folder / "images" / name, image[..., ::-1])  # as BGR
         frames.append(

@@ -195,10 +195,7 @@ def _trace(folder, built, cast, K, poses, size, spp, seed, progress):
                 light = {"seen": built(cast.extra(k)), "empty": empty}
             depth = scenes.z_depth(light["seen"], K, c2w, *size)
             # With the same seed, a pixel has the same paths where nobody stands in their way: what differs is real.
-            light = {
-                name: np.asarray(mi.render(s, sensor=camera, integrator=integrator, spp=spp, seed=seed * 65536 + k))
-                for name, s in light.items()
-            }
+            light = {name: scenes.traced(s, camera, integrator, spp, seed * 65536 + k) for name, s in light.items()}
             hidden = folder / "light" / ".part.npz"
             np.savez(hidden, depth=depth, **light)
             hidden.replace(path)

@@ -205,10 +205,10 @@ class _Recording:
         scenes.aim(sensor, c2w)
         integrator = mi.load_dict({"type": "direct", "emitter_samples": _LIGHT_SAMPLES, "bsdf_samples": 1})
         seed = self.seed * 65536 + camera
-        image = mi.render(self.stage.scene, sensor=sensor, integrator=integrator, spp=self.spp, seed=seed)
+        image = scenes.traced(self.stage.scene, sensor, integrator, self.spp, seed)
         output.write_png(label_path, labels)
         output.write_file(feature_path, teacher.tensor_bytes(feature))
-        image = scenes.encode_srgb(np.asarray(image) * self.play.exposure)
+        image = scenes.encode_srgb(image * self.play.exposure)
         output.write_png(image_path, image[..., ::-1])  # as BGR; last, since with it the frame is finished
 
     def _visible_surfaces(self, camera):

@@ -257,11 +257,11 @@ class _Views:
                 feature = teacher.feature_map(labels, points, CLASSES, self.teacher_size, self.seed, k)
                 scenes.aim(camera, c2w)
                 seed = self.seed * 65536 + k
-                image = mi.render(built, sensor=camera, integrator=integrator, spp=self.spp, seed=seed)
+                image = scenes.traced(built, camera, integrator, self.spp, seed)
                 output.write_png(label_path, labels)
                 output.write_depth(depth_path, depth)
                 output.write_file(feature_path, teacher.tensor_bytes(feature))
-                image = scenes.encode_srgb(np.asarray(image) * _EXPOSURE)
+                image = scenes.encode_srgb(image * _EXPOSURE)
                 output.write_png(image_path, image[..., ::-1])  # as BGR; last, since with it the view is finished
             if progress is not None:
                 progress(k + 1, len(poses))
