@@ -262,7 +262,7 @@ def _result_of(loop: _Loop) -> FitResult:
             held_out or trainer.photographs(),
             renderers_to_measure(config.renderers, config.settings, lenses=config.data.undistort == "off"),
             "test" if held_out else "train",
-            None if held_out else metrics.TRAIN_VIEWS,
+            metrics.most_views(config.max_steps) if held_out else metrics.TRAIN_VIEWS,
             options.get("as_photograph"),
         ),
         **chosen,

@@ -220,6 +220,16 @@ def test_a_fit_without_held_out_views_is_measured_in_some(dataset, tmp_path):  #
     assert metrics.through_renderers(None, [], {}, "test") is None
 
 
+def test_a_short_fit_draws_some_of_many_held_out_views(dataset, tmp_path, monkeypatch):  # noqa: F811
+    """All of them take longer than its steps; the table then has no worst view."""
+    monkeypatch.setattr(metrics, "TRAIN_VIEWS", 2)
+    found = fit(dataset, tmp_path / "run", config(max_steps=1, test_every=2), progress=False).metrics
+    assert (found["count"], found["renderers"]["of"]) == (5, 5)
+    assert [len(row["views"]) for row in found["renderers"]["rows"]] == [2, 2]
+    assert "2 of 5 test views" in renderers_table(found)[0]
+    assert metrics.most_views(1600) == 100
+
+
 def test_own_settings_have_a_row_of_their_own():
     """With the fields that they replace, and not twice."""
     other = FAST.replace(extent=4.0)
