@@ -159,6 +159,25 @@ def test_cameras_keep_their_distance(built):
         assert built[0].ray_intersect_preliminary(ray, coherent=False).t.numpy().min() > 0.3  # 0.35 by 400 other rays
 
 
+def test_free_cameras_stand_anywhere_and_look_anywhere(built):
+    """In the room, not in a thing; about a third 20 cm in front of one, the others 35 cm from everything."""
+    layout = room.Layout(0)
+    poses = room.free_poses(layout, built[0], 48, 3)
+    assert np.array_equal(poses, room.free_poses(layout, built[0], 48, 3))
+    eyes, forward = poses[:, :3, 3], poses[:, :3, 2]
+    assert (np.abs(eyes[:, :2]) < np.array(layout.size[:2]) / 2).all()
+    around = [room._distances(built[0], eye, room._around()) for eye in eyes]
+    nearest = np.array([distance.min() for distance, _ in around])
+    ahead = np.array([room._distances(built[0], eye, way[None])[0][0] for eye, way in zip(eyes, forward, strict=True)])
+    is_near = np.abs(ahead - 0.2) < 1e-3
+    assert 0.2 < is_near.mean() < 0.5
+    assert (nearest[~is_near] > 0.35).all()
+    assert (nearest > 0.1).all()
+    assert min(is_front.mean() for _, is_front in around) > 0.9
+    assert np.linalg.norm(forward.mean(0)) < 0.4  # in all directions
+    assert np.allclose(np.linalg.det(poses[:, :3, :3]), 1)
+
+
 def test_teacher_errs_as_stated(built):
     """At 80x60, 78 to 88 % of the pixels are right, fewer at boundaries; two views err in different places."""
     vectors = teacher.embeddings(room.CLASSES)

@@ -843,6 +843,12 @@ class Scene(Common):
         None, "WIDTHxHEIGHT of the teacher's feature maps; default 80x60 (room), 60x45 (kitchen), 40x30 (hall)."
     )
     test_every: int | None = option(None, "Hold out every n-th view (room); default 5, which is 15 of 75 views.")
+    free: bool = option(
+        False,
+        "Cameras anywhere in free space (room), looking anywhere, a third of them at a surface 20 cm away, in place of "
+        "a walk through its middle.",
+        heading="Views",
+    )
     exposure: Literal["auto", "fixed"] | None = option(
         None, "Exposure and white balance (capture): automatic and drifting (auto, the default), or the same for all."
     )

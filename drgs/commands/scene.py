@@ -21,6 +21,7 @@ _ONLY = {  # options that not every scene has
     "--times": ("kitchen", "hall"),
     "--teacher-size": ("room", "kitchen", "hall"),
     "--test-every": ("room",),
+    "--free": ("room",),
     "--exposure": ("capture",),
     "--wall": ("capture",),
     "--no-shadow": ("capture",),
@@ -37,6 +38,7 @@ def run(args: Scene) -> None:
         "--times": args.times,
         "--teacher-size": args.teacher_size,
         "--test-every": args.test_every,
+        "--free": args.free or None,
         "--exposure": args.exposure,
         "--wall": args.wall,
         "--no-shadow": None if args.shadow else False,
@@ -51,6 +53,8 @@ def run(args: Scene) -> None:
     numbers: dict[str, Any] = {"seed": args.seed} | {
         name: getattr(args, name) for name in names if getattr(args, name) is not None
     }
+    if args.free:
+        numbers["free"] = True
     if args.name == "capture":
         numbers |= {"shadow": args.shadow, "passer_by": args.passer_by}
     if args.pose_error is not None:
