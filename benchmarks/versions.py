@@ -200,15 +200,20 @@ def fits_compared(before: Path, data: Path, seconds: int) -> dict:
     return {"scene": data.name, "seconds": seconds, "before": old, "now": new}
 
 
-def fits_table() -> str:
-    """Held-out PSNR of the second checkout by scene and renderer, its gains on average and in the worst view."""
+def last_rows() -> list[dict]:
+    """The last row of each scene and number of seconds, by seconds."""
     from where import read_rows
 
+    rows = {(row["seconds"], row["scene"]): row for row in read_rows(FIT_ROWS)}
+    return sorted(rows.values(), key=lambda row: row["seconds"])
+
+
+def fits_table() -> str:
+    """Held-out PSNR of the second checkout by scene and renderer, its gains on average and in the worst view."""
     from drgs.studies.tables import markdown_table
 
     lines, gains = [], {}
-    rows = read_rows(FIT_ROWS)
-    for row in (row for row in rows if row["commit"] == rows[-1]["commit"]):
+    for row in last_rows():
         both = row["before"], row["now"]
         took, steps = (" / ".join(f"{round(x[key]):,}" for x in both) for key in ("took", "steps"))
         line = [row["scene"], str(row["seconds"]), took, steps]
@@ -254,10 +259,13 @@ def page() -> None:
     )
     fill_between(PAGE, "versions", text + "\n\n" + markdown_table(["", *scenes], lines))
     if FIT_ROWS.exists():
-        last = read_rows(FIT_ROWS)[-1]
+        rows = last_rows()
+        commits, machines, days = (
+            " and ".join(dict.fromkeys(row[key] for row in rows)) for key in ("commit", "machine", "date")
+        )
         text = paragraph(
-            f"Commit {last['commit']} beside {last['before_commit']}: `python benchmarks/versions.py --fits`, "
-            f"{last['machine']}, {last['date']}."
+            f"Commit {commits} beside {rows[-1]['before_commit']}: `python benchmarks/versions.py --fits`, {machines}, "
+            f"{days}."
         )
         fill_between(PAGE, "fits", text + "\n\n" + fits_table())
 
