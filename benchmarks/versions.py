@@ -11,8 +11,8 @@ neighboring turns, which other work on the machine changes little. Scenes are th
 
 With `--fits` both checkouts run `drgs fit` on each data set, side by side, one thread each, with as many steps as take
 those seconds of processor time: a fit of one step and a short one say what a step takes, for schedules are fractions of
-the steps. Held-out views are those that both have measured (versions before 0.3 draw at most eight of them in several
-renderers); renderers those that metrics.json has.
+the steps. All held-out views are drawn in the renderers of metrics.json by `drgs eval` of this checkout, which does not
+count.
 """
 
 from __future__ import annotations
@@ -170,10 +170,15 @@ def fit_for(checkout: Path, data: Path, seconds: int) -> dict:
 
 
 def fit_of(checkout: Path, data: Path, seconds: int, steps: int) -> dict:
-    """What a checkout's fit of so many steps has at held-out views, of the size of fits of `seconds`."""
+    """What a checkout's fit of so many steps has at held-out views, of the size of fits of `seconds`.
+
+    A fit draws some of many held-out views in several renderers; here all are drawn, by this checkout.
+    """
     with tempfile.TemporaryDirectory() as name:
         run = Path(name) / "run"
         took = fit_once(checkout, data, run, steps, seconds)
+        command = [sys.executable, "-m", "drgs", "eval", str(run), "--quiet"]
+        subprocess.run(command, env={**os.environ, "PYTHONPATH": str(ROOT)}, cwd=run.parent, check=True)
         metrics = json.loads((run / "metrics.json").read_text())
     seen = {row["name"]: {view["name"]: view["psnr"] for view in row["views"]} for row in metrics["renderers"]["rows"]}
     return {"steps": steps, "took": took, "psnr": seen}
