@@ -63,6 +63,7 @@ _ARGUMENTS_ELSEWHERE = {
     r"runs/td/.*": "is of a run of the demo: tests/test_tradeoff.py",
     r"scene\.sog": "is written by other programs: tests/test_codecs.py",
     r"examples\..*": "is an example: tests/test_examples.py",
+    r"dump\.npz": "is written by another rasterizer: tests/test_crossval.py, tests/test_examples.py",
 }
 
 
@@ -157,8 +158,8 @@ def make_folder(folder: Path) -> Path:
 
     `scene`, nine posed pictures of a few Gaussians; `data/room`, the same with a teacher's maps; `point_cloud.ply`
     and `scene.ply`, the Gaussians; `cameras.json`, poses alone; `flight.json`, a flight through three of them;
-    `phone.mp4`, seconds of video, and `photos`, an empty folder; `my_package/rasterizer.py`, a rasterizer in plain
-    torch.
+    `phone.mp4`, seconds of video, and `photos`, an empty folder; `my_package/rasterizer.py` and `plain_rasterizer.py`,
+    rasterizers in plain torch.
     """
     import cv2
     import numpy as np
@@ -218,6 +219,7 @@ def make_folder(folder: Path) -> Path:
         frame = cv2.imread(str(folder / f"scene/{i % 9}.png"))
         video.write(cv2.resize(frame, (64, 48)))
     video.release()
+    shutil.copy(ROOT / "examples/plain_rasterizer.py", folder)
     (folder / "my_package").mkdir()
     shutil.copy(ROOT / "tests/torch_model.py", folder / "my_package/rasterizer.py")
     return folder
