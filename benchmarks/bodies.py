@@ -3,7 +3,7 @@
     python benchmarks/bodies.py [NAME ...] [--page] [--pictures FOLDER]
 
 Appends one row a scene, background, seed and kind of fit to benchmarks/bodies.jsonl as it ends, leaves out what is
-there, then writes the table of docs/dynamic.md (what is before white) and docs/data/moving-bodies.csv (every fit).
+there, then writes the table of docs/dynamic-data.md (what is before white) and docs/data/moving-bodies.csv (every fit).
 Scenes are those of the folder `bodies`: the layout of D-NeRF, masks of instances beside the photographs. PSNR is also
 that of the pixels of bodies that move alone, and their masks are compared with what is rendered as moving: where
 Gaussians that the field moves or that are there for a time make up more than half of a pixel. Pixels outside the masks
@@ -47,7 +47,7 @@ from drgs.studies.tables import markdown_table  # noqa: E402
 from drgs.train import fit  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "bodies.jsonl"
-PAGE = ROOT / "docs" / "dynamic.md"
+PAGE = ROOT / "docs" / "dynamic-data.md"
 CSV = ROOT / "docs" / "data" / "moving-bodies.csv"
 SCENES = ("collision", "occlusion", "deformation")
 STILL = ("background", "wall", "cube")

@@ -1,4 +1,4 @@
-"""The race on captures of docs/active-static.md and its data files, of rows that are there.
+"""The race on captures of docs/next-views.md and its data files, of rows that are there.
 
     python benchmarks/captures.py        runs nothing
 
@@ -34,7 +34,7 @@ from drgs.studies.tables import markdown_table
 
 Rows = Sequence[dict[str, Any]]
 
-PAGE = ROOT / "docs" / "active-static.md"
+PAGE = ROOT / "docs" / "next-views.md"
 ROWS = ROOT / "benchmarks" / "captures.jsonl"
 DEFAULT = "geometry+backdrop, v_opt"
 OTHERS = ("farthest", "fisherrf", "uniform")
@@ -68,10 +68,10 @@ def section(rows: Rows) -> str:
     detectable = [one.detectable for one in whole if one.detectable is not None]
     commits = ", ".join(sorted({row["commit"] for row in rows}))
     head = (
-        f"Named before any fit ran, with so many starts (test split, two initial views): {each}; `bonsai` is every "
-        f"fourth photograph. {len(rows)} fits by `drgs reproduce captures --protocol blind`, commits {commits} "
-        f"([rows](../benchmarks/captures.jsonl), [by fit](data/captures.csv)). PSNR of the default less that of "
-        f"others, in dB; first the average over {len(view_counts(rows))} numbers of views. "
+        f"Named before any fit ran, with so many starts: {each}; `bonsai` is every fourth photograph. {len(rows)} fits "
+        f"by `drgs reproduce captures --protocol blind`, commits {commits} ([rows](../benchmarks/captures.jsonl), [by "
+        f"fit](data/captures.csv)). PSNR of the default less that of others, in dB; first the average over "
+        f"{len(view_counts(rows))} numbers of views. "
         f"{coverage(len(counts), len(units)):.0%} of such intervals hold the true mean; {min(detectable):.1f} to "
         f"{max(detectable):.1f} dB could be seen."
     )

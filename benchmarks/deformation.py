@@ -1,10 +1,10 @@
 """What views say about a deformation field: how far the estimates of it are off, whether they rank alike, their cost.
 
-    python benchmarks/deformation.py [--quick]     writes benchmarks/deformation.json and the page
-    python benchmarks/deformation.py --page        measures nothing, writes the page of what is there
+    python benchmarks/deformation.py [--quick]     writes benchmarks/deformation.json and data files
+    python benchmarks/deformation.py --page        measures nothing, writes the data files
 
-The page is the table of docs/dynamic.md and, with everything, docs/data/moving-network.csv (errors of the estimates),
-moving-network-tau.csv and moving-network-seconds.csv.
+Data files are docs/data/moving-network.csv (errors of the estimates), moving-network-tau.csv and
+moving-network-seconds.csv.
 
 The scene is made here: a cloud of Gaussians, a part of which swings around a pillar, and a small field that is fitted
 to renders of it. All cameras at the first time are known, candidates are these cameras at other times. Times are CPU
@@ -30,7 +30,6 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: tor
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from clocks import interleaved  # noqa: E402
-from pages import fill_between  # noqa: E402
 from studies import rank_correlation, write_csv  # noqa: E402
 from where import ran  # noqa: E402
 
@@ -40,7 +39,6 @@ from drgs.cameras import Camera, orbit  # noqa: E402
 from drgs.deform import DeformationField, DynamicGaussians, FieldConfig  # noqa: E402
 from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.gain import Information, information_gain  # noqa: E402
-from drgs.studies.tables import markdown_table  # noqa: E402
 
 FAST = drgs.RenderSettings.preset("fast")
 COUNTS = (1, 2, 4, 8, 16)
@@ -55,7 +53,7 @@ ESTIMATES = {
     "`trace`, forward": "forward",
     "`paper`": "paper",
 }
-"""What the page calls an estimate -> what the results do."""
+"""What the data files call an estimate -> what the results do."""
 
 
 def cloud(count: int, rng: np.random.Generator) -> tuple[Gaussians, torch.Tensor]:
@@ -180,23 +178,6 @@ def costs(count: int, size: tuple[int, int], share: float, turns: int) -> dict[s
     return interleaved(runs, turns, time.process_time)
 
 
-def table(r: dict) -> str:
-    """The page's: error and rank correlation of the estimates by few probes and many, and the regret by few."""
-    few = SOME[0]
-    heads = ["estimate", *(f"{what}, {K} probes" for K in SOME for what in ("error", "tau"))]
-    heads.append(f"best view lacks, {few} probes")
-    lines = []
-    for title, name in ESTIMATES.items():
-        if name == "ratio, own":
-            continue  # is in the data file
-        cells = []
-        for K in SOME:
-            _, error, tau, _ = r["errors"][f"{name} {K}"]
-            cells += [f"{100 * error:.0f} %", f"{tau:.2f}"]
-        lines.append([title, *cells, f"{100 * r['errors'][f'{name} {few}'][3]:.0f} %"])
-    return markdown_table(heads, lines)
-
-
 def error_lines(r: dict) -> Iterator[list[str]]:
     """Every estimate by every number of probes."""
     yield ["estimate", "probes", "mean of scores over the right ones", "standard deviation of that", "tau", "regret"]
@@ -225,17 +206,16 @@ def second_lines(r: dict) -> Iterator[list[str]]:
 
 
 def write_page(r: dict) -> None:
-    """The table and the data files."""
+    """The data files."""
     write_csv(DATA / "moving-network.csv", error_lines(r))
     write_csv(DATA / "moving-network-tau.csv", tau_lines(r))
     write_csv(DATA / "moving-network-seconds.csv", second_lines(r))
-    fill_between(ROOT / "docs" / "dynamic.md", "deformation", table(r))
 
 
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--quick", action="store_true", help="small and few: checks that the script runs")
-    parser.add_argument("--page", action="store_true", help="measure nothing, write the page of what is there")
+    parser.add_argument("--page", action="store_true", help="measure nothing, write the data files of what is there")
     args = parser.parse_args()
     if args.page:
         write_page(json.loads(RESULT.read_text()))
@@ -269,7 +249,6 @@ def main():
     print(json.dumps(result), flush=True)  # what follows takes as long again
     turns = 1 if args.quick else 2
     result["costs"] = {f"{share:.0%}": costs(many, large, share, turns) for share in (0.1, 1.0)}
-    print(table(result))
     if not args.quick:
         RESULT.write_text(json.dumps(result, indent=1) + "\n")
         write_page(result)

@@ -1,10 +1,10 @@
 """What a deformation field costs: the share of a training step, with and without gates, and seconds a pick.
 
-    python benchmarks/dynamic.py [--quick]             prints, writes benchmarks/dynamic.json and the page
+    python benchmarks/dynamic.py [--quick]             prints, writes benchmarks/dynamic.json and the data file
     python benchmarks/dynamic.py --run RUN             the same of a fit to what moves, dynamic-run.json; no picks
-    python benchmarks/dynamic.py --page                measures nothing, writes the page of what is there
+    python benchmarks/dynamic.py --page                measures nothing, writes the data file
 
-The page is the table of docs/dynamic.md and, with every part of a step, docs/data/moving-steps.csv.
+The data file is docs/data/moving-steps.csv.
 
 50,000 Gaussians, 320x240, 40 times; those of a run are split until there are as many. A step is the trainer's own
 (loss, backward pass, optimizer, gates that are ajar in every tenth); steps with a field and without take turns in one
@@ -31,7 +31,6 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: tor
 import cubes  # noqa: E402
 import torch  # noqa: E402
 from clocks import interleaved  # noqa: E402
-from pages import fill_between  # noqa: E402
 from studies import write_csv  # noqa: E402
 from where import ran  # noqa: E402
 
@@ -48,7 +47,6 @@ from drgs.fitting.records import load_run  # noqa: E402
 from drgs.fitting.rows import GaussianRows  # noqa: E402
 from drgs.fitting.trainer import Trainer  # noqa: E402
 from drgs.select import Scoring, select  # noqa: E402
-from drgs.studies.tables import markdown_table  # noqa: E402
 
 TIMES = 40
 CAMERAS = 15
@@ -151,20 +149,6 @@ def pick(scene: DynamicGaussians, shown: list[Frame]) -> dict[str, float]:
     return spent
 
 
-def table(results: list[dict]) -> str:
-    """A line a scene and share of Gaussians that move."""
-    lines = []
-    for r in results:
-        still = r["steps"]["still"]
-        for name, spent in r["steps"].items():
-            if name != "still":
-                times = [f"{1e3 * x:.0f}" for x in (still, spent)]
-                lines.append([r["scene"], name, *times, f"{100 * (1 - still / spent):.0f} %"])
-    return markdown_table(
-        ["scene", "Gaussians that move", "ms a step without a field", "with", "share of the field"], lines
-    )
-
-
 def csv_lines(results: list[dict]) -> Iterator[list[str]]:
     """Milliseconds of steps, of their parts by themselves, and of picks, with where and when."""
     yield ["scene", "Gaussians that move", "what", "milliseconds", "machine", "date", "commit", "load"]
@@ -180,10 +164,9 @@ def csv_lines(results: list[dict]) -> Iterator[list[str]]:
 
 
 def write_page() -> None:
-    """The table and the data file, of the results that are there."""
+    """The data file, of the results that are there."""
     results = [json.loads(path.read_text()) for path in RESULTS if path.exists()]
     write_csv(ROOT / "docs" / "data" / "moving-steps.csv", csv_lines(results))
-    fill_between(ROOT / "docs" / "dynamic.md", "dynamic", table(results))
 
 
 def main() -> None:
@@ -191,7 +174,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="small and few: checks that the script runs")
     parser.add_argument("--run", type=Path, help="take the Gaussians and the gates of a fit to what moves")
     parser.add_argument("--turns", type=int, default=5)
-    parser.add_argument("--page", action="store_true", help="measure nothing, write the page of what is there")
+    parser.add_argument("--page", action="store_true", help="measure nothing, write the data file of what is there")
     args = parser.parse_args()
     if args.page:
         write_page()
@@ -223,7 +206,6 @@ def main() -> None:
     if args.run is None:
         result["pick"] = pick(first.scene(), shown)
     print(json.dumps(result))
-    print(table([result]))
     if not args.quick:
         RESULTS[args.run is not None].write_text(json.dumps(result, indent=1) + "\n")
         write_page()

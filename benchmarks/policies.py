@@ -1,4 +1,4 @@
-"""The table, the picture and the data files of docs/active-static.md, of rows that are there.
+"""The table, the picture and the data files of docs/next-views.md, of rows that are there.
 
     python benchmarks/policies.py        runs nothing
 
@@ -27,7 +27,7 @@ from drgs.studies.tables import markdown_table
 
 Rows = Sequence[dict[str, Any]]
 
-PAGE = ROOT / "docs" / "active-static.md"
+PAGE = ROOT / "docs" / "next-views.md"
 DATA = ROOT / "docs" / "data"
 CURVES = ROOT / "docs" / "pictures" / "active-curves.png"
 ROWS = ROOT / "benchmarks" / "active.jsonl"
@@ -62,7 +62,7 @@ GROUPS = {
     "statue": ("statue",),
 }
 TABLED = ("all", "rooms", "still lifes", "captures")  # of the policies that pick by poses alone
-SHOWN = (4, 6, 8, 12)  # views, of the page's table
+SHOWN = (4, 6, 12)  # views, of the page's table
 
 CHOICE = ("head", "banana", "room-3", "room-4", "still-5", "still-6")
 TRIED = {
@@ -98,7 +98,7 @@ def of_group(rows: Rows, group: str) -> Rows:
 def table(rows: Rows) -> str:
     """PSNR of the default less that of every other policy at numbers of views, protocol `blind`."""
     blind = [row for row in rows if row["protocol"] == "blind"]
-    heads = ["against", "scenes", "units", *(f"{count} views" for count in SHOWN), "detectable"]
+    heads = ["against", "units (scenes)", *(f"{count} views" for count in SHOWN)]
     lines = []
     for other in OTHERS:
         for group in TABLED if other in ("uniform", "farthest") else ("all",):
@@ -113,8 +113,7 @@ def table(rows: Rows) -> str:
                 cells.append(f"{mean} [{one.low:+.2f}, {one.high:+.2f}]")
             last = found[-1]
             name = f"`{other}`" if group == "all" else f"– {group}"
-            detectable = f"{last.detectable:.2f}" if last.scenes > 2 else ""
-            lines.append([name, str(last.scenes), str(last.units), *cells, detectable])
+            lines.append([name, f"{last.units} ({last.scenes})", *cells])
     return markdown_table(heads, lines)
 
 

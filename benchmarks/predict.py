@@ -5,7 +5,7 @@
 
 On a fit to 6 views every other view of the pool is added alone, the fit goes on for a while, and the drop of the error
 of held-out views is compared with the score that each policy gave the view before. Results go to
-benchmarks/predict.json and to the data files of docs/active-static.md; candidates that have been measured are not
+benchmarks/predict.json and to the data files of docs/next-views.md; candidates that have been measured are not
 measured again.
 """
 

@@ -1,7 +1,7 @@
 """The experiment `static` of `drgs reproduce`, with a capture and more criteria: color and labels of held-out views.
 
     python benchmarks/semantic.py [--scale small] [--seeds 3] [--shard K/N]     fits, rows as they come
-    python benchmarks/semantic.py --page [--merge ROWS.jsonl ...]     the table of docs/semantic.md, its data files
+    python benchmarks/semantic.py --page [--merge ROWS.jsonl ...]               docs/data/semantic-*.csv
 
 Scenes: two rooms (seeds 1 and 2; constants are fixed on others), 56 candidates and 28 test views along one way each,
 and the statue, 29 photographs with a teacher made from their labels, at two held-out offsets. Every seed draws other
@@ -30,14 +30,10 @@ from typing import Any
 os.environ.setdefault("DRGS_THREADS", "1")
 
 import labelled
-import numpy as np
 import studies
-from studies import ROOT
 
 from drgs.studies import experiments
 from drgs.studies.cells import Study, distinct_seeds
-from drgs.studies.statistics import differences, estimate, values_of
-from drgs.studies.tables import markdown_table
 
 DEFAULT = "geometry+semantic+backdrop, v_opt"  # the program's own choice where there is a teacher
 MORE = {
@@ -89,44 +85,20 @@ def units_of(study: Study, seeds: int) -> list:
     return units
 
 
-def table(study: Study, rows: Sequence[Mapping[str, Any]]) -> str:
-    """Blind, PSNR and mIoU: means in which every scene counts alike, and PSNR less that of the reference. All else, the
-    paper's protocol too, is in the data files.
-    """
-    shown = [metric for metric in study.metrics if metric.key in ("psnr", "miou")]
-    blind = [row for row in rows if row["protocol"] == "blind"]
-    heads = ["policy"]
-    for metric in shown:
-        heads += [metric.title, *([f"less that of `{study.reference}`"] if metric.key == "psnr" else [])]
-    heads.append("seconds a pick")
-    lines = []
-    for policy in study.policies:
-        cells = [f"`{policy}`"]
-        for metric in shown:
-            cells.append(f"{estimate(values_of(blind, metric.key, policy)).mean:.{metric.digits}f}")
-            if metric.key != "psnr":
-                continue
-            if policy == study.reference:
-                cells.append("")
-                continue
-            one = estimate(differences(blind, metric.key, policy, study.reference))
-            mean, low, high = (f"{x:+.{metric.digits}f}" for x in (one.mean, one.low, one.high))
-            cells.append(f"{mean if one.low <= 0 <= one.high else f'**{mean}**'} [{low}, {high}]")
-        cells.append(f"{np.median([row['pick_seconds'] for row in blind if row['policy'] == policy]):.1f}")
-        lines.append(cells)
-    return markdown_table(heads, lines)
+def page(study: Study, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Writes the data files."""
+    for name, lines in studies.study_sheets(study, rows).items():
+        studies.write_csv(studies.PAGE_DATA / f"semantic-{name}.csv", lines)
 
 
 def main() -> int:
     return studies.command(
         "semantic",
-        ROOT / "docs" / "semantic.md",
         SCALES,
         study_of,
         units_of,
-        report=table,
+        page=page,
         rows="static",
-        sheets=True,
     )
 
 

@@ -21,7 +21,6 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
-from pages import fill_between  # noqa: E402
 from where import DATA, ran  # noqa: E402
 
 from drgs.data import load, scene_extent  # noqa: E402
@@ -267,27 +266,23 @@ def _numbers(
 
 def command(
     script: str,
-    page: Path,
     scales: Iterable[str],
     study_of: Callable[[str, Path], Study],
     units_of: Callable[[Study, int], list],
-    report: Callable[[Study, list[dict]], str],
+    page: Callable[[Study, list[dict]], None],
     rows: str,
     seeds: int = 3,
-    sheets: bool = False,
 ) -> int:
     """The command line of a study of fits; rows go to benchmarks/ROWS.jsonl.
 
     Args:
-        script: Name of the script, and of its part of the page.
-        page: Page that the tables are written into.
+        script: Name of the script.
         scales: Values of --scale, the default first.
         study_of: Scale, folder of runs -> study.
         units_of: Study, --seeds -> units, as `Study.cells` takes them.
-        report: Study, its rows -> tables.
+        page: Writes what a page has of a study, its rows.
         rows: Name of the file of rows.
         seeds: The default of --seeds.
-        sheets: With the tables, write `study_sheets` to docs/data/SCRIPT-NAME.csv.
     Returns:
         The exit code.
     """
@@ -297,7 +292,7 @@ def command(
     parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "studies")
     parser.add_argument("--shard", default="0/1", help="K/N: every N-th cell from the K-th on")
     parser.add_argument("--policies", nargs="+", help="cells of these policies alone")
-    parser.add_argument("--page", action="store_true", help="run nothing, write the tables of the rows that there are")
+    parser.add_argument("--page", action="store_true", help="run nothing, write the page of the rows that there are")
     parser.add_argument("--merge", type=Path, nargs="+", default=[], help="rows of another checkout, to be added")
     args = parser.parse_args()
     results = ROOT / "benchmarks" / f"{rows}.jsonl"
@@ -307,10 +302,7 @@ def command(
     study = study_of(args.scale, args.runs)
     if args.page:
         found = [row for row in read_study(results) if row["study"] == study.name]
-        by = f"By `python benchmarks/{script}.py --scale {args.scale}`."
-        fill_between(page, script, f"{by}\n\n{report(study, found)}")
-        for name, lines in study_sheets(study, found).items() if sheets else ():
-            write_csv(PAGE_DATA / f"{script}-{name}.csv", lines)
+        page(study, found)
         return 0
     shard, shards = map(int, args.shard.split("/"))
     units = units_of(study, args.seeds)

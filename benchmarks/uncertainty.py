@@ -6,7 +6,7 @@ Runs are folders of active fits, of `drgs fit --views active` or `drgs reproduce
 picked twelve views at random.
 Area between two sparsification curves: the root of the mean squared error of the pixels that are left when those called
 most uncertain are taken out, and the same by the true error; both are divided by the error of all pixels, and 0 is
-perfect. Rows are kept (benchmarks/uncertainty.jsonl); their means go to a data file of docs/active-static.md.
+perfect. Rows are kept (benchmarks/uncertainty.jsonl); their means go to a data file of docs/uncertainty.md.
 """
 
 from __future__ import annotations

@@ -892,7 +892,7 @@ class Reproduce(Workers):
     )
     policies: tuple[str, ...] = option(
         (),
-        "Run only this row of the table, by its label in rows.jsonl (docs/results.md); may be repeated.",
+        "Run only this row of the table, by its label in rows.jsonl (docs/next-views.md); may be repeated.",
         repeat=True,
         metavar="LABEL",
         flag="policy",

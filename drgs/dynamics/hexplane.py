@@ -31,7 +31,7 @@ class HexPlane(torch.nn.ParameterList):
     Parameters `0` to `6 L - 1`, level by level: the planes (x, y), (x, z), (y, z), shaped (resolution, resolution, C)
     with the second axis first, then (t, x), (t, y), (t, z), shaped (time_resolution, resolution, C). Those of space
     begin uniform in [0.5, 1.5], those of time at 1. 4DGS begins with [0.1, 0.5]: products of three are some 0.03, which
-    planes of time can hardly change, and motion is learned late (docs/dynamic.md).
+    planes of time can hardly change, and motion is learned late (docs/dynamic-data.md).
 
     Args:
         channels: C.

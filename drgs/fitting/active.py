@@ -54,7 +54,7 @@ _COVERED = 0.5  # opacity from which on a pixel needs no new points: more of it 
 # Share of a view's pixels that are open, below which no new points are sought; chosen, not tuned.
 _LEAST_OPEN_SHARE = 0.01
 _MOST_DRAWN = 20  # times a view's share of the budget: most points drawn from its depth map; chosen, not tuned
-# Triangulated points from which on `--restart auto` keeps the Gaussians; see docs/active-static.md.
+# Triangulated points from which on `--restart auto` keeps the Gaussians; see docs/next-views.md.
 _ENOUGH_TRIANGULATED = 1000
 _FEWEST_POINTS = 4  # points: each Gaussian's width is of its distances to the three nearest others
 

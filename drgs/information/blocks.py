@@ -36,7 +36,7 @@ from drgs.information.semantics import SemanticMetric
 from drgs.information.sums import Information
 
 MAP_PRIOR = Prior(1.0)
-"""lambda with which a map of the variance follows the error best, of 1e-6, 1e-2 and 1 (docs/active-static.md)."""
+"""lambda with which a map of the variance follows the error best, of 1e-6, 1e-2 and 1 (docs/uncertainty.md)."""
 
 _WITH_SCENES = ("columns", "probes")  # methods that know the parameters that a scene computes its Gaussians from
 

@@ -70,7 +70,7 @@ class Scoring(Record):
     criterion: str = option(
         CRITERION_NAMES[0],
         "Score of policy fisher, or package.module:function of your own; v_opt chooses best from six views on "
-        "(docs/active-static.md).",
+        "(docs/next-views.md).",
         metavar=one_of(CRITERION_NAMES),
     )
     settings: RenderSettings = dataclasses.field(default=_EXACT, metadata=TRANSIENT)

@@ -60,7 +60,7 @@ MOST_ADDED = 0.5
 """Share of the Gaussians that there may be: how many are added at most, so that what stands still keeps as many."""
 
 # Units of times are the median time between a photograph and the next one. The numbers are chosen, not
-# tuned; docs/dynamic.md has what lifetimes gain as a whole.
+# tuned; docs/dynamic-data.md has what lifetimes gain as a whole.
 _OPACITY = 0.3  # of a new Gaussian, as of those at points of depth maps: its place is known, too
 # Opacity below which a Gaussian gives way to a new one: all have it at the start, and nothing has raised it.
 _FAINT_OPACITY = 0.1
@@ -80,7 +80,7 @@ _NO_SURFACE = 1e9  # distance in world units of a ray that meets no surface: far
 
 @dataclasses.dataclass(frozen=True)
 class Search:
-    """How new Gaussians are searched for. The defaults are those that docs/dynamic.md was measured with.
+    """How new Gaussians are searched for. The defaults are those that docs/dynamic-data.md was measured with.
 
     Attributes:
         pixels: Pixels of the pictures that are compared, at most: few enough that the search takes seconds.
