@@ -439,7 +439,6 @@ def study_rows(rows: Rows) -> list[dict[str, Any]]:
                     "metrics": curve["12"],
                     "curve": {count: at for count, at in curve.items() if count not in ("2", "12")},
                     "seeing": row["seeing"][name],
-                    "known": row["curve"]["2"][name]["gaussians"] >= 1,
                     "object": name,
                     "commit": row["commit"],
                 }
@@ -476,16 +475,6 @@ def main_lines(rows: Rows) -> list[list[str]]:
     return lines
 
 
-def by_start(rows: Rows) -> str:
-    """A sentence: the difference from the default where two views have shown something of the object, and elsewhere."""
-    parts = []
-    for known, words in ((True, "have made Gaussians in the box"), (False, "have not")):
-        own = [over_views(row, "psnr") for row in rows if row["scene"] in ROOMS and row["known"] == known]
-        if values := differences(own, "psnr", REFERENCE, "default"):
-            parts.append(f"{np.mean(list(values.values())):+.2f} dB in {len(values)} units where two views {words}")
-    return f"`region` less `default` in rooms, 3 to 12 views: {', '.join(parts)}."
-
-
 def data_lines(rows: Rows) -> Iterator[list[str]]:
     """A line a fit and object."""
     counts = [str(count) for count in COUNTS if count > 2]
@@ -507,21 +496,18 @@ def write_page() -> None:
         comparisons=((REFERENCE, "default"),),
     )  # fmt: skip
     draw_curves(study, rows, METRICS[0], PICTURE)
-    failed = sum("error" in row for row in told)
-    processor = sum(row.get("process_seconds", 0) for row in told) / 60
     commits = ", ".join(sorted({row["commit"] for row in told}))
     head = (
-        f"{len(told)} fits by `python benchmarks/regions.py`, {failed} of them failed, {processor:.0f} minutes of "
-        f"processor, {told[0]['machine']}, {told[0]['date']}, commits {commits} ([rows](../benchmarks/regions.jsonl), "
-        "[by fit](data/active-region.csv), [IoU, and what such a study finds](data/active-region-differences.csv)). "
-        "PSNR of the object with `region` less that of another policy, mean and 95 % interval, bold where that "
-        f"excludes 0 and there are {FEWEST_UNITS} units; *wins*: units in which `region` is better, 3 to 12 views. "
-        f"{coverage(3, 18):.0%} of such intervals of three scenes hold the true mean where scenes differ as much as "
-        "their units do."
+        f"{len(told)} fits by `python benchmarks/regions.py`, {told[0]['machine']}, {told[0]['date']}, commits "
+        f"{commits} ([rows](../benchmarks/regions.jsonl), [by fit](data/active-region.csv), [IoU, and what such a "
+        "study finds](data/active-region-differences.csv)). PSNR of the object with `region` less that of another "
+        f"policy, mean and 95 % interval, bold where that excludes 0 and there are {FEWEST_UNITS} units; *wins*: units "
+        f"in which `region` is better, 3 to 12 views. {coverage(3, 18):.0%} of such intervals hold the true mean where "
+        "scenes differ as much as their units do."
     )
     heads, *lines = main_lines(rows)
     told = [[line[0].split(",")[0], *line[1:-1]] for line in lines if METRICS[0].title in line[0]]
-    text = [paragraph(head), markdown_table(["scenes", *heads[1:-1]], told), paragraph(by_start(rows))]
+    text = [paragraph(head), markdown_table(["scenes", *heads[1:-1]], told)]
     fill_between(PAGE, "regions", "\n\n".join(text))
     write_csv(PAGE_DATA / "active-region-differences.csv", [["scenes, metric", *heads[1:]], *lines])
     write_csv(PAGE_DATA / "active-region.csv", data_lines(rows))
