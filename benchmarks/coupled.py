@@ -124,10 +124,10 @@ def report(r: dict) -> str:
     e, fast, exact = r["errors"], r["fast"], r["exact"]
     lines = [
         paragraph(
-            f"`python benchmarks/coupled.py RUN`, {r['machine']}, {r['date']}, commit {r['commit']}; RUN is "
-            f"`{r['run']}`, {r['gaussians']:,} Gaussians with {r['width']} channels, a decoder of rank {r['rank']}; "
-            f"times are of `fast` at {r['size']['fast']} and `exact` at {r['size']['exact']}, errors against `exact` "
-            f"are of `fast` at 80x60 and the scores of {e['views']} views, with two training views."
+            f"`python benchmarks/coupled.py RUN`, {r['machine']}, {r['date']}, commit {r['commit']}: "
+            f"{r['gaussians']:,} Gaussians with {r['width']} channels, a decoder of rank {r['rank']}; times are of "
+            f"`fast` at {r['size']['fast']} and `exact` at {r['size']['exact']}, errors of `fast` at 80x60, against "
+            f"`exact`, and of scores of {e['views']} views."
         ),
         "",
         "| estimate | time, `fast` | time, `exact` | median error of an entry | `eig`: error, tau, regret |",
