@@ -162,9 +162,8 @@ def report(result: dict) -> str:
         f"{fit['at 0']:.1f} + {fit['per 100']:.2f} per 100 channels ({way}; within {100 * fit['error']:.0f} %)"
         for way, fit in result["growth"].items()
     )
-    added = ", ".join(f"{int(x) / 2**20:.0f} MiB with {width} channels" for width, x in result["grown"].items())
     told = f"""`fast` costs {costs}, times the colors. Other widths and what weights take are in
-        [features.json](../benchmarks/features.json). A coupled `fast` frame and its gradients add {added}."""
+        [features.json](../benchmarks/features.json), and so is memory."""
     lines.append(paragraph(" ".join(told.split())))
     return "\n".join(lines)
 
