@@ -1,7 +1,8 @@
 """What exact order costs on scenes that people have: `exact` against `fast`, on fits, a splat and the cube.
 
-    python benchmarks/exact.py [--fits FOLDER] [--turns 7]      tables, docs/benchmarks-exact.md, benchmarks/exact.json
+    python benchmarks/exact.py [--fits FOLDER] [--turns 7]      a part of docs/benchmarks.md, benchmarks/exact.json
     python benchmarks/exact.py --parts oracle torch             these parts again, the others as they are
+    python benchmarks/exact.py --page                           that part, of the results that there are
 
 Fits are made once, in FOLDER (default runs/exact), of the captures `office`, `banana` and (for the oracle) `statue` in
 DRGS_DATA and of a still life made here; the splat is `wolf` there. What is not there is left out, and the page says so.
@@ -26,7 +27,8 @@ import cubes  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from clocks import interleaved  # noqa: E402
-from render import Preset, backward, forward, volprim  # noqa: E402
+from pages import fill_between  # noqa: E402
+from render import PAGE, Preset, backward, forward, volprim  # noqa: E402
 from where import DATA, ran  # noqa: E402
 
 import drgs  # noqa: E402
@@ -237,31 +239,15 @@ def hit_costs(found: dict) -> list[float]:
 
 
 def scene_rows(found: dict) -> str:
-    """The table of the scenes, with one thread."""
+    """The table of the scenes, with one thread; Gaussians, sizes and memory are in exact.json."""
     lines = []
     for name, row in found.items():
         if row is None:
-            lines.append([name, "not there", *[""] * 7])
+            lines.append([name, "not there", *[""] * 4])
             continue
-        t = row["seconds"]
-        cells = []
-        for kind in (*KINDS, "with depth"):
-            fast = t[f"fast, {kind if kind in KINDS else KINDS[0]}"]
-            exact = t[f"exact, {kind}"]
-            cells.append(f"{exact / fast:.1f}x ({1e3 * fast:.0f} to {1e3 * exact:.0f} ms)")
-        size = "x".join(map(str, row["size"]))
-        lines.append(
-            [
-                name,
-                f"{row['gaussians']:,}",
-                size,
-                f"{row['hits']:.0f} ({row['hits of fast']:.0f})",
-                *cells,
-                f"{row['peak GB']:.2f}",
-            ]
-        )
-    heads = ["scene", "Gaussians", "view", "hits a pixel (of `fast`)", *KINDS, "forward with depth", "peak GB"]
-    return markdown_table(heads, lines)
+        cells = [f"{ratios({name: row}, kind)[0]:.1f}x" for kind in (*KINDS, "with depth")]
+        lines.append([name, f"{row['hits']:.0f} ({row['hits of fast']:.0f})", *cells])
+    return markdown_table(["scene", "hits a pixel (of `fast`)", *KINDS, "forward with depth"], lines)
 
 
 def missed(rows: dict) -> str:
@@ -269,92 +255,45 @@ def missed(rows: dict) -> str:
     over = []
     for kind, limit in zip(KINDS, LIMITS, strict=True):
         for threads, found in rows.items():
-            scenes = [f"{name} {x:.1f}x" for name, x in zip(found, ratios(found, kind), strict=True) if x > limit]
+            scenes = [name for name, x in zip(found, ratios(found, kind), strict=True) if x > limit]
             if scenes:
                 over.append(f"{kind}, {threads} thread{'s' if int(threads) > 1 else ''} ({', '.join(scenes)})")
     return f"Missed: {'; '.join(over)}." if over else "All are met."
 
 
 def report(result: dict) -> str:
-    """The page."""
-    memory, peers, oracle = result["memory"], result["peers"], [x for x in result["oracle"].values() if x]
+    """The part of the page."""
+    memory, peers = result["memory"], result["peers"]
     one, two = result["scenes"]["1"], result["scenes"]["2"]
     cost = [between(ratios(one, kind)) for kind in KINDS]
-    rest = {name: peers["rest"]["volprim, ellipsoids"] / t for name, t in peers["rest"].items()}
+    rest, busy = ({k: x["volprim, ellipsoids"] / t for k, t in x.items()} for x in (peers["rest"], peers["busy"]))
+    other = "volprim, ellipsoidsmesh"
     again = f" ({result['again']})" if "again" in result else ""
-    errors, ties = [x["error"] for x in oracle], [x["near a tie"] for x in oracle]
     slow = result["torch"]["seconds"]
-    lines = [
-        "# What exact order costs",
-        "",
-        paragraph(
-            f"Preset `exact` sorts Gaussians along each ray. On one thread it takes {cost[0]} times as long as `fast` "
-            f"for an image, {cost[1]} times with gradients and {cost[2]} times for a Fisher diagonal; it is "
-            f"{rest['exact']:.1f} times as fast as Mitsuba's `volprim_rf_basic`. {result.get('note', '')}"
-        ),
-        "",
-        paragraph(
-            f"Made by `python benchmarks/exact.py` on {result['machine']}, {result['date']}, commit {result['commit']}"
-            f"{again}. `exact` in multiples of `fast` on the same view, one thread; presets take turns in one process, "
-            "medians. The fits have 1,000 steps at 10,800 pixels. `forward` is without depth, with which tiles leave "
-            "fewer tails out ([numerics.md](numerics.md))."
-        ),
-        "",
-        scene_rows(one),
-        "",
-        paragraph(
-            f"With two threads: {', '.join(f'{kind} {between(ratios(two, kind))}x' for kind in KINDS)}, with depth "
-            f"{between(ratios(two, 'with depth'))}x ([all times](../benchmarks/exact.json)). Targets: "
-            f"{', '.join(f'{k} {x}x' for k, x in zip(KINDS, LIMITS, strict=True))}. {missed(result['scenes'])}"
-        ),
-        "",
-        paragraph(
-            "`fast` cuts Gaussians at 3 standard deviations and stops at a transmittance of 0.01: `exact` composites "
-            f"{between(hit_ratios(one))} times as many hits, and takes {between(hit_costs(one))} times as long for "
-            "each."
-        ),
-        "",
-        paragraph(
-            f"Against the float64 oracle, by brute force, colors of {len(oracle)} scenes are off by {min(errors):.1e} "
-            f"to {max(errors):.1e} at most, without pixels near a tie or a cut-off ({min(ties)} to {max(ties)} of "
-            f"{oracle[0]['pixels']})."
-        ),
-        "",
-        paragraph(
-            f"1,000,000 Gaussians at 1024x1024: {memory['frame']:.2f} GB peak of the whole process forward + backward, "
-            f"{memory['with the diagonal']:.2f} GB with a Fisher diagonal after it."
-        ),
-        "",
-        "## Compared with Mitsuba, at rest and on a busy machine",
-        "",
-        paragraph(
-            "The cube (100,000 Gaussians, 512^2), forward, ms; two threads. Busy: with two processes running that "
-            "never rest. `volprim_rf_basic` on `ellipsoidsmesh` has `extent_adaptive_clamping`."
-        ),
-        "",
-        "| | at rest | faster than volprim | busy | faster than volprim |",
-        "|---|---|---|---|---|",
-    ]
-    for name in peers["rest"]:
-        cells = []
-        for state in ("rest", "busy"):
-            t = peers[state]
-            cells.append(f"{1e3 * t[name]:.0f} | {t['volprim, ellipsoids'] / t[name]:.1f}x")
-        lines.append(f"| {name} | {' | '.join(cells)} |")
     theirs, ours = ([slow[f"{name}, {kind}"] for kind in ("forward", "both")] for name in TORCH_ROWS)
-    lines += [
-        "",
-        "## Compared with gsplat's torch code",
-        "",
-        paragraph(
-            f"{TORCH[0]:,} Gaussians, {TORCH[1]}x{TORCH[1]}, two threads: gsplat 1.5.3's own torch functions on the "
-            f"CPU (examples/gsplat_torch.py says which) take {1e3 * theirs[0]:.0f} ms forward and "
-            f"{1e3 * theirs[1]:.0f} ms forward + backward, our preset `gsplat` {1e3 * ours[0]:.0f} and "
-            f"{1e3 * ours[1]:.0f} ms, {theirs[0] / ours[0]:.0f} and {theirs[1] / ours[1]:.0f} times less; 99.9 % of "
-            f"the values differ by less than {result['torch']['difference']:.0e}."
-        ),
+    parts = [
+        f"On one thread `exact` takes {cost[0]} times as long as `fast` for an image, {cost[1]} times with gradients "
+        f"and {cost[2]} times for a Fisher diagonal. {result.get('note', '')}",
+        f"`python benchmarks/exact.py`, {result['machine']}, {result['date']}, commit {result['commit']}{again}: "
+        "in multiples of `fast` on the same view, one thread. The fits have 1,000 steps at 10,800 pixels. "
+        "`forward` is without depth, with which tiles leave fewer tails out ([numerics.md](numerics.md)).",
+        scene_rows(one),
+        f"With two threads: {', '.join(f'{between(ratios(two, kind))}x' for kind in (*KINDS, 'with depth'))} ([all "
+        "times](../benchmarks/exact.json)). Targets: "
+        f"{', '.join(f'{k} {x}x' for k, x in zip(KINDS, LIMITS, strict=True))}. {missed(result['scenes'])}",
+        f"`exact` composites {between(hit_ratios(one))} times as many hits, and takes {between(hit_costs(one))} times "
+        f"as long for each. 1,000,000 Gaussians at 1024x1024 take {memory['frame']:.2f} GB at the peak forward + "
+        f"backward, {memory['with the diagonal']:.2f} GB with a Fisher diagonal after it.",
+        f"**Peers**, two threads: on the cube `exact` is {rest['exact']:.1f} times as fast as `volprim_rf_basic`, and "
+        f"{busy['exact']:.1f} times beside two processes that never rest (`fast` {rest['fast']:.1f} and "
+        f"{busy['fast']:.1f}; `volprim_rf_basic` on `ellipsoidsmesh`, with `extent_adaptive_clamping`, "
+        f"{rest[other]:.1f} and {busy[other]:.1f}). gsplat 1.5.3's own torch functions on the CPU "
+        f"([which](../examples/gsplat_torch.py); {TORCH[0]:,} Gaussians, {TORCH[1]}x{TORCH[1]}) take "
+        f"{1e3 * theirs[0]:.0f} ms forward and {1e3 * theirs[1]:.0f} ms forward + backward, our preset `gsplat` "
+        f"{1e3 * ours[0]:.0f} and {1e3 * ours[1]:.0f} ms; 99.9 % of the values differ by less than "
+        f"{result['torch']['difference']:.0e}.",
     ]
-    return "\n".join([*lines, ""])
+    return "\n\n".join(part if part.startswith("|") else paragraph(part) for part in parts)
 
 
 def main() -> None:
@@ -364,13 +303,17 @@ def main() -> None:
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--task", choices=TASKS)
     parser.add_argument("--scene", default="")
+    parser.add_argument("--page", action="store_true", help="the page of the results that there are")
     args = parser.parse_args()
+    store = ROOT / "benchmarks" / "exact.json"
+    if args.page:
+        fill_between(PAGE, "exact", report(json.loads(store.read_text())))
+        return
     if args.task:
         print(json.dumps(TASKS[args.task](args.scene, args.fits, args.turns)))
         return
     for name in FITTED:
         scene(name, args.fits)
-    store = ROOT / "benchmarks" / "exact.json"
     parts = args.parts
     result = ran() if set(parts) == set(PARTS) else json.loads(store.read_text())
     if "scenes" in parts:
@@ -386,7 +329,7 @@ def main() -> None:
         made = ran()
         result["again"] = f"{', '.join(parts)}: {made['date']}, commit {made['commit']}"
     store.write_text(json.dumps(result, indent=1) + "\n")
-    (ROOT / "docs" / "benchmarks-exact.md").write_text(report(result))
+    fill_between(PAGE, "exact", report(result))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """What Fisher information costs, against rendering with gradients.
 
-    python benchmarks/fisher.py [--quick] [--run RUN]     tables, docs/benchmarks-fisher.md, benchmarks/fisher.json
+    python benchmarks/fisher.py [--quick] [--run RUN]     a part of docs/benchmarks.md, benchmarks/fisher.json
     python benchmarks/fisher.py --parts picks --run RUN   this part again, the others as they are
+    python benchmarks/fisher.py --page                    that part, of the results that there are
 
 RUN is a fitted run folder whose views are scored (default runs/real/office, else out/demo/run). Peers take turns in one
 process, every figure is the median of at least five turns after a warm-up; picks on `exact` are timed once.
@@ -24,7 +25,8 @@ import cubes  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from clocks import interleaved  # noqa: E402
-from render import backward, forward  # noqa: E402
+from pages import fill_between  # noqa: E402
+from render import PAGE, backward, forward  # noqa: E402
 from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
@@ -32,7 +34,7 @@ from drgs import fisher  # noqa: E402
 from drgs.gain import information_gain  # noqa: E402
 from drgs.runtime.machine import peak_memory  # noqa: E402
 from drgs.select import select  # noqa: E402
-from drgs.studies.tables import paragraph  # noqa: E402
+from drgs.studies.tables import markdown_table, paragraph  # noqa: E402
 
 Preset = drgs.RenderSettings.preset
 GEOMETRY = ("means", "rotations", "log_scales", "logit_opacities")
@@ -175,94 +177,55 @@ def growth(turns: int, quick: bool) -> list[dict]:
 
 
 def report(r: dict) -> str:
-    """The markdown page."""
-    fast = r["headline"][0]
-    lines = [
-        "# What Fisher information costs",
-        "",
-        paragraph(
-            f"The exact diagonal of a view takes {fast['exact diagonal'] / fast['forward+backward']:.2f} times as long "
-            f"as an image with gradients, {1e3 * fast['exact diagonal']:.0f} ms for 100,000 Gaussians at 512x512 with "
-            "preset `fast`."
-        ),
-        "",
-        paragraph(
-            f"Made by `python benchmarks/fisher.py` on {r['machine']}, {r['date']}, commit {r['commit']}"
-            + (f" ({r['again']})" if "again" in r else "")
-            + ". Milliseconds, one view of 100,000 Gaussians in a cube, 512x512, everything included (projection, "
-            "lists, sorting, torch), median, peers taking turns; in brackets the ratio to forward + backward. "
-            + " ".join(r.get("note", []))
-        ),
-        "",
-        "| | " + " | ".join(f"`{row['preset']}`, SH {row['sh']}" for row in r["headline"]) + " |",
-        "|---|" + "---|" * len(r["headline"]),
+    """The part of the page."""
+    fast, t = r["headline"][0], r["tangents"]
+    names = [name for name in fast if name not in ("preset", "sh", "forward", "without SH")]  # those are in fisher.json
+    cells = [
+        [name, *(f"{1e3 * row[name]:.0f} ({row[name] / row['forward+backward']:.2f})" for row in r["headline"])]
+        for name in names
     ]
-    for name in [k for k in r["headline"][0] if k not in ("preset", "sh")]:
-        cells = [f"{1e3 * row[name]:.0f} ({row[name] / row['forward+backward']:.2f})" for row in r["headline"]]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    t = r["tangents"]
-    lines += [
-        "",
-        "`exact diagonal` is every group: means, rotations, log-scales, logit-opacities and SH.",
-        "",
-        "## Tangents",
-        "",
-        paragraph(
-            f"Forward mode, `fast`: one tangent {1e3 * t['1']:.0f} ms, 4 in one traversal {1e3 * t['4']:.0f} ms, 16 "
-            f"{1e3 * t['16']:.0f} ms: {t['16'] / 16 / t['1']:.2f} of 16 single ones. The 6 of the pose: "
-            f"{1e3 * t['pose']:.0f} ms."
-        ),
+    growth = [
+        f"{1e3 * x['diagonal']:.0f} for {x['gaussians']:,}"
+        for x in r["growth"]
+        if x["views"] == 1 and x["pixels"] == 512  # the others are in fisher.json
     ]
-    if "picks" in r:
-        lines += picks_lines(r["picks"])
-    lines += [
-        "",
-        "## Growth",
-        "",
-        "Exact diagonal of one view, `fast`, SH 0; times are nearly proportional to the number of views.",
-        "",
-        "| Gaussians | pixels | ms |",
-        "|---|---|---|",
-        *(
-            f"| {x['gaussians']:,} | {x['pixels']}^2 | {1e3 * x['diagonal']:.1f} |"
-            for x in r["growth"]
-            if x["views"] == 1 and x["pixels"] >= 512  # the others are in fisher.json
-        ),
-        "",
+    parts = [
+        f"The exact diagonal of a view (means, rotations, log-scales, logit-opacities and SH) takes "
+        f"{fast['exact diagonal'] / fast['forward+backward']:.2f} times as long as an image with gradients. "
+        f"`python benchmarks/fisher.py`, {r['machine']}, {r['date']}, commit {r['commit']}"
+        + (f" ({r['again']})" if "again" in r else "")
+        + ": milliseconds, one view of 100,000 Gaussians in a cube, 512x512, in brackets the ratio to forward + "
+        "backward. " + " ".join(r.get("note", [])),
+        markdown_table(["", *(f"`{row['preset']}`, SH {row['sh']}" for row in r["headline"])], cells),
+        f"**Tangents**, forward mode, `fast`: one takes {1e3 * t['1']:.0f} ms, 4 in one traversal {1e3 * t['4']:.0f}, "
+        f"16 {1e3 * t['16']:.0f}, the 6 of the pose {1e3 * t['pose']:.0f}. **Growth** of the diagonal at "
+        f"512x512, `fast`, SH 0, in ms: {', '.join(growth)} Gaussians; nearly in proportion to the number of views.",
+        *(picks_lines(r["picks"]) if "picks" in r else []),
     ]
-    return "\n".join(lines)
+    return "\n\n".join(part if part.startswith("|") else paragraph(part) for part in parts)
 
 
 def picks_lines(c: dict) -> list[str]:
-    """The section of one pick."""
-    lines = [
-        "",
-        "## One pick",
-        "",
-        paragraph(
-            f"{c['poses']} candidate poses at 320x240 and {c['train']} training views, {c['gaussians']:,} Gaussians "
-            f"with SH {c['sh']} ({c['run']}), nothing cached. The paper states about 7 s on an L40 GPU, for its own "
-            "formula, `fisherrf` by `eig`; ours that compares with it is `fisher` by `eig`, geometry alone. The "
-            "default of `drgs select` is `v_opt` of geometry and backdrop."
-        ),
-        "",
-        "| policy | criterion | blocks | preset | seconds a pick | ms a view |",
-        "|---|---|---|---|---|---|",
-    ]
+    """The paragraphs and the table of one pick."""
     rows = {(row["policy"], row["criterion"], tuple(row["blocks"]), row["preset"]): row["seconds"] for row in c["rows"]}
-    for pick in PICKS:
-        policy, criterion, blocks, preset = pick
-        cells = [policy, criterion, ", ".join(blocks) or "-", preset, "not timed yet", ""]
-        if pick in rows:
-            cells[4:] = f"{rows[pick]:.2f}", f"{1e3 * rows[pick] / (c['poses'] + c['train']):.0f}"
-        lines.append(f"| {' | '.join(cells)} |")
-    gains = ", ".join(f"{1e3 * t:.0f} ms by `{name}`" for name, t in c["gain of one"].items())
-    told = f"The gain of one candidate, once its information is there: {gains}."
+    lines = []
+    for policy, criterion, blocks, preset in PICKS:
+        seconds = rows.get((policy, criterion, blocks, preset))
+        time = f"{seconds:.2f}" if seconds else "not timed yet"
+        lines.append([", ".join((policy, criterion, *blocks)), preset, time])
+    gains = " and ".join(f"{1e3 * t:.0f} ms by `{name}`" for name, t in c["gain of one"].items())
+    told = f"Of a pick, the gain of one candidate takes {gains}, once its information is there."
     if "memory" in c:
-        peaks = ", ".join(f"{row['candidates']} candidates {row['GB']:.2f} GB" for row in c["memory"])
-        told += f" Peak memory of the process, one pick of the default on `fast`: {peaks}."
-    lines += ["", paragraph(told)]
-    return lines
+        peaks = ", ".join(f"{row['GB']:.2f} GB with {row['candidates']}" for row in c["memory"])
+        told += f" Peak memory of the default by candidates: {peaks}."
+    return [
+        f"**One pick** among {c['poses']} candidate poses at 320x240, {c['train']} training views, {c['gaussians']:,} "
+        f"Gaussians with SH {c['sh']} ({c['run']}), nothing cached; the first row is the default of `drgs select`. The "
+        "paper states about 7 s on an L40 GPU, for its own formula, `fisherrf` by `eig`; ours that compares with it is "
+        "`fisher` by `eig`, geometry alone.",
+        markdown_table(["policy, criterion, blocks", "preset", "seconds a pick"], lines),
+        told,
+    ]
 
 
 def main():
@@ -270,8 +233,13 @@ def main():
     parser.add_argument("--quick", action="store_true", help="small and few: checks that the script runs")
     parser.add_argument("--run", type=Path, help="a fitted run whose cameras are scored")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
+    parser.add_argument("--page", action="store_true", help="the page of the results that there are")
     parser.add_argument("--task", type=int, help="only the peak memory of scoring so many candidates")
     args = parser.parse_args()
+    store = ROOT / "benchmarks" / "fisher.json"
+    if args.page:
+        fill_between(PAGE, "fisher", report(json.loads(store.read_text())))
+        return
     if args.task:
         print(score(args.run, args.task))
         return
@@ -280,7 +248,6 @@ def main():
     run = args.run or next((p for p in (ROOT / "runs/real/office", ROOT / "out/demo/run") if p.is_dir()), None)
     if parts == ["picks"] and run is None:
         parser.error("--parts picks needs a fitted run; name one by --run")
-    store = ROOT / "benchmarks" / "fisher.json"
     result = ran() if len(parts) == len(PARTS) else json.loads(store.read_text())
     if "headline" in parts:
         result["headline"] = headline(turns)
@@ -298,7 +265,7 @@ def main():
     text = report(result)
     print(text)
     if not args.quick:
-        (ROOT / "docs" / "benchmarks-fisher.md").write_text(text)
+        fill_between(PAGE, "fisher", text)
         store.write_text(json.dumps(result, indent=1) + "\n")
 
 

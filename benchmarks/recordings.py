@@ -34,7 +34,7 @@ from drgs.data import load  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.fitting.frames import frames_for  # noqa: E402
 from drgs.fitting.start import start_plain  # noqa: E402
-from drgs.studies.tables import paragraph  # noqa: E402
+from drgs.studies.tables import markdown_table, paragraph  # noqa: E402
 from drgs.tracing.recordings import without_recordings  # noqa: E402
 
 ROWS = HERE / "recordings.jsonl"
@@ -156,41 +156,26 @@ def fit_steps(scene: str, trained: str, steps: int) -> dict:
     return row | {"times": times, "ran": ran()}
 
 
-def section() -> list[str]:
-    """The lines of docs/benchmarks.md, from the rows of processors: the last one of each frame, and of each fit."""
+def section() -> str:
+    """The part of docs/benchmarks.md, from the rows of processors: the last one of each frame, and of each fit."""
     rows = {(r["kind"], r.get("gaussians"), r.get("preset")): r for r in read_rows(ROWS) if not r.get("card")}
-    made = [
-        "## What a frame costs besides its work",
-        "",
-        "<!-- recordings: begin -->",
-        "",
+    shown = {key: r for key, r in rows.items() if key[0] in ("forward", "step", "fit") and key[2] in SHOWN}
+    lines: dict[tuple, list[str]] = {}
+    for (kind, count, preset), r in shown.items():
+        what = f"{r['scene']}, a step of a fit" if kind == "fit" else "x".join(map(str, r["size"]))
+        cells = lines.setdefault((count, preset, what), [f"`{preset}`, {count:,} Gaussians, {what}", "", ""])
+        ms = [f"{r['times'][name]['processor_ms']:.1f}" for name in ("traced", "recorded")]
+        cells[1 if kind == "forward" else 2] = ", ".join(ms)
+    made = list(shown.values())[-1]["ran"]
+    text = (
         "Colors, alpha and depth of a pinhole on tiles, and their gradients, are launched as they were recorded at the "
         "first frame of the same sizes and settings (`drgs/tracing/recordings.py`); all else is traced by Python each "
         "time. Bits are the same on LLVM. To record a step takes a tenth to a quarter longer than to trace it. "
-        "Processor time in milliseconds, medians of frames in turns, one thread, on a busy machine (`python "
-        "benchmarks/recordings.py`):",
-        "",
-        *table(rows),
-        "",
-        "<!-- recordings: end -->",
-        "",
-    ]
-    return [paragraph(x) if len(x) > 120 and not x.startswith("|") else x for x in made]
-
-
-def table(rows: dict[tuple, dict]) -> list[str]:
-    """A line for each frame and each fit, and where they were measured."""
-    lines = ["| | traced anew | recorded |", "|---|---|---|"]
-    named = {"forward": "forward", "step": "with gradients", "fit": "a step of a fit"}
-    where = ""
-    for (kind, count, preset), r in rows.items():
-        if kind not in named or preset not in SHOWN:
-            continue
-        ms = [f"{r['times'][name]['processor_ms']:.1f}" for name in ("traced", "recorded")]
-        what = r["scene"] if kind == "fit" else "x".join(map(str, r["size"]))
-        lines.append(f"| `{preset}`, {count:,} Gaussians, {what}, {named[kind]} | {' | '.join(ms)} |")
-        where = f"{r['ran']['machine']}, {r['ran']['date']}, commit {r['ran']['commit']}"
-    return [*lines, "", f"{where}."]
+        "Processor time in milliseconds, medians of frames in turns, on a busy machine (`python "
+        f"benchmarks/recordings.py`, {made['machine']}, {made['date']}, commit {made['commit']}):"
+    )
+    heads = ["traced anew, recorded", "forward", "with gradients"]
+    return f"{paragraph(text)}\n\n{markdown_table(heads, list(lines.values()))}"
 
 
 def main() -> None:
@@ -203,9 +188,7 @@ def main() -> None:
     parser.add_argument("--page", action="store_true", help="write the table of docs/benchmarks.md, and nothing else")
     args = parser.parse_args()
     if args.page:
-        rows = section()
-        begin, end = (rows.index(f"<!-- recordings: {x} -->") for x in ("begin", "end"))
-        fill_between(HERE.parent / "docs" / "benchmarks.md", "recordings", "\n".join(rows[begin + 2 : end - 1]))
+        fill_between(HERE.parent / "docs" / "benchmarks.md", "recordings", section())
         return
     if args.fit:
         for preset in args.presets:

@@ -1,6 +1,7 @@
 """How fast the renderer is, against Mitsuba's `volprim_rf_basic` on the same work.
 
-    python benchmarks/render.py [--quick]          prints tables, writes docs/benchmarks.md and benchmarks/render.json
+    python benchmarks/render.py [--quick]     a part of docs/benchmarks.md, benchmarks/render.json
+    python benchmarks/render.py --page        that part, of the results that there are
 
 Everything a frame needs is inside the clock (projection, lists, sorting, shading, torch bridge). Peers take turns in
 one process, every figure is the median of at least five turns after a warm-up, and what counts are the ratios.
@@ -11,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -22,17 +24,18 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 import cubes  # noqa: E402
 import numpy as np  # noqa: E402
-import recordings  # noqa: E402
 import torch  # noqa: E402
 from clocks import interleaved  # noqa: E402
+from pages import fill_between  # noqa: E402
 from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
 from drgs import runtime  # noqa: E402
 from drgs.ellipsoids import semi_axes  # noqa: E402
 from drgs.runtime.machine import peak_memory  # noqa: E402
-from drgs.studies.tables import paragraph  # noqa: E402
+from drgs.studies.tables import markdown_table, paragraph  # noqa: E402
 
+PAGE = ROOT / "docs" / "benchmarks.md"
 Preset = drgs.RenderSettings.preset
 
 
@@ -275,101 +278,80 @@ def task_first() -> dict:
     return {"first": times[0], "warm": min(times[1:])}
 
 
+def headline_rows(h: dict) -> list[list[str]]:
+    """A row a renderer: milliseconds of both kinds of frames, and how many times faster than `volprim_rf_basic`."""
+    kinds = ("forward", "forward+backward")
+    names = dict.fromkeys(re.sub(r",? forward(\+backward)?$", "", name) for name in h)
+    lines = []
+    for name in names:
+        found = [next((h[key] for key in (f"{name} {kind}", f"{name}, {kind}") if key in h), None) for kind in kinds]
+        base = [h[f"volprim {kind}"] for kind in kinds]
+        times = [f"{1e3 * t:.0f} ({b / t:.1f}x)" if t else "" for t, b in zip(found, base, strict=True)]
+        lines.append([name, *times])
+    return lines
+
+
 def report(result: dict) -> str:
-    """The markdown page."""
-    h = result["headline"]
-    base = {"forward": h["volprim forward"], "forward+backward": h["volprim forward+backward"]}
-    rows = []
-    for name, seconds in h.items():
-        kind = "forward+backward" if name.endswith("forward+backward") else "forward"
-        rows.append(f"| {name} | {1e3 * seconds:.0f} | {base[kind] / seconds:.1f}x |")
-    times = {kind: base[kind] / h[f"fast {kind}"] for kind in base}
-    lines = [
-        "# How fast the renderer is",
-        "",
+    """The part of the page."""
+    parts = [
         paragraph(
-            f"Preset `fast` is {times['forward']:.0f} times as fast as Mitsuba's `volprim_rf_basic`, `exact` "
-            f"{base['forward'] / h['exact forward']:.1f} times. `exact` costs "
-            f"{h['exact forward'] / h['fast forward']:.1f}x `fast` forward and "
-            f"{h['exact forward+backward'] / h['fast forward+backward']:.1f}x forward + backward."
+            f"`python benchmarks/render.py`, {result['machine']}, {result['date']}, commit {result['commit']}: "
+            "milliseconds, in brackets how many times faster than Mitsuba's `volprim_rf_basic`. 100,000 Gaussians in "
+            "[-1, 1]^3, median standard deviation 0.01, seen from distance 4 at 45 degrees, 512x512, one ray a pixel. "
+            "`fast` has the cut-offs of `volprim_rf_basic` (3 sigma, T = 0.01, alpha 0.9999)."
         ),
-        "",
-        paragraph(
-            f"Made by `python benchmarks/render.py` on {result['machine']}, {result['date']}, commit "
-            f"{result['commit']}. Medians of interleaved turns in one process, everything of an image included. The "
-            "ratios carry over to other machines, the milliseconds do not."
-        ),
-        "",
-        "## Compared with Mitsuba's `volprim_rf_basic`",
-        "",
-        paragraph(
-            "100,000 Gaussians in [-1, 1]^3, median standard deviation 0.01, seen from distance 4 at 45 degrees, "
-            "512^2, one ray a pixel. `fast` has the cut-offs of `volprim_rf_basic` (3 sigma, T = 0.01, alpha 0.9999)."
-        ),
-        "",
-        "| | ms | times faster than volprim |",
-        "|---|---|---|",
-        *rows,
-        "",
+        markdown_table(["", "forward", "forward + backward"], headline_rows(result["headline"])),
     ]
     if "rates" in result:
         r = result["rates"]
-        lines += [
+        parts.append(
             paragraph(
-                f"`fast` forward composites {r['hits per second'] / 1e6:.0f} million hits a second, out of at most "
-                f"{r['tests per second at most'] / 1e6:.0f} million tests of a Gaussian on a pixel; that is at most "
+                f"`fast` forward composites {r['hits per second'] / 1e6:.0f} million hits a second, with at most "
                 f"{100 * r['share of peak at most']:.0f} % of the {r['peak Gflop/s']:.0f} Gflop/s of fused "
                 "multiply-adds in a Dr.Jit kernel here."
-            ),
-            "",
-        ]
+            )
+        )
     if "hits" in result:
         x = result["hits"]
-        lines += [
-            "## Hits that the acceleration structure finds",
-            "",
+        parts.append(
             paragraph(
-                f"Of {x['true hits']:,} true hits of 256 x 256 rays (within 3 sigma, counted by `tiles`, no early "
-                f"stop) `bvh` finds {100 * x['bvh finds']:.2f} %, in {x['bvh ns per true hit']:.0f} ns each, and "
-                f"`volprim_rf_basic` {100 * x['volprim finds']:.2f} %, in {x['volprim ns per true hit']:.0f} ns. "
-                f"{100 * x['rays equal on both traversals']:.2f} % of the rays get the same color (1e-4) from `bvh` "
-                "and `tiles`. `volprim_rf_basic` misses a lone Gaussian of this size on 40 % of its rays."
-            ),
-            "",
-        ]
-    lines += [
-        "## Growth",
-        "",
-        "`fast`; standard deviations shrink with the square root of the number, so that the image stays as covered.",
-        "",
-        "| Gaussians | image | tile entries | forward ms | forward + backward ms |",
-        "|---|---|---|---|---|",
-        *(
-            f"| {r['gaussians']:,} | {r['size']}^2 | {r['pairs']:,} | {1e3 * r['forward']:.1f} "
-            f"| {1e3 * r['forward+backward']:.1f} |"
-            for r in result["growth"]
-            if r["size"] >= 512  # smaller images are in render.json
-        ),
-        "",
-        "## Memory and compilation",
-        "",
+                f"Of {x['true hits']:,} true hits (256x256 rays, within 3 sigma, counted by `tiles`) `bvh` finds "
+                f"{100 * x['bvh finds']:.2f} %, in {x['bvh ns per true hit']:.0f} ns each, `volprim_rf_basic` "
+                f"{100 * x['volprim finds']:.2f} %, in {x['volprim ns per true hit']:.0f} ns; it misses a lone "
+                f"Gaussian of this size on 40 % of its rays. {100 * x['rays equal on both traversals']:.2f} % of the "
+                "rays get the same color (1e-4) from `bvh` and `tiles`."
+            )
+        )
+    growth = "; ".join(
+        f"{1e3 * r['forward']:.0f} and {1e3 * r['forward+backward']:.0f} ms for {r['gaussians']:,} at {r['size']}^2"
+        for r in result["growth"]
+        if r["size"] == 1024 or (r["size"] == 512 and r["gaussians"] != 10_000)  # the others are in render.json
+    )
+    parts += [
         paragraph(
-            f"1,000,000 Gaussians at 1024 x 1024, forward + backward: {result['memory']['peak GB']:.2f} GB peak of the "
-            "whole process, torch included. First image forward + backward, nothing cached: "
-            f"{result['first']['first']:.2f} s; first image of a second process: {result['second']['first']:.2f} s; "
-            f"warm: {result['second']['warm']:.3f} s."
+            "**Growth**, `fast`, forward and forward + backward, standard deviations shrinking with the square root of "
+            f"the number: {growth}."
         ),
-        "",
-        *recordings.section(),
+        paragraph(
+            "**Memory**: 1,000,000 Gaussians at 1024x1024, forward + backward, take "
+            f"{result['memory']['peak GB']:.2f} GB at the peak of the whole process, torch included. **Compilation**: "
+            f"the first image forward + backward takes {result['first']['first']:.2f} s with nothing cached, "
+            f"{result['second']['first']:.2f} s in a second process, {result['second']['warm']:.3f} s warm."
+        ),
     ]
-    return "\n".join(lines)
+    return "\n\n".join(parts)
 
 
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--quick", action="store_true", help="small and few: checks that the script runs")
+    parser.add_argument("--page", action="store_true", help="the page of the results that there are")
     parser.add_argument("--task", choices=("memory", "first"))
     args = parser.parse_args()
+    store = ROOT / "benchmarks" / "render.json"
+    if args.page:
+        fill_between(PAGE, "render", report(json.loads(store.read_text())))
+        return
     if args.task:
         print(json.dumps({"memory": task_memory, "first": task_first}[args.task]()))
         return
@@ -388,8 +370,8 @@ def main():
     text = report(result)
     print(text)
     if not args.quick:
-        (ROOT / "docs" / "benchmarks.md").write_text(text)
-        (ROOT / "benchmarks" / "render.json").write_text(json.dumps(result, indent=1) + "\n")
+        fill_between(PAGE, "render", text)
+        store.write_text(json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":
