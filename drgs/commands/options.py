@@ -534,7 +534,7 @@ class Select(ComparedViews, Workers):
     output: Path = option(Path("out/select.json"), "The JSON file.", short="o")
     preset: Preset = option(
         "fast",
-        "Preset of render settings; fast ranks like exact in a fraction of the time (docs/tradeoff-fisher.md).",
+        "Preset of render settings; fast ranks like exact in a fraction of the time (docs/tradeoff.md).",
         heading="Rendering",
     )
     policy: str = same_option(SelectionConfig, "policy", heading="Views")
