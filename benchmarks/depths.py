@@ -3,8 +3,8 @@
     python benchmarks/depths.py [--scenes office ...] [--ways off ...] [--trained fast ...] [--units 3] [--views 0 6]
                                 [--steps 300] [--page]
 
-Appends one row a fit to benchmarks/depths.jsonl as it ends, leaves out what is there of this machine, then writes the
-table of docs/real-data.md, docs/data/depths.csv and depths-means.csv. Ways are weights of the term, the first and the
+Appends one row a fit to benchmarks/depths.jsonl as it ends, leaves out what is there of this machine, then writes
+docs/data/depths.csv and depths-means.csv. Ways are weights of the term, the first and the
 last, and whether what is behind a map counts as much (`both sides`); `relative` are maps m = 0.7 / z + 0.1 of the
 training views in place of z, so that scale and shift have to be found. All ways but `off` are `--depth on`; a row has
 what `auto` found, too.
@@ -32,7 +32,6 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 import numpy as np  # noqa: E402
 from fits import psnr_by_renderer, split_of  # noqa: E402
-from pages import fill_between  # noqa: E402
 from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
 
@@ -45,10 +44,8 @@ from drgs.fitting.metrics import evaluate  # noqa: E402
 from drgs.fitting.start import start  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.studies.statistics import Unit, estimate  # noqa: E402
-from drgs.studies.tables import markdown_table  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "depths.jsonl"
-PAGE = ROOT / "docs" / "real-data.md"
 CHOOSING = ("office", "still0", "room21")
 SHOWING = ("still7", "room22")
 MADE = ("still0", "still7", "room21", "room22")
@@ -66,7 +63,6 @@ WEIGHTS = {
 """Way -> the first and the last weight of the term, and the factor of what is behind the map."""
 DEFAULT = WEIGHTS["3 to 0.3"]
 KEY = ("scene", "way", "trained", "views", "steps", "seed", "offset")
-TOLD = (("3 to 0.3", "300"), ("3 to 0.3, both sides", "300"), ("1 to 0.1, both sides", "1500"))
 """Ways and steps of the page's table, of fits of all views; all are in the data file."""
 
 
@@ -189,13 +185,11 @@ def lines(rows: list[dict]) -> list[list[str]]:
     return found_lines
 
 
-def write_page(rows: list[dict]) -> None:
-    """The page's table, and the data file of all fits."""
+def write_files(rows: list[dict]) -> None:
+    """The data files: means, and all fits."""
     heads = ["weight", "fitted for", "views", "steps", "scenes", "fits", "PSNR", "worst", "depth error", "step"]
     found = lines(rows)
     write_csv(PAGE_DATA / "depths-means.csv", [heads, *found])
-    told = [[way, *cells[:-1]] for way, _, views, *cells in found if views == "all" and (way, cells[0]) in TOLD]
-    fill_between(PAGE, "depths", markdown_table([heads[0], *heads[3:-1]], told))
     everything = [[*KEY, *(f"{seen}, dB" for seen in SEEN), "cc_psnr", "ssim", "depth_error", "used", "seconds"]]
     for row in rows:
         numbers = [*(row["psnr"][seen] for seen in SEEN), *(row[name] for name in ("cc_psnr", "ssim", "depth_error"))]
@@ -215,7 +209,7 @@ def main() -> None:
     parser.add_argument("--steps", nargs="+", type=int, default=[300])
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the captures")
     parser.add_argument("--made", type=Path, default=ROOT / "runs" / "made", help="folder of the made scenes")
-    parser.add_argument("--page", action="store_true", help="write the table, fit nothing")
+    parser.add_argument("--page", action="store_true", help="write the data files, fit nothing")
     args = parser.parse_args()
     machine = ran()["machine"]
     there = {tuple(row[key] for key in KEY) for row in read_rows(ROWS) if row["machine"] == machine}
@@ -236,7 +230,7 @@ def main() -> None:
                 name: statistics.mean(x for x in row[name] if x is not None) for name in ("cc_psnr", "depth_error")
             }
             print(*key, f"{statistics.mean(row['psnr'][key[2]]):.2f} dB", means, f"{row['seconds']:.0f} s", flush=True)
-    write_page(read_rows(ROWS))
+    write_files(read_rows(ROWS))
 
 
 if __name__ == "__main__":

@@ -2,9 +2,9 @@
 
     python benchmarks/rates.py [--scenes banana ...] [--steps 400 1500] [--page]
 
-Appends one row a fit to benchmarks/rates.jsonl as it ends, leaves out what is there, then writes the table of
-docs/real-data.md, docs/data/rates.csv and rates-whole.csv. Scenes are captures by name, or paths of scenes that move or
-have a teacher: those are fitted with the defaults of `drgs fit`, and have a table of their own. One thread, one seed.
+Appends one row a fit to benchmarks/rates.jsonl as it ends, leaves out what is there, then writes
+docs/data/rates.csv and rates-whole.csv. Scenes are captures by name, or paths of scenes that move or have a teacher:
+those are fitted with the defaults of `drgs fit`, and have a table of their own. One thread, one seed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 from fits import fitted, psnr_by_renderer  # noqa: E402
-from pages import fill_between  # noqa: E402
 from studies import PAGE_DATA, table_lines, write_csv  # noqa: E402
 from where import DATA, add_row, ran, read_rows  # noqa: E402
 
@@ -31,11 +30,9 @@ from drgs.data import load  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.fitting.frames import frames_for  # noqa: E402
 from drgs.fitting.renderers import renderers_to_measure  # noqa: E402
-from drgs.studies.tables import markdown_table  # noqa: E402
 from drgs.train import fit  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "rates.jsonl"
-PAGE = ROOT / "docs" / "real-data.md"
 SCENES = ("banana", "fern", "statue")
 SIZE = {"max_pixels": 12_000, "max_gaussians": 8_000}
 SEEN = ("exact", "fast", "gsplat")
@@ -137,27 +134,13 @@ def table(found: list[dict]) -> str:
     return "\n".join(lines)
 
 
-def short_table(found: list[dict]) -> str:
-    """What the page has of `table`: what larger rates add in `fast` to those of 3DGS."""
-    shown = "scales, means, SH x 4"
-    lines = []
-    by = {(row["scene"], row["steps"], row["rates"]): row["psnr"]["fast"] for row in found if "psnr" in row}
-    for scene, steps, rates in sorted(by):
-        if rates != "3DGS":
-            continue
-        plain = by[scene, steps, rates]
-        gain = statistics.mean(by[scene, steps, shown]) - statistics.mean(plain)
-        lines.append([scene, f"{steps:,}", f"{statistics.mean(plain):.2f}", f"{gain:+.2f}"])
-    return markdown_table(["capture", "steps", "3DGS", shown], lines)
-
-
 def main() -> None:
     """The program."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), help="names of captures")
     parser.add_argument("--steps", nargs="+", type=int, default=[400, 1500])
     parser.add_argument("--rates", nargs="+", choices=FACTORS, default=list(FACTORS))
-    parser.add_argument("--page", action="store_true", help="fit nothing, write the table of the rows that there are")
+    parser.add_argument("--page", action="store_true", help="fit nothing, write the tables of the rows that there are")
     args = parser.parse_args()
     done = {tuple(row[name] for name in KEY) for row in read_rows(ROWS)}
     for steps in args.steps:
@@ -169,7 +152,6 @@ def main() -> None:
                     said = row.get("scores") or {x: statistics.mean(row["psnr"][x]) for x in SEEN}
                     print(scene, steps, rates, {name: round(x, 3) for name, x in said.items()}, flush=True)
     rows = read_rows(ROWS)
-    fill_between(PAGE, "rates", short_table(rows))
     for name, text in (("rates", table(rows)), ("rates-whole", whole_table(rows))):
         print(text)
         write_csv(PAGE_DATA / f"{name}.csv", table_lines(text))
