@@ -1,7 +1,7 @@
 """Preset `mitsuba`: how right its order of entries is, and what it costs to sort by them.
 
-    python benchmarks/entry.py [--quick] [--print]     a table of docs/numerics.md, benchmarks/entry.json
-    python benchmarks/entry.py --page                  the table of what benchmarks/entry.json has
+    python benchmarks/entry.py [--quick]     a table, and benchmarks/entry.json, of which docs/numerics.md tells
+    python benchmarks/entry.py --page        the table of what benchmarks/entry.json has
 
 Errors are against the float64 oracle, in a window of `wolf` (../shared/data, or DRGS_DATA) and inside of three huge
 Gaussians; times are CPU time of the process beside the same settings in the order of centers, which sorts nothing along
@@ -23,7 +23,6 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: tor
 
 import torch  # noqa: E402
 from clocks import interleaved  # noqa: E402
-from pages import fill_between  # noqa: E402
 from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
@@ -33,7 +32,6 @@ from drgs.studies.tables import markdown_table, paragraph  # noqa: E402
 
 MITSUBA = drgs.RenderSettings.preset("mitsuba")
 OFF = 1e-3
-PAGE = ROOT / "docs" / "numerics.md"
 RESULTS = ROOT / "benchmarks" / "entry.json"
 
 
@@ -76,7 +74,7 @@ def costs(g: Gaussians, camera: Camera, turns: int) -> dict[str, float]:
 
 
 def report(r: dict) -> str:
-    """What docs/numerics.md says."""
+    """The table."""
     told = (
         f"`python benchmarks/entry.py`, {r['machine']}, {r['date']}, commit {r['commit']}; windows of "
         f"{max(row['pixels'] for row in r['rows'].values()):,} pixels. Off: by more than {OFF:g}. Cost: over the order "
@@ -95,11 +93,10 @@ def report(r: dict) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--quick", action="store_true", help="without wolf: checks that the script runs")
-    parser.add_argument("--print", action="store_true", help="do not touch docs/numerics.md")
-    parser.add_argument("--page", action="store_true", help="measure nothing, write what there is")
+    parser.add_argument("--page", action="store_true", help="measure nothing, print what there is")
     args = parser.parse_args()
     if args.page:
-        fill_between(PAGE, "entry", report(json.loads(RESULTS.read_text())))
+        print(report(json.loads(RESULTS.read_text())))
         return
     inside = orbit((0, 0, 0), 3.0, 1, width=40, height=40)[0]
     result: dict = {
@@ -116,12 +113,9 @@ def main() -> None:
         camera = orbit(middle, float(wolf.means.std(0).norm()) * 3, 8, width=160, height=160)[1]
         row = errors(wolf, camera, (60, 60, 40, 40))
         result["rows"][f"a window of wolf ({len(wolf):,} thin Gaussians)"] = row | {"cost": costs(wolf, camera, 5)}
-    text = report(result)
-    print(text)
+    print(report(result))
     if not args.quick:
         RESULTS.write_text(json.dumps(result, indent=1) + "\n")
-    if not (args.print or args.quick):
-        fill_between(PAGE, "entry", text)
 
 
 if __name__ == "__main__":
