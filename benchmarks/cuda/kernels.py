@@ -1,6 +1,6 @@
 """Every CUDA kernel of the package, compiled for real cards on a machine without one.
 
-    python benchmarks/cuda/kernels.py           table of docs/cuda.md and benchmarks/cuda/kernels.json
+    python benchmarks/cuda/kernels.py           a table, and benchmarks/cuda/kernels.json
     python benchmarks/cuda/kernels.py --check [CASE ...]      writes nothing; 1 if anything is wrong
 
 A process of its own (drive.py) runs the cases on LLVM and on a driver that has no card behind it, which keeps the PTX
@@ -254,17 +254,14 @@ def main() -> int:
         kernels = rows(folder / "80", cases, NEW)
         old = driven(folder / "75", args.cases, 75, optix=False) if args.old else {}
         before = rows(folder / "75", old, OLD)
-    lines = table(kernels, cases)
-    print("\n".join(lines))
+    print("\n".join(table(kernels, cases)))
     if not args.check:
-        from pages import fill_between
         from where import ran
 
         if not args.old and _DATA.exists():
             before = json.loads(_DATA.read_text()).get("old", [])
         told = {"ran": ran(), "cases": cases, "kernels": kernels, "old": before}
         _DATA.write_text(json.dumps(told, indent=None, separators=(",", ":")).replace('{"case"', '\n{"case"') + "\n")
-        fill_between(ROOT / "docs" / "cuda.md", "kernels", "\n".join(lines))
     wrong = faults(cases, kernels) + faults(old, before)
     print("\n".join(wrong), file=sys.stderr)
     return int(bool(wrong))
