@@ -1,6 +1,6 @@
 """drgs: differentiable Gaussian rendering with Dr.Jit and Mitsuba 3, on any CPU and on NVIDIA cards.
 
-CUDA was run for 15 minutes on one card, an H200: docs/cuda.md.
+CUDA was run for half an hour, on H200 cards: docs/cuda.md.
 
     import drgs
 
