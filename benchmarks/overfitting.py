@@ -2,8 +2,8 @@
 
     python benchmarks/overfitting.py [--scenes banana ...] [--views 3 6 12 0] [--rules "drop 0.2" ...] [--page]
 
-Appends one row a fit to benchmarks/overfitting.jsonl as it ends and leaves out what is there; --page writes the table
-of docs/real-data.md and docs/data/overfitting.csv. A fit of a few views has those that are evenly spaced among the
+Appends one row a fit to benchmarks/overfitting.jsonl as it ends and leaves out what is there; --page writes
+docs/data/overfitting.csv, of which docs/real-data.md tells. A fit of a few views has those that are evenly spaced among the
 training views, by name, and initial points of these alone; it is measured on all the others, 12 at most, evenly spaced.
 0 views are all training views, measured on those held out. On the way `fast` draws at most 4 of the measured views,
 which says when they were best. Rules were tried on CHOOSING; those that were best there were then measured on SHOWING.
@@ -28,7 +28,6 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 from fits import psnr_by_renderer, split_of  # noqa: E402
-from pages import fill_between  # noqa: E402
 from steps import PATHS, SEEN, lines  # noqa: E402
 from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
@@ -39,10 +38,8 @@ from drgs.fitting.frames import Frame, frames_for  # noqa: E402
 from drgs.fitting.start import start_plain  # noqa: E402
 from drgs.fitting.trainer import Trainer  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
-from drgs.studies.tables import markdown_table  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "overfitting.jsonl"
-PAGE = ROOT / "docs" / "real-data.md"
 CHOOSING = ("banana", "fern", "office", "still0", "room21")
 SHOWING = ("head", "statue", "lego", "street", "watch", "still7", "room22")
 MADE = ("still0", "still7", "room21", "room22")
@@ -64,7 +61,6 @@ RULES: dict[str, dict[str, Any]] = {
     "SH 2": {"sh_degree": 2},
 }
 """Name -> fields of `FitConfig` that it changes. Rows of other rules are of code that lost and was not kept."""
-SHOWN = "drop 0.4"  # what `auto` does of 3 photographs
 
 
 def split(dataset: Dataset, config: FitConfig, views: int) -> tuple[list[View], list[View]]:
@@ -134,27 +130,21 @@ def cells(rows: list[dict], rule: str, scenes: Sequence[str]) -> list[str]:
     return found if any(found) else []
 
 
-def write_page(rows: list[dict]) -> None:
-    """The page's table of `SHOWN`, seen with `fast`, and the data file of every rule and scene."""
+def write_file(rows: list[dict]) -> None:
+    """The data file of every rule and scene."""
     kinds = sorted({(row["views"] or 99, row["views"], row["max_steps"], row["max_pixels"]) for row in rows})
     rules = [rule for rule in dict.fromkeys(row["rule"] for row in rows) if rule != "none"]
     heads = ["rule", "views", "steps", "pixels", "scene", "fits", *(f"{x}: mean / worst, dB" for x in SEEN)]
-    table, everything = [], [heads]
+    everything = [heads]
     for _, *kind in kinds:
         views, steps, pixels = kind
         alike = [row for row in rows if [row["views"], row["max_steps"], row["max_pixels"]] == kind]
         told = [str(views or "all"), f"{steps:,}"]
-        for half, scenes in (("tried on", CHOOSING), ("shown on", SHOWING)):
-            own = [scene for scene in scenes if cells(alike, SHOWN, [scene])]
-            if own:
-                name = f"{half} these {len(own)}" if len(own) > 1 else own[0]
-                table.append([*told, name, cells(alike, SHOWN, own)[1]])
         for rule in rules:
             for scenes in (CHOOSING, SHOWING):
                 own = [scene for scene in scenes if cells(alike, rule, [scene])]
                 for some in [[scene] for scene in own] + ([own] if len(own) > 1 else []):
                     everything.append([rule, *told, f"{pixels:,}", ", ".join(some), *cells(alike, rule, some)])
-    fill_between(PAGE, "overfitting", markdown_table(["views", "steps", "captures", f"`{SEEN[0]}`"], table))
     write_csv(PAGE_DATA / "overfitting.csv", everything)
 
 
@@ -172,7 +162,9 @@ def main() -> None:
     parser.add_argument("--seen", nargs="+", default=list(SEEN), help="presets that measure, `fast` among them")
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the captures")
     parser.add_argument("--made", type=Path, default=ROOT / "runs" / "made", help="folder of the made scenes")
-    parser.add_argument("--page", action="store_true", help="fit nothing, write the table of the rows that there are")
+    parser.add_argument(
+        "--page", action="store_true", help="fit nothing, write the data file of the rows that there are"
+    )
     args = parser.parse_args()
     fits = [(s, v, r, u) for s in args.scenes for v in args.views for u in args.units for r in args.rules]
     for scene, views, rule, unit in [] if args.page else fits:
@@ -186,7 +178,7 @@ def main() -> None:
         way = " ".join(f"{x[2]:.2f}" for x in row["curve"])
         print(scene, views, rule, row["points"], *mean, f"({way})", f"{row['seconds']:.1f} s", flush=True)
     if args.page:
-        write_page(read_rows(ROWS))
+        write_file(read_rows(ROWS))
 
 
 if __name__ == "__main__":

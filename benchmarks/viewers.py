@@ -23,7 +23,7 @@ By their code viewers leave out a Gaussian whose center is outside of the pictur
 farthest center, so that a skybox makes its order of what is near coarser; Babylon.js's own viewer has its far plane at
 1100 times the diagonal of what it has loaded. Neither was measured. None takes colors for linear ones.
 
-`--page` writes the table of docs/one-model.md and docs/data/viewers.csv, `--picture` a sheet of one view of the runs
+`--page` writes docs/data/viewers.csv, of which docs/one-model.md tells, `--picture` a sheet of one view of the runs
 of one capture.
 """
 
@@ -56,7 +56,6 @@ import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from fits import split_of  # noqa: E402
-from pages import fill_between  # noqa: E402
 from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
@@ -72,8 +71,7 @@ from drgs.settings import RenderSettings  # noqa: E402
 from drgs.viewing.client import ClientGaussians, pose_of  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "viewers.jsonl"
-PAGE = ROOT / "docs" / "one-model.md"
-LEFT_OUT = ("inria", "3dgut", "Spark, as it comes")  # of the page; the data file has all
+LEFT_OUT = ("inria", "3dgut", "Spark, as it comes")  # of what is printed; the data file has all
 PAGES = ROOT / "benchmarks" / "viewer_pages"
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 PATIENCE = 300.0  # s until a viewer must have drawn: the processor draws, and may be busy
@@ -494,7 +492,7 @@ def main() -> None:
     parser.add_argument("--wheels", type=Path, default=ROOT / "out" / "viewers", help="where pip put vuer and gradio")
     parser.add_argument("--views", type=int, default=3, help="held-out photographs of each run")
     parser.add_argument("--far", type=float, help="far plane of all viewers, in units of the scene")
-    parser.add_argument("--page", action="store_true", help="write the table of docs/one-model.md")
+    parser.add_argument("--page", action="store_true", help="write docs/data/viewers.csv")
     parser.add_argument("--picture", type=Path, help="JPEG of one view in all of them, a run a row")
     parser.add_argument("--at", type=int, default=0, help="which of the views the picture shows")
     parser.add_argument("--keep", type=Path, help="folder for all pictures")
@@ -530,7 +528,6 @@ def main() -> None:
     text = table(read_rows(ROWS))
     print(text)
     if args.page:
-        fill_between(PAGE, "viewers", text)
         write_csv(PAGE_DATA / "viewers.csv", sheet_lines(read_rows(ROWS)))
 
 
