@@ -3,11 +3,11 @@
     python benchmarks/overfitting.py [--scenes banana ...] [--views 3 6 12 0] [--rules "drop 0.2" ...] [--page]
 
 Appends one row a fit to benchmarks/overfitting.jsonl as it ends and leaves out what is there; --page writes
-docs/data/overfitting.csv, of which docs/real-data.md tells. A fit of a few views has those that are evenly spaced among the
-training views, by name, and initial points of these alone; it is measured on all the others, 12 at most, evenly spaced.
-0 views are all training views, measured on those held out. On the way `fast` draws at most 4 of the measured views,
-which says when they were best. Rules were tried on CHOOSING; those that were best there were then measured on SHOWING.
-Seconds are those that the process computed in its steps. Made scenes are folders of `--made`. One thread.
+docs/data/overfitting.csv, of which docs/real-data.md tells. A fit of a few views has those that are evenly spaced among
+the training views, by name, and initial points of these alone; it is measured on all the others, 12 at most, evenly
+spaced. 0 views are all training views, measured on those held out. On the way `fast` draws at most 4 of the measured
+views, which says when they were best. Rules were tried on CHOOSING; those that were best there were then measured on
+SHOWING. Seconds are those that the process computed in its steps. Made scenes are folders of `--made`. One thread.
 """
 
 from __future__ import annotations
@@ -162,9 +162,7 @@ def main() -> None:
     parser.add_argument("--seen", nargs="+", default=list(SEEN), help="presets that measure, `fast` among them")
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the captures")
     parser.add_argument("--made", type=Path, default=ROOT / "runs" / "made", help="folder of the made scenes")
-    parser.add_argument(
-        "--page", action="store_true", help="fit nothing, write the data file of the rows that there are"
-    )
+    parser.add_argument("--page", action="store_true", help="fit nothing, write the file of the rows that there are")
     args = parser.parse_args()
     fits = [(s, v, r, u) for s in args.scenes for v in args.views for u in args.units for r in args.rules]
     for scene, views, rule, unit in [] if args.page else fits:

@@ -2,7 +2,7 @@
 
     python benchmarks/recordings.py [--turns 40] [--sizes 200:32x24 ...] [--presets fast ...]
     python benchmarks/recordings.py --fit banana [--steps 200]      steps of two fits, in turns
-    python benchmarks/recordings.py --page                          the table of docs/benchmarks.md
+    python benchmarks/recordings.py --page                          the part of docs/benchmarks.md
 
 Appends a row for each size, preset and kind of frame to recordings.jsonl: medians of wall and processor time and of
 what kernels take, in milliseconds, and how far images and gradients of both are apart. On a card gsplat's kernels take
@@ -34,7 +34,7 @@ from drgs.data import load  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.fitting.frames import frames_for  # noqa: E402
 from drgs.fitting.start import start_plain  # noqa: E402
-from drgs.studies.tables import markdown_table, paragraph  # noqa: E402
+from drgs.studies.tables import paragraph  # noqa: E402
 from drgs.tracing.recordings import without_recordings  # noqa: E402
 
 ROWS = HERE / "recordings.jsonl"
@@ -159,23 +159,22 @@ def fit_steps(scene: str, trained: str, steps: int) -> dict:
 def section() -> str:
     """The part of docs/benchmarks.md, from the rows of processors: the last one of each frame, and of each fit."""
     rows = {(r["kind"], r.get("gaussians"), r.get("preset")): r for r in read_rows(ROWS) if not r.get("card")}
-    shown = {key: r for key, r in rows.items() if key[0] in ("forward", "step", "fit") and key[2] in SHOWN}
-    lines: dict[tuple, list[str]] = {}
+    named = {"step": "with gradients", "fit": "a step of a fit"}
+    shown = {key: r for key, r in rows.items() if key[0] in named and key[2] in SHOWN}
+    found = []
     for (kind, count, preset), r in shown.items():
-        what = f"{r['scene']}, a step of a fit" if kind == "fit" else "x".join(map(str, r["size"]))
-        cells = lines.setdefault((count, preset, what), [f"`{preset}`, {count:,} Gaussians, {what}", "", ""])
-        ms = [f"{r['times'][name]['processor_ms']:.1f}" for name in ("traced", "recorded")]
-        cells[1 if kind == "forward" else 2] = ", ".join(ms)
+        traced, recorded = (r["times"][name]["processor_ms"] for name in ("traced", "recorded"))
+        what = r["scene"] if kind == "fit" else "x".join(map(str, r["size"]))
+        told = f"`{preset}`, {count:,} Gaussians, {what}, {named[kind]}"
+        found.append(f"{told}: {recorded:.1f} instead of {traced:.1f}")
     made = list(shown.values())[-1]["ran"]
-    text = (
+    return paragraph(
         "Colors, alpha and depth of a pinhole on tiles, and their gradients, are launched as they were recorded at the "
         "first frame of the same sizes and settings (`drgs/tracing/recordings.py`); all else is traced by Python each "
         "time. Bits are the same on LLVM. To record a step takes a tenth to a quarter longer than to trace it. "
         "Processor time in milliseconds, medians of frames in turns, on a busy machine (`python "
-        f"benchmarks/recordings.py`, {made['machine']}, {made['date']}, commit {made['commit']}):"
+        f"benchmarks/recordings.py`, {made['machine']}, {made['date']}, commit {made['commit']}): {'; '.join(found)}."
     )
-    heads = ["traced anew, recorded", "forward", "with gradients"]
-    return f"{paragraph(text)}\n\n{markdown_table(heads, list(lines.values()))}"
 
 
 def main() -> None:
@@ -185,7 +184,7 @@ def main() -> None:
     parser.add_argument("--presets", nargs="*", default=list(PRESETS))
     parser.add_argument("--fit", help="a capture, of which a fit's steps are timed, and nothing else")
     parser.add_argument("--steps", type=int, default=200)
-    parser.add_argument("--page", action="store_true", help="write the table of docs/benchmarks.md, and nothing else")
+    parser.add_argument("--page", action="store_true", help="write the part of docs/benchmarks.md, and nothing else")
     args = parser.parse_args()
     if args.page:
         fill_between(HERE.parent / "docs" / "benchmarks.md", "recordings", section())
