@@ -1,6 +1,6 @@
 """What a fit has besides photographs and Gaussians is a component: one file, and one row of a table.
 
-The first is the one that docs/extending.md shows, from its page. Others are written here, in a few lines, as a file of
+The first is examples/vignette.py, which docs/extending.md shows. Others are written here, in a few lines, as a file of
 their own would be.
 """
 
@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from doc_pages import blocks
 from test_times import Drift
 from test_train import FAST, config, dataset, random_rows, scene  # noqa: F401 (a fixture)
 
@@ -40,20 +39,19 @@ from drgs.io.checkpoint import load_state, save_state
 from drgs.selection import policies
 from drgs.train import fit
 
-PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
+VIGNETTE = Path(__file__).parents[1] / "examples" / "vignette.py"
 
 
 @pytest.fixture
 def vignette(tmp_path, monkeypatch):
-    """The class of the page, in a file of its own, and its row in the table."""
-    file = next(x.text for x in blocks(PAGE) if x.text.startswith("# my_package/vignette.py"))
-    (tmp_path / "vignette_of_the_page.py").write_text(file)
+    """The class of the example, and its row in the table."""
+    (tmp_path / "vignette_of_the_example.py").write_text(VIGNETTE.read_text())
     monkeypatch.syspath_prepend(str(tmp_path))
-    kind = importlib.import_module("vignette_of_the_page").Vignette
+    kind = importlib.import_module("vignette_of_the_example").Vignette
     COMPONENTS["vignette"] = kind
     yield kind
     del COMPONENTS["vignette"]
-    del sys.modules["vignette_of_the_page"]
+    del sys.modules["vignette_of_the_example"]
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -34,6 +35,7 @@ def site(tmp_path_factory) -> Path:
     for block in blocks(PAGE):
         if found := re.match(r"# (my_package/\w+\.py)\n", block.text):
             (folder / found[1]).write_text(block.text)
+    shutil.copy(ROOT / "examples/vignette.py", package)
     name, version = project["project"]["name"], project["project"]["version"]
     info = folder / f"{name.replace('-', '_')}-{version}.dist-info"
     info.mkdir()
