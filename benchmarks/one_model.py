@@ -3,11 +3,11 @@
     python benchmarks/one_model.py [--scenes head bonsai ...] [--trained fast any ...] [--seeds 3] [--steps 400]
     python benchmarks/one_model.py --page
 
-Appends one row a fit to benchmarks/one_model.jsonl as it ends, leaves out what is there, then writes the tables of
-docs/one-model.md and docs/real-data.md. Scenes are captures by name, or folders. Each seed holds out other views, but
-of data sets that have a split of their own. The cycles were chosen on banana, fern, statue and lego, which the averages
-leave out. One thread. What a mix costs is the average of the medians of its presets' steps over the median of the steps
-with `fast` of the same fit, so that other work on the machine takes from both.
+Appends one row a fit to benchmarks/one_model.jsonl as it ends, leaves out what is there, then writes the table of
+docs/one-model.md and docs/data/one-model*.csv. Scenes are captures by name, or folders. Each seed holds out other
+views, but of data sets that have a split of their own. The cycles were chosen on banana, fern, statue and lego, which
+the averages leave out. One thread. What a mix costs is the average of the medians of its presets' steps over the median
+of the steps with `fast` of the same fit, so that other work on the machine takes from both.
 """
 
 from __future__ import annotations
@@ -35,11 +35,10 @@ from drgs.fitting.frames import frames_for  # noqa: E402
 from drgs.fitting.renderers import ANY, RendererSchedule, renderers_to_measure  # noqa: E402
 from drgs.settings import PRESETS, RenderSettings  # noqa: E402
 from drgs.studies.statistics import Unit, estimate  # noqa: E402
-from drgs.studies.tables import markdown_table  # noqa: E402
 
-SHOWN = tuple(name for name in ANY if name != "inria")  # on the pages; of `inria` there is one seed
+SHOWN = tuple(name for name in ANY if name != "inria")  # on the page; of `inria` there is one seed
 ROWS = ROOT / "benchmarks" / "one_model.jsonl"
-PAGES = {"behind": ROOT / "docs" / "one-model.md", "one_model": ROOT / "docs" / "real-data.md"}
+PAGE = ROOT / "docs" / "one-model.md"
 SCENES = ("head", "bonsai", "office", "lego", "banana", "fern", "statue")
 TUNED_ON = ("banana", "fern", "statue", "lego")
 SIZE = {"max_steps": 400, "max_pixels": 12_000, "max_gaussians": 8_000}
@@ -156,21 +155,6 @@ def tables(found: list[dict]) -> str:
     return "\n".join(lines)
 
 
-def beside_specialists(found: list[dict]) -> str:
-    """Held-out PSNR of `any` by capture and renderer, and what that is behind the fit for this renderer alone."""
-    lines = []
-    for scene in dict.fromkeys(row["scene"] for row in found):
-        group = [row for row in found if (row["scene"], row["trained"]) == (scene, "any")]
-        cells = [f"{scene} ({'+'.join(str(len(row['psnr'][ANY[0]])) for row in group)})"]
-        for name in SHOWN:
-            lags = [statistics.mean(x) for unit, x in _lags(found, "any", name).items() if unit[0] == scene]
-            mean = statistics.mean(statistics.mean(row["psnr"][name]) for row in group)
-            cells.append(f"{mean:.2f} ({statistics.mean(lags):+.2f})")
-        ratios = [row["over_fast"] for row in group if row["over_fast"]]
-        lines.append([*cells, f"{statistics.mean(ratios):.2f}"])
-    return markdown_table(["capture (held out)", *(f"`{name}`" for name in SHOWN), "step / `fast`"], lines)
-
-
 def main() -> None:
     """The program."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -194,9 +178,8 @@ def main() -> None:
     short = [row for row in found if row["max_steps"] == SIZE["max_steps"]]
     few = behind(short, SHOWN).splitlines()
     few = [line for line in few if not line.startswith("| gsplat |")]  # which is in the data file
-    for name, text in (("behind", "\n".join(few)), ("one_model", beside_specialists(short))):
-        print(text)
-        fill_between(PAGES[name], name, text)
+    print(*few, sep="\n")
+    fill_between(PAGE, "behind", "\n".join(few))
     write_csv(PAGE_DATA / "one-model.csv", table_lines(tables(short)))
     write_csv(PAGE_DATA / "one-model-behind.csv", table_lines(behind(short)))
     write_csv(PAGE_DATA / "one-model-steps.csv", table_lines(longer(found)))
