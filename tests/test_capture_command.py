@@ -54,7 +54,7 @@ def viewer(tmp_path_factory):
     folder = tmp_path_factory.mktemp("npm")
     write_viewer(folder / "there")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(npm, "PACKAGED", folder / "there")
+        patch.setattr(npm, "cache_folder", lambda: folder / "there")
         patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
         yield
 
@@ -236,15 +236,15 @@ def test_the_page_to_send_may_be_out_of_reach(captured, tmp_path, monkeypatch, c
     def refused(*_, **__):
         raise urllib.error.URLError("no network")
 
-    there = npm.PACKAGED
-    monkeypatch.setattr(npm, "PACKAGED", tmp_path / "none")
+    there = npm.cache_folder
+    monkeypatch.setattr(npm, "cache_folder", lambda: tmp_path / "none")
     monkeypatch.setattr(urllib.request, "urlopen", refused)
     run(Capture(output=folder, resume=True))
     told = capsys.readouterr().out
     assert "share: not written, " in told
     assert "no network" in told
     assert steps_of(folder) == ["photos", "poses", "fit", "report"]
-    monkeypatch.setattr(npm, "PACKAGED", there)
+    monkeypatch.setattr(npm, "cache_folder", there)
     run(Capture(output=folder, resume=True))
     assert (folder / "scene.html").is_file()
     assert steps_of(folder)[-1] == "share"

@@ -168,7 +168,7 @@ def test_a_capture_goes_on_after_a_full_disk(disk, tmp_path, capsys, monkeypatch
     from drgs.pages.sharing import npm
 
     write_viewer(tmp_path / "npm")
-    monkeypatch.setattr(npm, "PACKAGED", tmp_path / "npm")
+    monkeypatch.setattr(npm, "cache_folder", lambda: tmp_path / "npm")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(capture, "FitConfig", lambda: types.SimpleNamespace(replace=lambda **_: CONFIG))
     walls = corner_walls(np.random.default_rng(5))

@@ -66,7 +66,7 @@ def viewer(tmp_path, monkeypatch):
     """Pages take a stand-in for the viewer's code."""
     folder = tmp_path / "npm"
     write_viewer(folder)
-    monkeypatch.setattr(npm, "PACKAGED", folder)
+    monkeypatch.setattr(npm, "cache_folder", lambda: folder)
 
 
 def told(path) -> dict:
@@ -139,10 +139,9 @@ def test_refusals(viewer, tmp_path, monkeypatch, capsys, arguments, told_of):
 
 
 def test_without_a_network(tmp_path, monkeypatch, capsys):
-    """Where the viewer's code is neither in the wheel nor fetched, one line says what to do, and no page is left."""
+    """Where the viewer's code is not there and cannot be fetched, one line says what to do, and no page is left."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(npm, "PACKAGED", tmp_path / "none")
 
     def refuse(address, timeout):
         raise urllib.error.URLError("no route to host")
@@ -152,7 +151,8 @@ def test_without_a_network(tmp_path, monkeypatch, capsys):
     assert cli.main(["share", "a.ply", "--quiet"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "must be fetched once from https://registry.npmjs.org/three/-/three-" in line
-    assert "no route to host; connect to the network" in line
+    assert "no route to host; connect to the network, or copy " in line
+    assert line.endswith(f"{tmp_path / 'cache' / 'drgs' / 'npm'} from a machine that has it")
     assert not (tmp_path / "a.html").exists()
 
 

@@ -358,13 +358,13 @@ def test_own_error_sees_a_wrong_truth(place, monkeypatch):
 
 
 def test_tables_and_no_matplotlib(place, monkeypatch, capsys):
-    """The tables on stdout; without matplotlib one line instead of the plot, exit code 0."""
+    """The tables on stdout; without matplotlib one line before the work instead of the plot, exit code 0."""
     few(monkeypatch, "fast", "float64 oracle")
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     parts = ("tradeoff", place / "scene.ply", "--cameras", place / "cameras.json", "-o", place / "plain")
     assert cli.main([*map(str, parts), "--repeats", "1", "--max-error", "1e-9"]) == 0
-    text = capsys.readouterr().out
-    assert "no plot: matplotlib is not installed" in text
+    text, told = capsys.readouterr()
+    assert "no plot will be drawn: matplotlib is not installed; pip install 'drgs[report]'" in told.splitlines()[0]
     assert "no setting is within it, the least error is" in text
     assert not (place / "plain" / "tradeoff.png").exists()
 

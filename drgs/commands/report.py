@@ -20,6 +20,7 @@ from drgs.fitting.renderers import own_preset
 from drgs.fitting.resume import lock_run
 from drgs.io.outputs import check_file
 from drgs.io.run import Run
+from drgs.pages.report import charts
 from drgs.pages.report.page import GENERATOR
 from drgs.pages.report.write import FILE, write_report
 
@@ -38,6 +39,8 @@ def run(args: Report) -> None:
         if path.suffix.lower() not in (".html", ".htm"):
             raise ValueError(f"{path}: must be named *.html, which is what is written; choose another (-o)")
         check_file(path, "report", [folder.path / "config.json"], is_report)
+    if not charts.is_available():
+        _log.warning("no charts will be drawn: matplotlib is not installed; pip install 'drgs[report]'")
     try:
         dataset = load_dataset(record.data, record.config, lazy=True, points=False, semantics=False)
         dataset = record.with_refined_poses(dataset)

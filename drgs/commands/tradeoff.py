@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import logging
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -54,6 +55,9 @@ from drgs.lab.tradeoff import (
     plot,
     recommend,
 )
+from drgs.pages.report import charts
+
+_log = logging.getLogger(__name__)
 
 
 def run(args: Tradeoff) -> None:
@@ -65,6 +69,8 @@ def run(args: Tradeoff) -> None:
     if not args.max_error or not all(0 < x < math.inf for x in args.max_error):
         got = " ".join(f"{x:g}" for x in args.max_error) or "none"
         raise ValueError(f"--max-error must be finite numbers > 0, got {got}; correct it")
+    if not charts.is_available():
+        _log.warning("no plot will be drawn: matplotlib is not installed; pip install 'drgs[report]'")
     OrbitShape.of(args)  # refuses what cannot be, before anything is read
     names = ["tradeoff.json", "tradeoff.md", "tradeoff.png"]
     lock_folder(args.output, "tradeoff", names, inputs=[args.scene, args.cameras or ""])
@@ -106,8 +112,6 @@ def run(args: Tradeoff) -> None:
         _print(report)
         files = "tradeoff.json, tradeoff.md" + (", tradeoff.png" if drawn else "")
         print(f"{files}: {args.output}", flush=True)
-        if not drawn:
-            print("no plot: matplotlib is not installed; pip install 'drgs[report]'")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -63,8 +63,8 @@ class ClipEncoder:
     def __init__(self, folder: Path, device: str = "cpu") -> None:
         self.folder = Path(folder)
         self.device = device
-        self._config = _checked_config(self.folder)
         transformers = _transformers()
+        self._config = _checked_config(self.folder)
         weights = next((name for name in _WEIGHTS if (self.folder / name).is_file()), None)
         if weights is None:
             raise FileNotFoundError(f"{self.folder}: must hold the weights {_WEIGHTS[0]}, found none; {_ADVICE}")

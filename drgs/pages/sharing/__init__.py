@@ -7,7 +7,6 @@ layers      what is known of each of them: class, expected error, where it is at
 placing     where the page's camera stands
 page        the template, filled: page.html with loader.js, page.js, gaussians.js, cameras.js and panel.js
 npm         the viewer's code, fetched by version and hash
-wheel       the step that puts it into a wheel
 """
 
 from drgs.checks.imports import modules_of

@@ -1,7 +1,6 @@
-"""The viewer's code: packages of npm, pinned by version and hash, of which a wheel of drgs carries what a page needs.
+"""The viewer's code: packages of npm, pinned by version and hash.
 
-A checkout has none of it: it is fetched at first use and kept in the user's cache. Imports nothing of drgs and nothing
-heavy, since building the wheel runs it as well.
+It is 5 MB that only pages need, and no part of drgs: it is fetched at first use and kept in the user's cache.
 """
 
 from __future__ import annotations
@@ -18,10 +17,7 @@ import urllib.error
 import urllib.request
 from pathlib import Path
 
-PACKAGED = Path(__file__).parent / "npm"
-"""Where a wheel has the files of the packages, in a folder for each."""
-
-_log = logging.getLogger("drgs.pages.sharing.npm")  # by this name where it is loaded by itself, too
+_log = logging.getLogger(__name__)
 _TIMEOUT = 60.0  # seconds without an answer from the registry; chosen
 _MOST_BYTES = 64 << 20  # bytes of an archive, many times what the packages have: more is not one of them
 
@@ -82,18 +78,14 @@ PACKAGES = (
 """The packages that draw a page, both under the MIT license."""
 
 
-def viewer_files(cache: Path | None = None) -> Path:
-    """The folder with the files of all packages: the wheel's own, else the cache, which is filled if it must be.
+def viewer_files() -> Path:
+    """The folder with the files of all packages; what it lacks is fetched.
 
-    Args:
-        cache: Folder to fetch into; default `drgs/npm` in the user's cache.
     Raises:
-        OSError: If they are nowhere and cannot be fetched, or not be written.
+        OSError: If they are not there and cannot be fetched, or not be written.
         ValueError: If what was fetched is not what is pinned.
     """
-    for folder in (PACKAGED, cache or _user_cache()):
-        if all((folder / package.folder / name).is_file() for package in PACKAGES for name in package.files):
-            return folder
+    folder = cache_folder()
     fetch_into(folder)
     return folder
 
@@ -116,7 +108,8 @@ def fetch_into(folder: Path) -> None:
             _write(target / name, data)
 
 
-def _user_cache() -> Path:
+def cache_folder() -> Path:
+    """`drgs/npm` in the user's cache."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "drgs" / "npm"
 
 
@@ -130,7 +123,7 @@ def _downloaded(package: Package) -> bytes:
         reason = getattr(error, "reason", error)
         raise OSError(
             f"share: the viewer's code must be fetched once from {package.address}, got: {reason}; connect to the "
-            "network, or install drgs from a wheel, which has it"
+            f"network, or copy {cache_folder()} from a machine that has it"
         ) from None
 
 
