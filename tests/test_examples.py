@@ -418,3 +418,24 @@ def test_uncertainty_in_a_training_script_of_gsplat(capsys):
     assert pick in far
     assert all(0.5 < b / a < 3 for a, b in zip(true, expected, strict=True))
     assert f"photograph view {pick + 4} next" in capsys.readouterr().out
+
+
+def test_an_export_of_nerfstudio(tmp_path, capsys):
+    """Of a splat in the frame of its run, with wrong colors, the expected error of held-out views is near the true one;
+    nothing is known of what lies behind it, which the expected one has as well."""
+    from test_fisher_command import SCALE, SHIFT, TURN
+
+    from drgs.commands.frames import _moved
+    from examples import nerfstudio_export
+
+    (tmp_path / "data").mkdir()
+    g = write_still(tmp_path / "data")
+    noise = torch.randn(g.sh.shape, generator=torch.Generator().manual_seed(2))
+    splat = tmp_path / "splat.ply"
+    drgs.save_gaussians(_moved(g.replace(sh=g.sh + noise), TURN, SCALE * SHIFT, SCALE), splat)
+    stated = {"transform": np.c_[TURN, SHIFT].tolist(), "scale": SCALE}
+    (tmp_path / "dataparser_transforms.json").write_text(json.dumps(stated))
+    true, expected, name = nerfstudio_export.main(splat, tmp_path / "data")
+    assert len(true) == 2
+    assert all(0.5 < b / a < 3 for a, b in zip(true, expected, strict=True))
+    assert f"photograph {name} next" in capsys.readouterr().out

@@ -72,6 +72,22 @@ def test_gauss_newton_finds_the_pose(scene):
     assert np.linalg.eigvalsh(spread).min() > 0
 
 
+def test_in_a_graph_of_gtsam(scene):
+    """Its optimizer finds the pose, and its marginal covariance is ours."""
+    gtsam = pytest.importorskip("gtsam", reason="no GTSAM: pip install gtsam")
+    g, camera, photograph = scene
+    noise = gtsam.noiseModel.Isotropic.Sigma(photograph.numel(), 0.02)
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.add(gtsam.CustomFactor(noise, [7], pose_factor.error_function(g, camera, photograph)))
+    values.insert(7, gtsam.Pose3(camera.c2w).retract(np.array([0.03, -0.02, 0.02, 0.03, -0.03, 0.03])))
+    found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    pose = found.atPose3(7).matrix()
+    assert np.abs(pose - camera.c2w).max() < 1e-4
+    _, jacobian = pose_factor.linearize(g, dataclasses.replace(camera, w2c=np.linalg.inv(pose)), photograph)
+    marginal = gtsam.Marginals(graph, found).marginalCovariance(7)
+    np.testing.assert_allclose(marginal, pose_factor.covariance(jacobian, 0.02), rtol=1e-6, atol=1e-9 * marginal.max())
+
+
 def test_covariance_is_pose_information_in_the_cameras_axes(scene):
     g, camera, photograph = scene
     _, jacobian = pose_factor.linearize(g, camera, photograph)
