@@ -408,7 +408,7 @@ class _Loop:
                 self._log(step)
                 if step.psnr is not None:
                     self._psnr = 0.98 * (self._psnr or step.psnr) + 0.02 * step.psnr
-                shown = "" if self._psnr is None else f"{self._psnr:.2f} dB, "
+                shown = "" if self._psnr is None else f"training PSNR {self._psnr:.2f} dB, "
                 bar.update(done, text=f"{shown}{len(trainer.rows)} Gaussians")
                 if self._pace is not None:
                     self._follow_pace(self._pace, bar)

@@ -607,14 +607,16 @@ def test_bad_resumes_are_refused(still, tmp_path):
 
 
 def test_command(still, tmp_path, capsys):
-    """`drgs fit --views active` passes its options on, and opens lazily."""
+    """`drgs fit --views active` passes its options on, opens lazily, and says what to do next."""
     line = f"fit {still} -o {tmp_path / 'run'} --views active --policy coverage --initial 3 --add 1 --every 3"
     more = "--max-steps 6 --max-gaussians 60 --test-every 4 --seed 5 --prior 1e-4 --relative-prior --info-pixels 90"
     assert cli.main([*line.split(), *more.split()]) == 0
     record = json.loads((tmp_path / "run/selection.json").read_text())
     assert (record["policy"], record["seed"], record["relative_prior"]) == ("coverage", 5, True)
     assert (len(record["start"]), len(record["picks"])) == (3, 1)
-    assert "added view" in capsys.readouterr().err
+    out, err = capsys.readouterr()
+    assert "added view" in err
+    assert f"\nnext: drgs view {tmp_path / 'run'}; " in out
 
 
 @pytest.mark.parametrize(

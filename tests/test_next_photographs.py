@@ -90,6 +90,7 @@ def test_the_first_place_looks_at_the_hole(half_seen, capsys):
     """It stands where no photograph was taken from and looks at the ball; the words say the way there."""
     assert cli.main(["capture", "--more", "-k", "4", "-o", str(half_seen)]) == 0
     out = capsys.readouterr().out
+    assert out.endswith(f"; in the browser: drgs view {half_seen}\n")
     found = json.loads((half_seen / "next.json").read_text())
     first = found["picks"][0]
     c2w = np.array(first["camera"]["c2w"])

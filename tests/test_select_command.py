@@ -190,6 +190,12 @@ def test_dome_is_even(count):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
+        (
+            "run --candidates nowhere",
+            "--candidates nowhere: must be cameras, a data set or a run, found no such file or folder; check the "
+            "path, or take --candidates dome or orbit, which need none",
+        ),
+        ("run --candidates none.json", "or take --candidates dome or orbit, which need none"),
         ("run --candidates data -k 6", "k must be a whole number in 1..5 candidates, got 6"),
         ("run --candidates data -k 0", "k must be a whole number in 1..5 candidates, got 0"),
         ("run --candidates run --train data", "must hold a view that is not known yet, all 9 of split all are"),
@@ -204,7 +210,6 @@ def test_dome_is_even(count):
             "run --candidates dome --orbit span=90",
             "--orbit span must have --candidates orbit, a dome goes",
         ),
-        ("run --candidates nowhere", "nowhere: must be a data set, found no such file or folder"),
         ("data --candidates orbit", "must be a run folder, found no config.json"),
         ("run --candidates empty.json", "must be a list of at least one camera"),
         (

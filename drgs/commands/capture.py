@@ -69,7 +69,8 @@ def _print_next(args: Capture) -> None:
     for pick in picks:
         worth = "" if pick["gain"] is None else f" (adds {_times(pick['gain'])})"
         print(f"{pick['rank']}. {pick['text']}{worth}")
-    print(f"arrows on the map: drgs report {shlex.quote(str(args.output))}; in the browser: drgs view")
+    run = shlex.quote(str(args.output))
+    print(f"arrows on the map: drgs report {run}; in the browser: drgs view {run}")
 
 
 def _times(gain: float) -> str:

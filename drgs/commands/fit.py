@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 
 from drgs.commands.eval import print_table
 from drgs.commands.options import Fit
@@ -47,6 +48,8 @@ def run(args: Fit) -> None:
     print(f"{len(result.gaussians)} Gaussians in {result.seconds:.0f} s: {result.run.point_cloud}")
     if args.report:
         print(f"report: {page}")
+    run = shlex.quote(str(result.run.path))
+    print(f"next: drgs view {run}; as a page to send: drgs share {run} -o scene.html")
 
 
 def _on_background(dataset: Dataset, config: FitConfig, args: Fit, lazy: bool) -> FitConfig:

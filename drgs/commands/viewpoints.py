@@ -373,6 +373,11 @@ def views_to_compare(
     """
     source = Source.of(option, text, ("orbit", "dome"), given)
     source.check_split(args.split)
+    if source.kind in ("list", "data") and not Path(source.text).exists():
+        raise FileNotFoundError(
+            f"{option} {text}: must be cameras, a data set or a run, found no such file or folder; check the path, or "
+            f"take {option} dome or orbit, which need none"
+        )
     if source.kind == "orbit":
         return _compared_orbit(OrbitShape.of(args), given, known, args.count), f"orbit of {args.count}"
     if source.kind == "dome":
