@@ -196,11 +196,11 @@ def test_what_a_capture_found(run, tmp_path, capsys):
     assert re.search(r"capture\.json: .*text", capsys.readouterr().err)
 
 
-def test_without_matplotlib(run, tmp_path, monkeypatch, capsys):
+def test_without_matplotlib(run, tmp_path, monkeypatch, caplog):
     """No chart; a line before the work and the page say how to get them."""
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     page = page_of(run, tmp_path)
-    assert "no charts will be drawn: matplotlib is not installed; pip install 'drgs[report]'" in capsys.readouterr().err
+    assert "no charts will be drawn: matplotlib is not installed; pip install 'drgs[report]'" in caplog.text
     assert not page.all("svg")
     assert "pip install 'drgs[report]'" in page.texts["p"]
 
