@@ -183,15 +183,19 @@ def test_auto_is_as_photographs_that_short_fits_did_not_see_say(tmp_path, monkey
 
 
 def test_by_default_gains_are_tried_where_the_fit_is_long(tmp_path, monkeypatch, capsys):
-    """The trial of `auto` runs unasked where it is a tenth of the fit; a shorter fit names the option instead."""
+    """The trial of `auto` runs unasked where it is a tenth of the fit; a shorter fit names the option instead. Each
+    records what it has taken.
+    """
     monkeypatch.setitem(exposures._TRIAL, "max_steps", 2)
     write_photographs(tmp_path / "data", GAINS)
     data = load(tmp_path / "data")
     long = fit(data, tmp_path / "long", config(max_steps=40), progress=True).run
     assert "gained" in long.config()["exposure"]
+    assert long.config()["fit"]["data"]["exposure"] == "auto"
     assert "dB; " in capsys.readouterr().err
     short = fit(data, tmp_path / "short", config(max_steps=30), progress=True).run
     assert "exposure" not in short.config()
+    assert short.config()["fit"]["data"]["exposure"] == "off"
     assert "--exposure auto" in capsys.readouterr().err
 
 

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from drgs.data import View
-    from drgs.fitting.config import FitConfig
+    from drgs.fitting.config import ExposureUse, FitConfig
     from drgs.settings import RenderSettings
 
 NETWORK = "exposure"
@@ -239,11 +239,8 @@ class Exposure(torch.nn.Module):
         return dataclasses.replace(output, rgb=torch.where((target >= _BRIGHT) & (shown > target), target, shown))
 
     def meter(self, frames: list[Frame], scene: Scene, settings: RenderSettings) -> Meter | None:
-        """How the camera exposes what it sees; None where that does not predict the gains of photographs left out.
-
-        Args:
-            frames: Photographs that have a gain, of which as many are rendered as `_METERED` says.
-            scene, settings: What is rendered, and how.
+        """The `Meter` of photographs that have a gain, of which as many are rendered as `_METERED` says; None where it
+        would not predict the gains of others.
         """
         frames = frames[:: -(-len(frames) // _METERED)]
         seen = []
@@ -295,9 +292,6 @@ class Exposure(torch.nn.Module):
 class Meter:
     """How a camera exposes what it sees: log gain = (1, log R, log G, log B) @ coefficients of the mean color.
 
-    A photograph that is not fitted to has a gain that nobody knows, but a camera that meters chose it by what was in
-    view, of which the rendering has the mean color.
-
     Attributes:
         coefficients: (4, 3) for R, G and B.
         least, most: (3,) log gains of the photographs that these are fitted to; no predicted one is beyond.
@@ -315,7 +309,7 @@ class Meter:
     def fitted(
         cls, brightness: np.ndarray, log_gains: np.ndarray, background: tuple[float, float, float]
     ) -> Meter | None:
-        """Least squares over V photographs; None where it does not predict the gains of those left out.
+        """Least squares over V photographs; None where that does not predict the gains of each by the others.
 
         Args:
             brightness: (V, 3) logarithms of the mean R, G and B of renderings with gain 1.
@@ -531,25 +525,18 @@ class ExposureComponent(Component):
 
     def start(self, fit: Fit, setup: Setup) -> None:
         """See `Component`: gains from the points that photographs share, if the option or their use says so."""
-        config, use = fit.config, fit.config.data.exposure
-        compared = _compared(setup, config)
-        if use in (None, "off"):  # a first look, which costs little
-            if compared is None:
-                return
-            with Bar("exposure") as bar:
-                first = estimate_exposure(fit.frames, compared[0], config.seed, compared[1], _FIRST_OBSERVATIONS)
-                if not first.is_sound:
-                    return
-                if use == "off" or not _is_trial_short(setup):
-                    bar.note(first.warning())
-                    return
+        compared = _compared(setup)
+        use = _use_of(setup, compared)
+        setup.config = fit.config = fit.config.replace(exposure=use)
+        if use == "off":
+            return
+        assert setup.points is not None  # initial ones are there
+        points, shown = compared or (setup.points, None)
         # A trial takes photographs that are there and stand still, and points of which it is known who shows them.
-        is_tried = use in (None, "auto") and compared is not None and not setup.is_active
+        is_tried = use == "auto" and compared is not None and not setup.is_active
         with Bar("exposure") as bar:
-            assert setup.points is not None  # initial ones are there
-            points, shown = compared or (setup.points, None)
-            estimate = estimate_exposure(fit.frames, points, config.seed, shown)
-            is_on = use in ("points", "learned") or (estimate.is_sound if is_tried else estimate.is_clear)
+            estimate = estimate_exposure(fit.frames, points, fit.config.seed, shown)
+            is_on = use != "auto" or (estimate.is_sound if is_tried else estimate.is_clear)
             if is_tried and is_on:
                 estimate = estimate.confirmed()
                 gained = _trial(fit, setup.views, estimate)
@@ -581,7 +568,7 @@ class ExposureComponent(Component):
         return out if self.module is None else self.module(out, frame)
 
     def meter(self, fit: Fit) -> Meter | None:
-        """How the camera exposes what it sees, as photographs of the fit say by their gains; None where they do not."""
+        """The `Meter` of the fit's photographs; None where they have no gains, or these do not predict each other."""
         if self.module is None:
             return None
         return self.module.meter(fit.photographs(), fit.scene(), fit.config.settings)
@@ -600,15 +587,14 @@ class ExposureComponent(Component):
 
     def join(self, fit: Fit, frame: Frame, setup: Setup) -> list[dict]:
         """See `Component`: gains are estimated again, with the points of the new photograph."""
-        use = fit.config.data.exposure
-        if use in (None, "off") or setup.picked_points is None:
+        if self.evidence is None or setup.picked_points is None:
             return []
         frames = [*fit.photographs(), frame]
         with Bar("exposure") as bar:
             points, shown = setup.picked_points(setup.dataset.points)
             estimate = estimate_exposure(frames, points, fit.config.seed, shown)
             # A few points of the first photographs may have said something else than all of them do.
-            is_on = use != "auto" or estimate.is_clear
+            is_on = fit.config.data.exposure != "auto" or estimate.is_clear
             if is_on != (self.module is not None):
                 now = "each has its own" if is_on else "off, all have the same"
                 bar.note(f"exposure: {estimate.words()}; {now} from step {fit.step_index} on")
@@ -641,29 +627,44 @@ class ExposureComponent(Component):
 
     def record(self, fit: Fit, before: Mapping[str, Any]) -> dict[str, Any]:
         """See `Component`."""
-        if self.evidence is not None:
-            return {"exposure": self.evidence}
         # Checkpoints of version 0.2.0 say nothing of fits to all views.
-        is_known = fit.config.data.exposure != "off" and "exposure" in before
-        return {"exposure": before["exposure"]} if is_known else {}
+        known = before.get("exposure") if self.evidence is None else self.evidence
+        return {} if known is None else {"exposure": known}
 
 
-def _compared(setup: Setup, config: FitConfig) -> tuple[np.ndarray, np.ndarray | None] | None:
+def _compared(setup: Setup) -> tuple[np.ndarray, np.ndarray | None] | None:
     """Points (P, 3) by which the exposure of photographs is compared, and which of the V show which, (V, P) bool.
 
     Returns:
         None where nothing says what hides points, and where nobody asks for exposure and to look would take matching;
         None for who shows them where every photograph may.
     """
-    use = config.data.exposure
-    is_asked_for = use not in (None, "off")
+    is_asked_for = setup.config.data.exposure not in (None, "off")
     if setup.picked_points is not None:
         return setup.picked_points(setup.dataset.points) if is_asked_for else None
     if setup.times:  # photographs of other times do not show the same
         return None
     matches = Matches() if setup.matches is None and is_asked_for else setup.matches
     with Bar("points that photographs share") as bar:
-        return shared_points(setup.dataset, setup.views, config.seed, matches, bar.stage)
+        return shared_points(setup.dataset, setup.views, setup.config.seed, matches, bar.stage)
+
+
+def _use_of(setup: Setup, compared: tuple[np.ndarray, np.ndarray | None] | None) -> ExposureUse:
+    """`exposure` of a fit. Where it is not stated: auto if photographs differ at a first look, which costs little, and
+    a trial is short beside the fit, else off. A fit that is to have no gains says that photographs differ.
+    """
+    stated = setup.config.data.exposure
+    if stated not in (None, "off"):
+        return stated
+    if compared is None:
+        return "off"
+    with Bar("exposure") as bar:
+        first = estimate_exposure(setup.frames, compared[0], setup.config.seed, compared[1], _FIRST_OBSERVATIONS)
+        if first.is_sound and stated is None and _is_trial_short(setup):
+            return "auto"
+        if first.is_sound:
+            bar.note(first.warning())
+    return "off"
 
 
 def _is_trial_short(setup: Setup) -> bool:
