@@ -22,7 +22,8 @@ from drgs.data import load
 from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.display.pictures import map_picture
 from drgs.files import load_ply, load_state, save_ply
-from drgs.fitting.errors import _as_shown, run_error_record
+from drgs.fitting.components.table import held_components
+from drgs.fitting.errors import run_error_record
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.records import load_run
 from drgs.gain import Prior, unit_length
@@ -113,14 +114,16 @@ def test_expected_error_of_a_splat(place, monkeypatch, capsys, caplog):
 
 
 def test_photographs_without_their_exposure():
-    """A photograph is divided by its own gain, but for what is known to be background."""
+    """A photograph is divided by its own gain, but for what is known to be background; and not without gains."""
     camera = orbit((0, 0, 0), 3.0, 2, width=4, height=3)[0]
     frame = Frame("a", camera, torch.full((3, 4, 3), 0.4), mask=torch.zeros(3, 4), is_object=True)
     frame.mask[:, :2] = 1
-    shown = _as_shown(frame, torch.tensor([2.0, 1.0, 0.5]).log())
+    networks = {"exposure": {"log_gains": torch.tensor([[2.0, 1.0, 0.5]]).log()}}
+    (held,) = held_components(["a"], networks, RenderSettings())
+    shown = held.as_shown(frame.image(), frame)
     torch.testing.assert_close(shown[0, 0], torch.tensor([0.2, 0.4, 0.8]))
     torch.testing.assert_close(shown[0, 3], torch.full((3,), 0.4))
-    assert _as_shown(frame, None) is frame.pixels
+    assert held_components(["a"], {}, RenderSettings()) == []
 
 
 def test_maps_add_up_to_the_scores(place, monkeypatch, capsys):

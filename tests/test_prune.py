@@ -21,8 +21,7 @@ from drgs.data import load
 from drgs.data.camera_lists import save_cameras_json
 from drgs.deform import FieldConfig
 from drgs.files import save_ply
-from drgs.fitting.components.base import Checkpoint
-from drgs.fitting.components.exposure import ExposureComponent
+from drgs.fitting.components.table import held_components
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import load_frames
 from drgs.fitting.losses import psnr
@@ -108,6 +107,22 @@ def test_a_loss_is_kept_to(scene):
     assert counts[1] < counts[0] < len(g)
 
 
+def test_a_loss_is_of_images_with_their_exposure(scene):
+    """Renderings at the half brightness of the images, where that is asked for, have the PSNR and the loss of both at
+    full brightness.
+    """
+    g, cameras = scene
+    images = [x.clamp(0, 0.9) for x in _images(g.replace(sh=0.8 * g.sh), cameras)]
+    half = [0.5 * x for x in images]
+    darker = [lambda out: dataclasses.replace(out, rgb=0.5 * out.rgb.clamp(0, 1))] * len(cameras)
+    bright, dark = (
+        prune(g, cameras, FAST, loss=0.5, images=images),
+        prune(g, cameras, FAST, loss=0.5, images=half, as_photographs=darker),
+    )
+    assert dark.psnr == pytest.approx(bright.psnr + 20 * math.log10(2), abs=1e-3)
+    assert torch.equal(dark.kept, bright.kept)
+
+
 def test_masked_pixels_decide_nothing(scene):
     """A view whose mask is 0 shows nothing."""
     g, cameras = scene
@@ -145,14 +160,12 @@ def test_fitting_on_keeps_to_exposures(tmp_path):
     frames = load_frames(load(tmp_path).views, 10_000, mask="ignore")
     images, cameras = [frame.image() for frame in frames], [frame.camera for frame in frames]
     dark = [dataclasses.replace(frame, pixels=(0.6 * frame.pixels).to(frame.pixels.dtype)) for frame in frames]
-    gains = {"exposure.parameter.log_gains": torch.full((len(dark), 3), math.log(0.6))}
-    held = ExposureComponent.held(Checkpoint(gains, {"views": [frame.name for frame in dark]}, "state"), (0.0,) * 3)
+    gains = {"exposure": {"log_gains": torch.full((len(dark), 3), math.log(0.6))}}
+    (held,) = held_components([frame.name for frame in dark], gains, RenderSettings())
     config = FitConfig(renderers=("fast",), settings=FAST)
     kept = fit_on(g, dark, config, 20, components=[held])
     assert _psnr(kept, cameras, images) > _psnr(fit_on(g, dark, config, 20), cameras, images) + 5
     assert not held.module.log_gains.requires_grad
-    with pytest.raises(ValueError, match="log_gains must have shape"):
-        ExposureComponent.held(Checkpoint({}, {"views": ["a"]}, "state"), (0.0,) * 3)
 
 
 @pytest.mark.parametrize(
@@ -261,10 +274,27 @@ def test_command_with_exposures(place, monkeypatch, capsys):
     """A run whose photographs have exposures is fitted on with those, and with no photographs but its own."""
     monkeypatch.chdir(place)
     config = FitConfig().replace(max_steps=6, max_gaussians=100, exposure="learned")
-    drgs.fit(load(place / "data"), place / "uneven", config, progress=False)
+    run = drgs.fit(load(place / "data"), place / "uneven", config, progress=False).run
+    tensors, header = load_state(run.state)
+    gains = tensors["exposure.parameter.log_gains"]
+    gains.copy_(torch.linspace(-0.5, 0.5, len(gains))[:, None].expand_as(gains))
+    save_state(run.state, tensors, header)
     line = ["prune", "uneven", "--keep", "0.5", "--refit", "3", "--quiet", "-o", "even.ply"]
     assert cli.main(line) == 0
-    assert json.loads((place / "even.json").read_text())["refit"] == 3
+    record = json.loads((place / "even.json").read_text())
+    assert record["refit"] == 3
+    loaded = drgs.load_run("uneven")
+    frames = {frame.name: frame for frame in load_frames(load(place / "data").views, config.data.max_pixels)}
+    names = loaded.record.train
+    (held,) = held_components(list(names), loaded.networks, loaded.record.config.settings)
+    found: dict[bool, list[float]] = {True: [], False: []}
+    for name in names:
+        frame = frames[name]
+        out = drgs.render(loaded.gaussians, frame.camera, FAST)
+        for has_gain, shown in ((True, held.as_photograph(out, frame)), (False, out)):
+            found[has_gain].append(psnr(shown.rgb.clamp(0, 1), frame.image(), frame.mask))
+    assert record["train_psnr"] == pytest.approx(np.mean(found[True]), abs=1e-3)
+    assert abs(np.mean(found[True]) - np.mean(found[False])) > 0.1
     shutil.copytree(place / "data", place / "other")
     (place / "other/images/1.png").rename(place / "other/images/strange.png")
     views = place / "other/transforms.json"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from test_dropout import run_to, same
 from test_train import config, dataset, scene  # noqa: F401 (a fixture)
 
 from drgs.fitting.components.base import Setup
+from drgs.fitting.components.exposure import exposure_network
 from drgs.fitting.components.table import components_of
 from drgs.fitting.frames import load_frames
 from drgs.fitting.losses import psnr
@@ -54,6 +56,27 @@ def test_superfluous_gaussians_go_when_density_control_ends(dataset):  # noqa: F
         assert torch.equal(x, old[name][torch.stack(places)] if x.dim() else old[name]), name
     assert trainer.component("pruning").before_density(trainer) == []
     assert len(run_to(trainer, 20).rows) == left
+
+
+def test_photographs_are_compared_by_their_exposure(dataset):  # noqa: F811
+    """At half the brightness, with gains that say so, as many go as at their own; without gains others would."""
+    left = []
+    for brightness, gain in ((1.0, 1.0), (0.5, 0.5), (0.5, 1.0)):
+        trainer = trainer_of(dataset, prune_loss=1.0, refine_stop=0.8)
+        g = scene()
+        trainer.rows = GaussianRows(
+            {name: getattr(g, name) for name in ("means", "quats", "log_scales", "logit_opacities")}
+            | {"sh_dc": g.sh[:, :1], "sh_rest": g.sh[:, 1:]},
+            g.origin,
+        )
+        trainer.step_index = 16
+        for frame in trainer.frames:
+            frame.pixels = brightness * (0.8 * frame.image() + 0.05)
+        gains = torch.full((len(trainer.frames), 3), math.log(gain)).numpy()
+        trainer.component("exposure").module = exposure_network(trainer.frames, False, gains).module
+        (event,) = trainer.component("pruning").before_density(trainer)
+        left.append(event["gaussians"])
+    assert left[0] == left[1] != left[2]
 
 
 def test_a_photograph_whose_mask_keeps_nothing_is_left_out(dataset):  # noqa: F811

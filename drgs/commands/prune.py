@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +20,18 @@ from drgs.data import View
 from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.ellipsoids import Gaussians, Scene
-from drgs.fitting.components.base import Checkpoint, Component
-from drgs.fitting.components.exposure import ExposureComponent
+from drgs.fitting.components.base import Checkpoint, Component, RunViews
 from drgs.fitting.components.poses import CAMERAS
 from drgs.fitting.components.semantics import EMBEDDINGS
+from drgs.fitting.components.table import COMPONENTS, held_components
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.metrics import TRAIN_VIEWS, through_renderers
+from drgs.fitting.networks import saved_networks
 from drgs.fitting.records import fitted_views, is_run, of_some
 from drgs.fitting.renderers import renderers_to_measure
 from drgs.information.region import Region, RegionText
+from drgs.integrator import Output
 from drgs.io.checkpoint import load_state, save_state
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import atomic_write, lock_folder, write_json
@@ -63,7 +66,7 @@ def run(args: Prune) -> None:
             )
         check_lenses("prune", settings, views.cameras)
         warn_of_unseen(given.gaussians, views.cameras)
-        exposures = _exposures(args, given, views, checkpoint)
+        held, as_photograph = _as_left(args, given, views, checkpoint)
         region = region_of("prune", args, given, views.origin, views.cameras, settings)
         with Bar("prune", show=not args.quiet):
             pruned = prune(
@@ -74,6 +77,7 @@ def run(args: Prune) -> None:
                 loss=loss,
                 images=None if views.train is None else [frame.image() for frame in views.train],
                 masks=None if views.train is None else [frame.mask for frame in views.train],
+                as_photographs=[functools.partial(_through, held, frame) for frame in views.train or ()],
                 semantics=given.semantics(),
                 unseen=args.unseen,
                 region=region,
@@ -89,8 +93,8 @@ def run(args: Prune) -> None:
                 far = int(pruned.kept[: given.far].sum())
                 config = given.record.config if given.record else _config_over(given)
                 frames = _shown(views.train, region, given, settings)
-                stages["refitted"] = fit_on(pruned.gaussians, frames, config, args.refit, far, exposures)
-            costs = views.measured(stages, given, settings, lenses, region)
+                stages["refitted"] = fit_on(pruned.gaussians, frames, config, args.refit, far, held)
+            costs = views.measured(stages, given, settings, lenses, region, as_photograph)
             *_, left = stages.values()
             output.write(left, given, checkpoint, pruned.kept)
             write_json(output.report, _record(args, pruned, views, settings, costs))
@@ -160,12 +164,13 @@ class _Output:
 
 
 def _checkpoint(args: Prune, given: SceneInput, output: _Output) -> Checkpoint | None:
-    """The run's, where something of it beside its Gaussians is needed.
+    """The run's, where something of it beside its Gaussians is needed or may be of use.
 
     Raises:
         FileNotFoundError, ValueError: If it is missing or damaged.
     """
-    if given.run is None or not (output.is_run or args.refit and "exposure" in given.estimated):
+    needed = output.is_run or args.refit and given.estimated
+    if given.run is None or given.step is None and not needed:  # there is the PLY alone
         return None
     return Checkpoint(*load_state(given.run.state), str(given.run.state))
 
@@ -246,6 +251,7 @@ class _Views:
         settings: RenderSettings,
         lenses: bool,
         region: Region | None = None,
+        as_photograph: Callable[[Output, Frame], Output] | None = None,
     ) -> dict[str, dict[str, float]]:
         """Renderer -> stage -> mean PSNR in dB: of held-out views, or else of some of those that decide; of the object
         where masks or alpha say where it is, of the pixels that show a region where there is one. Nothing without
@@ -254,12 +260,14 @@ class _Views:
         frames = self.held_out or self.train
         if frames is None:
             return {}
+        whole = {frame.name: frame for frame in frames}  # a camera exposes for all that it sees
+        seen = None if as_photograph is None else lambda out, frame: as_photograph(out, whole[frame.name])
         frames = _shown(frames, region, given, settings)
         renderers = renderers_to_measure(("fast",), given.settings("fast"), "all", lenses)
         found: dict[str, dict[str, float]] = {name: {} for name in renderers}
         for stage, scene in stages.items():
             measured: Any = through_renderers(
-                scene, frames, renderers, self.measured_split, None if self.held_out else TRAIN_VIEWS
+                scene, frames, renderers, self.measured_split, None if self.held_out else TRAIN_VIEWS, seen
             )
             for row in measured["rows"]:
                 found[row["name"]][stage] = row["mean"].get("psnr_object", row["mean"]["psnr"])
@@ -271,21 +279,39 @@ class _Views:
         return "test" if self.held_out else "train"
 
 
-def _exposures(args: Prune, given: SceneInput, views: _Views, checkpoint: Checkpoint | None) -> list[Component]:
-    """The gains by which `--refit` compares photographs, of a run that has found one for each; they stay.
+def _as_left(
+    args: Prune, given: SceneInput, views: _Views, checkpoint: Checkpoint | None
+) -> tuple[list[Component], Callable[[Output, Frame], Output] | None]:
+    """What the run's fit has renderings go through before it compares them with its photographs, exposures, and before
+    they are measured; nothing where other photographs are compared.
 
     Raises:
-        ValueError: If a photograph is none of the run's.
+        ValueError: If `--refit` is to compare others.
     """
-    if not args.refit or views.train is None or checkpoint is None:
-        return []
-    known = checkpoint.header["views"]
-    if other := next((frame.name for frame in views.train if frame.name not in known), None):
-        raise ValueError(
-            f"--refit must have photographs whose exposure {args.scene} has found, {other!r} of {views.source} is not "
-            "among these; leave --data or --refit out"
-        )
-    return [ExposureComponent.held(checkpoint, given.background)]
+    if views.train is None or given.record is None or checkpoint is None:
+        return [], None
+    frames, names = views.train, checkpoint.header["views"]
+    networks, settings = saved_networks(checkpoint.tensors, checkpoint.header), given.record.config.settings
+    held = held_components(names, networks, given.over_background(settings))
+    if held and (other := next((frame.name for frame in frames if frame.name not in names), None)):
+        if args.refit:
+            raise ValueError(
+                f"--refit must have photographs whose exposure {args.scene} has found, {other!r} of {views.source} is "
+                "not among these; leave --data or --refit out"
+            )
+        return [], None
+    run = RunViews(given.scene, settings, bool(given.record.refined), [], [], [], names, lambda: frames, networks)
+    options: dict[str, Any] = {}
+    for component in COMPONENTS.values():
+        options |= component.run_evaluation(run)
+    return held, options.get("as_photograph")
+
+
+def _through(held: list[Component], frame: Frame, out: Output) -> Output:
+    """A rendering as the fit compares it with a photograph."""
+    for component in held:
+        out = component.as_photograph(out, frame)
+    return out
 
 
 def _shown(frames: list[Frame], region: Region | None, given: SceneInput, settings: RenderSettings) -> list[Frame]:

@@ -12,10 +12,9 @@ import logging
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from drgs.display.progress import Bar
-from drgs.fitting.components.exposure import NETWORK
+from drgs.fitting.components.table import held_components
 from drgs.fitting.frames import Frame, frames_for, load_dataset
 from drgs.fitting.records import fitted_views, load_run
 from drgs.fitting.resume import lock_run
@@ -28,6 +27,7 @@ if TYPE_CHECKING:
 
     from drgs.data import Dataset, View
     from drgs.ellipsoids import Scene
+    from drgs.fitting.components.base import Component
     from drgs.fitting.config import DataConfig
     from drgs.fitting.trainer import Trainer
     from drgs.io.run import Run
@@ -76,8 +76,8 @@ def run_error_record(
     if missing := [name for name in names if name not in views]:
         raise ValueError(f"{loaded.record.data}: must still hold photograph {missing[0]!r}, it is gone; restore it")
     frames = frames_for([views[names[row]] for row in rows], config.data, pixels)
-    gains = loaded.networks.get(NETWORK, {}).get("log_gains")
-    record = _record_of(loaded.scene, frames, rows, len(names), settings, gains)
+    held = held_components(names, loaded.networks, config.settings)
+    record = _record_of(loaded.scene, frames, len(names), settings, held)
     if settings == config.settings and pixels == config.data.max_pixels:
         try:
             with lock_run(run, "errors"):
@@ -127,7 +127,7 @@ def error_record_of_views(
         FileNotFoundError, ValueError: If a photograph cannot be read.
     """
     frames = frames_for(views, data, max_pixels)
-    return _record_of(scene, frames, range(len(frames)), len(frames), settings, None)
+    return _record_of(scene, frames, len(frames), settings)
 
 
 def fit_errors(run: Run, trainer: Trainer, steps: int) -> dict[str, float]:
@@ -140,9 +140,7 @@ def fit_errors(run: Run, trainer: Trainer, steps: int) -> dict[str, float]:
     """
     frames, scene, config = trainer.photographs(), trainer.scene(), trainer.config
     rows = _evenly(len(frames), max(_FEWEST, steps // _STEPS_A_PHOTOGRAPH))
-    exposure = trainer.network(NETWORK)
-    gains = None if exposure is None else exposure.state_dict()["log_gains"]
-    record = _record_of(scene, [frames[row] for row in rows], rows, len(frames), config.settings, gains)
+    record = _record_of(scene, [frames[row] for row in rows], len(frames), config.settings, trainer.components)
     _save(run, scene, record, len(rows), config.data.max_pixels)
     return {"photographs": len(rows), "misfit": record.mean_misfit**0.5}
 
@@ -160,22 +158,22 @@ def _evenly(count: int, most: int | None) -> list[int]:
 def _record_of(
     scene: Scene,
     frames: Sequence[Frame],
-    rows: Sequence[int],
     count: int,
     settings: RenderSettings,
-    log_gains: torch.Tensor | None,
+    components: Sequence[Component] = (),
 ) -> ErrorRecord:
     """The record of some photographs of a fit, which stand for all.
 
     Args:
         scene: The scene.
         frames: The photographs.
-        rows: Number of each among all.
-        count: How many there are.
+        count: How many there are in all.
         settings: Settings of the renderer.
-        log_gains: (count, 3) log gains that the fit has estimated; None: it has estimated none.
+        components: Those of the fit, which say what photographs are without an exposure of their own.
     """
-    images = [_as_shown(x, None if log_gains is None else log_gains[i]) for i, x in zip(rows, frames, strict=True)]
+    images = [frame.image() for frame in frames]
+    for component in components:
+        images = [component.as_shown(image, frame) for image, frame in zip(images, frames, strict=True)]
     masks, cameras = [frame.mask for frame in frames], [frame.camera for frame in frames]
     with Bar("residuals", len(frames)) as bar:
         record = error_record(scene, cameras, images, settings, masks=masks, advance=bar.advance)
@@ -198,13 +196,3 @@ def _digest(scene: Scene) -> str:
         digest.update(f"{name} {values.dtype.str} {values.shape}".encode())
         digest.update(values.data if values.size else b"")
     return digest.hexdigest()
-
-
-def _as_shown(frame: Frame, log_gain: torch.Tensor | None) -> torch.Tensor:
-    """(H, W, 3) a photograph without a log gain (3,) of its own; a background that was put behind it later has none."""
-    image = frame.image()
-    if log_gain is None:
-        return image
-    corrected = (image / log_gain.detach().cpu().exp()).clamp(0, 1)
-    empty = frame.empty()
-    return corrected if empty is None else torch.lerp(corrected, image, empty[..., None])

@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Generic, Literal, TypeVar
 
 import numpy as np
@@ -35,7 +35,7 @@ from drgs.fitting.trainer import Trainer
 from drgs.information.inputs import Masks, mask_list
 from drgs.information.region import Region
 from drgs.information.semantics import SemanticMetric
-from drgs.integrator import render
+from drgs.integrator import Output, render
 from drgs.settings import RenderSettings
 
 Unseen = Literal["keep", "remove"]
@@ -98,6 +98,7 @@ def prune(
     loss: float | None = None,
     images: Sequence[torch.Tensor] | None = None,
     masks: Masks = None,
+    as_photographs: Sequence[Callable[[Output], Output]] | None = None,
     rounds: int = ROUNDS,
     unseen: Unseen = "keep",
     semantics: SemanticMetric | None = None,
@@ -119,6 +120,8 @@ def prune(
             allows, to within some percent of it.
         images: (H, W, 3) in [0, 1], a photograph of each camera.
         masks: One for each camera: (H, W) in [0, 1] what counts of its image; or None: all.
+        as_photographs: What each camera's rendering goes through before it is compared with its image, as by a gain of
+            that image's exposure; None: nothing.
         rounds: In how many rounds; more are better, each takes a traversal of every view.
         unseen: What becomes of Gaussians that change no view: `keep` or `remove`.
         semantics: The metric in which features are a part of the image; None: colors are all of it.
@@ -145,7 +148,9 @@ def prune(
         _log.warning("prune: %s", shares.note)
     with Bar("errors without a Gaussian", (rounds + (region is not None)) * len(cameras)) as bar:
         shown = None if shares is None else shares.shares
-        views = _Views(cameras, settings, mask_list(where, masks, cameras), images, semantics, power, bar, shown)
+        as_photographs = as_photographs or [lambda out: out] * len(cameras)
+        listed = mask_list(where, masks, cameras)
+        views = _Views(cameras, settings, listed, images, as_photographs, semantics, power, bar, shown)
         return _pruned(gaussians, views, keep, loss, rounds, unseen)
 
 
@@ -215,6 +220,7 @@ class _Views:
     settings: RenderSettings
     masks: list[torch.Tensor | None]
     images: Sequence[torch.Tensor] | None
+    as_photographs: Sequence[Callable[[Output], Output]]
     semantics: SemanticMetric | None
     power: float
     bar: Bar
@@ -239,13 +245,14 @@ class _Views:
         if self.images is None:
             return None
         found = []
-        for camera, target, mask in zip(self.cameras, self.images, self._masks(1), strict=True):
+        views = zip(self.cameras, self.images, self._masks(1), self.as_photographs, strict=True)
+        for camera, target, mask, as_photograph in views:
             if self.shares is not None and mask is not None and not bool((mask > 0).any()):
                 continue
             with torch.no_grad():  # a measure
                 seen = colors_only(gaussians, camera.time)
-                image = render(seen, camera, self.settings, outputs=()).rgb.cpu().clamp(0, 1)
-            found.append(psnr(image, target, mask))
+                out = as_photograph(render(seen, camera, self.settings, outputs=()))
+            found.append(psnr(out.rgb.cpu().clamp(0, 1), target, mask))
         return float(np.mean(found))
 
     def _masks(self, power: float) -> list[torch.Tensor | None]:

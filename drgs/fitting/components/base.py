@@ -14,8 +14,8 @@ that a component overrides only those that it needs. They are called in this ord
     state, write_files                                                                                  each checkpoint
     record, log_fields, describe, evaluation, metrics                                 its part of files and of stderr
 
-Class methods read what a run folder says, when no fit is there: `load_gaussians`, `load_scene`, `run_metrics`, `report`
-and the checks of a checkpoint.
+Class methods read what a run folder says, when no fit is there: `load_gaussians`, `load_scene`, `held`, `run_metrics`,
+`report` and the checks of a checkpoint.
 """
 
 from __future__ import annotations
@@ -319,6 +319,10 @@ class Component:
         """A rendering with the photograph's own exposure and the like, for the loss; differentiated."""
         return out
 
+    def as_shown(self, image: torch.Tensor, frame: Frame) -> torch.Tensor:
+        """The inverse: the image (H, W, 3) of a photograph without an exposure of its own and the like; no graph."""
+        return image
+
     def after_backward(self, fit: Fit) -> None:
         """Change gradients before optimizers step."""
 
@@ -396,6 +400,21 @@ class Component:
     def load_scene(cls, scene: Scene, checkpoint: Checkpoint) -> Scene:
         """As `scene`, of a checkpoint; for rendering, not fitted."""
         return scene
+
+    @classmethod
+    def held(
+        cls, names: list[str], networks: Mapping[str, Mapping[str, torch.Tensor]], settings: RenderSettings
+    ) -> Component | None:
+        """With what its networks say of photographs, which stays: for `as_photograph` and `as_shown` without a fit.
+
+        Args:
+            names: Photographs that were fitted to, in the order of the fit.
+            networks: As of `RunViews`.
+            settings: Settings of the renderings.
+        Returns:
+            None where they say nothing.
+        """
+        return None
 
     @classmethod
     def run_evaluation(cls, run: RunViews) -> dict[str, Any]:

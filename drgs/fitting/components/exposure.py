@@ -238,6 +238,10 @@ class Exposure(torch.nn.Module):
         target = frame.image().to(shown.device)
         return dataclasses.replace(output, rgb=torch.where((target >= _BRIGHT) & (shown > target), target, shown))
 
+    def of(self, frame: Frame) -> torch.Tensor:
+        """(3,) the log gain of a photograph, a value without a graph."""
+        return self.log_gains[self._rows[frame.name]].detach()
+
     def meter(self, frames: list[Frame], scene: Scene, settings: RenderSettings) -> Meter | None:
         """The `Meter` of photographs that have a gain, of which as many are rendered as `_METERED` says; None where it
         would not predict the gains of others.
@@ -506,16 +510,14 @@ class ExposureComponent(Component):
         self.evidence: dict[str, Any] | None = None
 
     @classmethod
-    def held(cls, checkpoint: Checkpoint, background: tuple[float, float, float]) -> ExposureComponent:
-        """With the gains of the photographs that a checkpoint names; they stay as they are.
-
-        Raises:
-            ValueError: If the checkpoint has none.
-        """
-        names = checkpoint.header["views"]
+    def held(
+        cls, names: list[str], networks: Mapping[str, Mapping[str, torch.Tensor]], settings: RenderSettings
+    ) -> ExposureComponent | None:
+        """See `Component`."""
+        if NETWORK not in networks:
+            return None
         component = cls()
-        component.module = Exposure(names, np.zeros((len(names), 3)), False, background)
-        Network(NETWORK, component.module, 0.0).restore(dict(checkpoint.tensors), checkpoint.where)
+        component.module = Exposure(names, networks[NETWORK]["log_gains"].numpy(), False, settings.background)
         return component
 
     def setting(self, setup: Setup) -> str | None:
@@ -567,6 +569,14 @@ class ExposureComponent(Component):
         """See `Component`."""
         return out if self.module is None else self.module(out, frame)
 
+    def as_shown(self, image: torch.Tensor, frame: Frame) -> torch.Tensor:
+        """See `Component`; a background that was put behind a photograph later has no gain."""
+        if self.module is None:
+            return image
+        corrected = (image / self.module.of(frame).cpu().exp()).clamp(0, 1)
+        empty = frame.empty()
+        return corrected if empty is None else torch.lerp(corrected, image, empty[..., None])
+
     def meter(self, fit: Fit) -> Meter | None:
         """The `Meter` of the fit's photographs; None where they have no gains, or these do not predict each other."""
         if self.module is None:
@@ -580,10 +590,10 @@ class ExposureComponent(Component):
     @classmethod
     def run_evaluation(cls, run: RunViews) -> dict[str, Any]:
         """See `Component`."""
-        if NETWORK not in run.networks:
+        held = cls.held(run.names, run.networks, run.settings)
+        if held is None or held.module is None:
             return {}
-        module = Exposure(run.names, run.networks[NETWORK]["log_gains"].numpy(), False, run.settings.background)
-        return {"as_photograph": module.meter(run.photographs(), run.scene, run.settings)}
+        return {"as_photograph": held.module.meter(run.photographs(), run.scene, run.settings)}
 
     def join(self, fit: Fit, frame: Frame, setup: Setup) -> list[dict]:
         """See `Component`: gains are estimated again, with the points of the new photograph."""

@@ -7,6 +7,7 @@ its whole budget, and then those go without which photographs change least, as m
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -63,7 +64,15 @@ class PruningComponent(Component):
         frames = [photographs[i] for i in chosen]
         images, masks = [frame.image() for frame in frames], [frame.mask for frame in frames]
         scene: Any = fit.scene()  # Gaussians, or a DynamicGaussians
-        found = prune(scene, [x.camera for x in frames], loss=loss, images=images, masks=masks, rounds=1)
+        found = prune(
+            scene,
+            [frame.camera for frame in frames],
+            loss=loss,
+            images=images,
+            masks=masks,
+            as_photographs=[functools.partial(fit.as_photograph, frame=frame) for frame in frames],
+            rounds=1,
+        )
         found.kept[: fit.rows.far] = True  # a skybox stays whole
         before = len(fit.rows)
         fit.rows.keep(found.kept.nonzero()[:, 0])

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from drgs.checks.registry import Registry
 from drgs.fitting.components.base import Component
+
+if TYPE_CHECKING:
+    import torch
+
+    from drgs.settings import RenderSettings
 
 _HERE = "drgs.fitting.components"
 
@@ -37,3 +43,11 @@ COMPONENTS: Registry[type[Component]] = Registry(
 def components_of(kinds: Sequence[Callable[[], Component]] | None = None) -> list[Component]:
     """New instances for a fit; `kinds`: what makes them, default all rows of the table."""
     return [kind() for kind in (COMPONENTS.values() if kinds is None else kinds)]
+
+
+def held_components(
+    names: list[str], networks: Mapping[str, Mapping[str, torch.Tensor]], settings: RenderSettings
+) -> list[Component]:
+    """What the fit of a run has left that is said of photographs; arguments as of `Component.held`."""
+    held = (kind.held(names, networks, settings) for kind in COMPONENTS.values())
+    return [component for component in held if component is not None]
