@@ -58,6 +58,16 @@ def test_superfluous_gaussians_go_when_density_control_ends(dataset):  # noqa: F
     assert len(run_to(trainer, 20).rows) == left
 
 
+def test_a_fit_with_more_steps_does_not_grow_again(dataset):  # noqa: F811
+    """Where the clock gives it twice the steps, density control would be due again by its share of them."""
+    trainer = run_to(trainer_of(dataset, prune_loss=0.3, refine_stop=0.8), 18)
+    left, (before, _) = len(trainer.rows), trainer.component("pruning").counts
+    trainer.reschedule(40)
+    events = [event["event"] for _ in range(14) for event in trainer.step().events]
+    assert "density" not in events
+    assert len(trainer.rows) == left < before
+
+
 def test_photographs_are_compared_by_their_exposure(dataset):  # noqa: F811
     """At half the brightness, with gains that say so, as many go as at their own; without gains others would."""
     left = []

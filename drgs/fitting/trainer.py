@@ -230,7 +230,7 @@ class Trainer:
         Raises:
             ValueError: If they have been done already, or where the fit has stages, whose rates count steps.
         """
-        if any(component.stage(self) is not None for component in self.components):
+        if any(stage is not None and stage.length for stage in (x.stage(self) for x in self.components)):
             raise ValueError("fit: steps must stay as they are where things move; fit again with others")
         if max_steps <= self.step_index:
             raise ValueError(f"fit: steps must be more than the {self.step_index} done, got {max_steps}; ask for more")

@@ -16,6 +16,7 @@ import numpy as np
 from drgs.fitting.components.base import Checkpoint, Component, Fit, Setup
 from drgs.fitting.frames import Frame
 from drgs.fitting.pruning import prune
+from drgs.fitting.stages import Stage
 
 _PHOTOGRAPHS = 24  # training photographs, evenly spaced, that are looked at: each is rendered about ten times
 
@@ -47,6 +48,10 @@ class PruningComponent(Component):
                 "fit: refine_stop must be below 1 for prune_loss, which removes Gaussians when density control ends, "
                 "got 1; use --refine-stop 0.8, or leave --prune-loss out"
             )
+
+    def stage(self, fit: Fit) -> Stage | None:
+        """See `Component`: no step any more once Gaussians are removed, also where a fit is given more steps then."""
+        return Stage(0, 0) if self.counts else None
 
     def resume(self, fit: Fit, checkpoint: Checkpoint) -> None:
         """See `Component`."""
