@@ -79,6 +79,18 @@ def test_one_field_is_an_option_everywhere():
         assert found == value
 
 
+@pytest.mark.parametrize("flag", ["--updates-per-step", "--num-downscales", "--dropout"])
+def test_auto_is_the_word_for_none(flag):
+    """As help names it; messages say both, as a script has None."""
+    name = flag[2:].replace("-", "_")
+    value = parsed_options(options.Fit, ["data", "-o", "run", flag, "auto"])
+    for step in options_in(options.Fit)[name].path:
+        value = getattr(value, step)
+    assert value is None
+    with pytest.raises(ValueError, match=rf"fit: {name} must be .*, or None \(auto\), got -1"):
+        parsed_options(options.Fit, ["data", "-o", "run", flag, "-1"])
+
+
 @pytest.mark.parametrize(
     ("line", "told"),
     [

@@ -64,6 +64,7 @@ def check_fields(
     where: str,
     record: Any,
     ranges: Mapping[str, tuple[float, float]] = {},
+    words: Mapping[str, str] = {},
 ) -> None:
     """Raise ValueError unless the fields of a frozen dataclass have their annotated types and lie in their ranges.
 
@@ -74,6 +75,7 @@ def check_fields(
         where: The record, for the message.
         record: An instance of a dataclass.
         ranges: Field -> (lowest, highest), both allowed; of tuples, each of their numbers.
+        words: Field -> what a command line calls its None.
     """
     for name, hint in _hints(type(record)).items():  # type: ignore[arg-type]  # a class is hashable
         value = getattr(record, name)
@@ -86,7 +88,8 @@ def check_fields(
         low, high = ranges.get(name, (-math.inf, math.inf))
         checked, problem = _checked(value, hint, low, high)
         if problem:
-            raise ValueError(f"{where}: {name} must be {problem}, got {value!r}")
+            called = f" ({words[name]})" if name in words else ""
+            raise ValueError(f"{where}: {name} must be {problem}{called}, got {value!r}")
         if checked is not value:
             object.__setattr__(record, name, checked)
 

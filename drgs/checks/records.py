@@ -44,7 +44,7 @@ class Spec:
         positional: It has no flag: words of the command line that belong to no option are its value.
         repeat: A tuple of which every use of the flag adds an element.
         commas: A tuple that is written as one word, with commas between its elements.
-        none: With `commas`, the word for an empty tuple.
+        none: The word for None; with `commas`, for an empty tuple.
         file_only: No option, but a configuration file may state it.
     """
 
@@ -197,7 +197,7 @@ class Record:
     def check(self) -> None:
         """Raise ValueError unless every field has its type and is in the range that it declares."""
         kind: Any = type(self)
-        check_fields(self.where, self, _ranges_of(kind))
+        check_fields(self.where, self, _ranges_of(kind), _words_of(kind))
 
     def replace(self, **fields: Any) -> Self:
         """A copy with these fields, each of this record or of one nested in it.
@@ -232,8 +232,17 @@ class Record:
 
 @functools.cache
 def _ranges_of(kind: type) -> Mapping[str, tuple[float, float]]:
-    specs = {field.name: field.metadata.get(_OPTION) for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    return {name: spec.within for name, spec in specs.items() if spec is not None and spec.within is not None}
+    return {name: spec.within for name, spec in _specs_of(kind).items() if spec.within is not None}
+
+
+@functools.cache
+def _words_of(kind: type) -> Mapping[str, str]:
+    return {name: spec.none for name, spec in _specs_of(kind).items() if spec.none is not None and not spec.commas}
+
+
+def _specs_of(kind: Any) -> dict[str, Spec]:
+    """Field -> what it says of itself, of those that are options."""
+    return {field.name: field.metadata[_OPTION] for field in dataclasses.fields(kind) if _OPTION in field.metadata}
 
 
 def nested(kind: Any, base: Any, values: Mapping[tuple[str, ...], Any]) -> Any:

@@ -140,9 +140,10 @@ def _values(option: Option, words: Sequence[str]) -> Any:
     kinds = _kinds(option.hint)
     if not words:
         raise ValueError(f"{option.flag} must have a value, {_metavar_of(option)}, got none; add it")
+    if words[0] == option.spec.none:
+        return () if option.spec.commas else None
     if option.spec.commas:
-        names = tuple(name.strip() for name in words[0].split(","))
-        return () if words[0] == option.spec.none else names
+        return tuple(name.strip() for name in words[0].split(","))
     if not kinds or option.spec.repeat:
         return _converted(option, kinds[0] if kinds else option.hint, words[0])
     if kinds[-1] is Ellipsis:
