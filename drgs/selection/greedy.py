@@ -152,8 +152,8 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         raise ValueError("select: refine must be None with combine zscore, which compares candidates; use combine sum")
     if not combination.traced or combination.apart:  # a trace alone has no lambda
         _check_prior(pool, prior)
-    H, wanted, scores, kept, pixels = _first_round(pool, information, combination)
-    gains = combination.compared(scores)
+    first = _first_round(pool, information, combination)
+    gains, kept = combination.compared(first.gains), first.kept
     selection = Selection(
         picks=[],
         scores=[gain.total for gain in gains],
@@ -163,13 +163,13 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         prior=dataclasses.replace(prior, lengths={}),  # what is told of it, as of the scoring, are plain numbers
         evaluations=len(gains),
         computed=information.computed,
-        pixels=pixels,
+        pixels=first.pixels,
         notes=[
             *_notes(gains, combination.apart),
             *_silent(information.has_any),
             *_crowded(pool.cache, information),
-            *([wanted.note] if wanted.note else []),
-            *_halved(pool, pixels),
+            *([first.note] if first.note else []),
+            *_halved(pool, first.pixels),
         ],
     )
     # Scores never rise as H grows, unless lambda or the set of counted parameters changes with it.
@@ -181,7 +181,7 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         margin = gains[best].total - gains[order[1]].total if len(order) > 1 else None
         pick, picked = pool.pick(best, gains[best].total, gains[best].parts, margin), kept.get(best)
         if pool.refine is not None:
-            score = combination.scorer(H, wanted.pool, wanted.shares)
+            score = first.scorer(combination)
             compute = information.again(pool.refine.evaluations)
             start = pool.candidates[best]
             camera, gain, moved, count = refined(
@@ -196,35 +196,41 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         left.remove(best)
         kept.pop(best)
         assert picked is not None  # kept, as more than one is picked
-        _add(H, picked)
+        _add(first.known, picked)
         fresh = set()  # the other scores are bounds now
-        selection.evaluations += _refresh(
-            gains, left, fresh, falling, combination.scorer(H, wanted.pool, wanted.shares), kept
-        )
+        selection.evaluations += _refresh(gains, left, fresh, falling, first.scorer(combination), kept)
         for i, gain in zip(left, combination.compared([gains[i] for i in left]), strict=True):
             gains[i] = gain
 
 
-class _Wanted(NamedTuple):
-    """What scores need to know of all views together, known ones and candidates.
+class _FirstRound(NamedTuple):
+    """What is known once every candidate has been scored.
 
     Attributes:
-        pool: The information of all views, of the pixels that count; None where scores are not pooled.
+        known: H, the information of the training views, to which that of picks is added.
+        everything: The information of all views, of the pixels that count; None where scores are not pooled.
         shares: Factors of what each parameter adds to a score, where a region counts and scores are not pooled.
         note: What is to be said of the region; "" where there is nothing.
+        gains: Of each candidate.
+        kept: Candidate -> its information, where it is wanted again.
+        pixels: By how many each candidate was scored; none where all were by all of theirs.
     """
 
-    pool: Information | None = None
-    shares: Information | None = None
-    note: str = ""
+    known: dict[str, torch.Tensor]
+    everything: Information | None
+    shares: Information | None
+    note: str
+    gains: list[Gain]
+    kept: dict[int, Information]
+    pixels: list[int]
+
+    def scorer(self, combination: Combination) -> Callable[[Information], Gain]:
+        """What scores a candidate, given what is known by now."""
+        return combination.scorer(self.known, self.everything, self.shares)
 
 
-def _first_round(
-    pool: Pool, information: ViewInformation, combination: Combination
-) -> tuple[dict[str, torch.Tensor], _Wanted, list[Gain], dict[int, Information], list[int]]:
-    """H of the training views, what scores need of all views, every candidate's gain and, where it is wanted again, its
-    information by index; and the pixels that each was scored by, where these are not all.
-    """
+def _first_round(pool: Pool, information: ViewInformation, combination: Combination) -> _FirstRound:
+    """Score every candidate, given the training views."""
     H: dict[str, torch.Tensor] = {}
     gains: list[Gain] = []
     kept: dict[int, Information] = {}
@@ -259,13 +265,13 @@ def _first_round(
         if keeps:
             kept[i] = part
         del part  # else two views are alive while the next one is computed
-    wanted = _Wanted()
+    pooled: Information | None = everything
+    factors = None
     if everything is not None:
-        wanted = _Wanted(everything)
         if pool.region is not None:
             of_region = _of_region(information, [*known, *candidates], shares, everything)
-            wanted = _Wanted(of_region) if combination.pooled else _Wanted(None, shares_of(of_region, everything))
-        score = combination.scorer(H, wanted.pool, wanted.shares)
+            pooled, factors = (of_region, None) if combination.pooled else (None, shares_of(of_region, everything))
+        score = combination.scorer(H, pooled, factors)
         if not keeps:
             information.expect(len(candidates))
             each = information.each(candidates)
@@ -276,7 +282,7 @@ def _first_round(
         full = _score_in_full(information, whole, candidates, gains, scorer, everything, kept)
         used = [(whole if i in full else candidates)[i].camera for i in range(len(whole))]
         pixels = [camera.width * camera.height for camera in used]
-    return H, wanted._replace(note=note), gains, kept, pixels
+    return _FirstRound(H, pooled, factors, note, gains, kept, pixels)
 
 
 def _halves(pool: Pool, combination: Combination) -> bool:
