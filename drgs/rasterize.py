@@ -226,16 +226,7 @@ def rasterization(
     mode = _MODES[render_mode]
     antialiased = rasterize_mode == "antialiased"
     settings = _settings_of(preset, near_plane, eps2d, antialiased, with_eval3d, with_ut, global_z_order)
-    strains = None
-    if covars is not None:
-        if return_normals:
-            raise NotImplementedError(
-                "rasterization: return_normals is not supported with covars, whose axes have no order; pass quats and "
-                "scales"
-            )
-        quats, scales, strains = factors("rasterization", covars, tuple(means.shape[:-1]))
-    if quats is None or scales is None:
-        raise ValueError("rasterization: quats and scales must be tensors where there are no covars, got None")
+    quats, scales, strains = _shapes_of(quats, scales, covars, tuple(means.shape[:-1]), return_normals)
     if colors is None or not mode.color:
         colors, sh_degree, backgrounds = torch.zeros_like(means[..., :1]), None, None
     lead = tuple(means.shape[:-2])
@@ -303,20 +294,14 @@ def rasterization(
             )
             signals = None if extra is None else _colors_of_view(by_batch(extra), b, c, extra_signals_sh_degree)
             views.append(_View(options, splats, camera, signals, *(at(x, b, c) for x in by_view)))
-    drawn = [view.draw() for view in views]
-
-    def joined(parts: list[torch.Tensor]) -> torch.Tensor:
-        """What views have, one each, with the leading axes and that of cameras."""
-        return torch.stack(parts).reshape(*lead, count, *parts[0].shape)
-
-    meta: dict[str, Any] = {name: joined([of_view[name] for _, _, of_view in drawn]) for name in drawn[0][2]}
+    images, alphas, meta = _drawn(views, (*lead, count))
     if leaf is not None:
         with torch.no_grad():  # its values; the graph of every view begins at the leaf
             leaf.copy_(meta["means2d"])
         meta["means2d"] = leaf
     meta |= {"width": width, "height": height, "n_batches": batches, "n_cameras": count}
     meta |= dict.fromkeys(("batch_ids", "camera_ids", "gaussian_ids"))  # of packed arrays, which these are not
-    return joined([image for image, _, _ in drawn]), joined([alpha for _, alpha, _ in drawn]), meta
+    return images, alphas, meta
 
 
 @dataclasses.dataclass(frozen=True)
@@ -471,6 +456,34 @@ class _View:
         if self.options.clip > 0:
             kept &= (meta["radii"] > self.options.clip).any(-1)
         return kept
+
+
+def _drawn(views: list[_View], axes: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+    """What views have, with the leading axes and that of cameras: images, alphas and the arrays of `meta`."""
+    images, alphas, metas = zip(*(view.draw() for view in views), strict=True)
+    joined = lambda parts: torch.stack(parts).reshape(*axes, *parts[0].shape)  # noqa: E731
+    meta = {name: joined([of_view[name] for of_view in metas]) for name in metas[0]}
+    return joined(images), joined(alphas), meta
+
+
+def _shapes_of(
+    quats: torch.Tensor | None,
+    scales: torch.Tensor | None,
+    covars: torch.Tensor | None,
+    shape: tuple[int, ...],
+    with_normals: bool,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+    """Quaternions, scales and, where they are those of covariances, strains of Gaussians of a shape (..., N)."""
+    if covars is not None:
+        if with_normals:
+            raise NotImplementedError(
+                "rasterization: return_normals is not supported with covars, whose axes have no order; pass quats and "
+                "scales"
+            )
+        return factors("rasterization", covars, shape)
+    if quats is None or scales is None:
+        raise ValueError("rasterization: quats and scales must be tensors where there are no covars, got None")
+    return quats, scales, None
 
 
 def _evaluated(coefficients: torch.Tensor, degree: int, towards: torch.Tensor) -> torch.Tensor:
