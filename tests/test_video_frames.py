@@ -9,7 +9,7 @@ from made_videos import RATE, film, pictures, turn_cameras, walk_cameras
 from test_data_points import HEIGHT, WIDTH
 
 from drgs import cli
-from drgs.sfm.video_frames import examine, pick_frames
+from drgs.sfm.video_frames import examine
 
 
 def kinds(picked) -> list[str]:
@@ -30,7 +30,7 @@ def test_a_walk_gives_frames_in_even_steps(walk, tmp_path):
     """Times and what moved are kept, the bound is kept, and what is taken has parallax in between."""
     path = film(tmp_path / "walk.mp4", walk)
     told = []
-    picked = pick_frames(path, 150, lambda done, total: told.append((done, total)))
+    picked = examine(path, lambda done, total: told.append((done, total))).pick(150)
     taken = indices(picked)
     assert len(taken) == picked.useful_frames <= picked.samples == 30
     assert len(taken) >= 6
@@ -44,7 +44,7 @@ def test_a_walk_gives_frames_in_even_steps(walk, tmp_path):
     assert picked.findings == ()
     assert told[0] == (0, 30)
     assert told[-1] == (30, 30)
-    few = pick_frames(path, 5)
+    few = examine(path).pick(5)
     assert 4 <= len(few.frames) <= 5
     assert few.useful_frames == picked.useful_frames
     assert indices(few)[-1] - indices(few)[0] > 15
@@ -53,7 +53,7 @@ def test_a_walk_gives_frames_in_even_steps(walk, tmp_path):
 def test_frames_are_those_of_the_video(walk, tmp_path):
     """A frame that is taken decodes to the picture of its number."""
     path = film(tmp_path / "walk.mp4", walk)
-    for frame in pick_frames(path, 4).frames:
+    for frame in examine(path).pick(4).frames:
         errors = [np.abs(frame.frame.read().astype(float) - image).mean() for image in walk]
         assert int(np.argmin(errors)) == frame.frame.index
 
@@ -62,7 +62,7 @@ def test_a_blurred_frame_is_not_taken_beside_a_sharp_one(walk, tmp_path):
     """Every third frame blurred, and two that follow each other."""
     blurred = {*range(1, 30, 3), 20, 21}
     images = [cv2.GaussianBlur(image, (0, 0), 2.5) if i in blurred else image for i, image in enumerate(walk)]
-    picked = pick_frames(film(tmp_path / "walk.mp4", images), 150)
+    picked = examine(film(tmp_path / "walk.mp4", images)).pick(150)
     assert len(picked.frames) >= 6
     assert blurred.isdisjoint(indices(picked).tolist())
     assert min(frame.sharpness for frame in picked.frames) > 0.5
@@ -74,7 +74,7 @@ def test_frames_between_looks_are_compared(walk, tmp_path):
     sharp = [3 * at + at % 3 for at in range(len(walk))]
     for at, image in zip(sharp, walk, strict=True):
         images[at] = image
-    picked = pick_frames(film(tmp_path / "walk.mp4", images, rate=30), 150)
+    picked = examine(film(tmp_path / "walk.mp4", images, rate=30)).pick(150)
     assert picked.samples == len(walk)
     assert set(indices(picked).tolist()) <= set(sharp)
 
@@ -82,7 +82,7 @@ def test_frames_between_looks_are_compared(walk, tmp_path):
 def test_long_blur_is_told(walk, tmp_path):
     """Where there is nothing sharp near by, frames are taken all the same, and a finding says when."""
     images = [cv2.GaussianBlur(image, (0, 0), 2.5) if 12 <= i < 22 else image for i, image in enumerate(walk)]
-    picked = pick_frames(film(tmp_path / "walk.mp4", images), 150)
+    picked = examine(film(tmp_path / "walk.mp4", images)).pick(150)
     found = [finding for finding in picked.findings if finding.kind == "blur"]
     assert len(found) == 1
     assert found[0].line().startswith("walk.mp4, 1.2 to 2.1 s: blurred; hold still")
@@ -110,12 +110,12 @@ def test_turns_at_the_end_are_left_out_and_those_between_bridged(tmp_path):
     turn = turn_cameras(first[-1], 15, step=0.04)
     images = pictures([*first, *turn])
     path = film(tmp_path / "end.mp4", images)
-    picked = pick_frames(path, 150)
+    picked = examine(path).pick(150)
     assert "turn" in kinds(picked)
     assert (indices(picked) < 15).sum() >= 4
     assert (indices(picked) >= 18).sum() == 0
     back = [*images, *images[::-1]]  # the same backwards: the walk goes on
-    picked = pick_frames(film(tmp_path / "between.mp4", back), 150)
+    picked = examine(film(tmp_path / "between.mp4", back)).pick(150)
     taken = indices(picked)
     between = ((taken >= 18) & (taken < 42)).sum()
     assert 2 <= between <= 8
@@ -127,7 +127,7 @@ def test_a_camera_at_rest(walk, tmp_path):
     """One frame or two, however long it is, and a finding."""
     rng = np.random.default_rng(0)
     images = [np.clip(walk[0] + rng.normal(0, 4, walk[0].shape), 0, 255).astype(np.uint8) for _ in range(30)]
-    picked = pick_frames(film(tmp_path / "still.mp4", images), 150)
+    picked = examine(film(tmp_path / "still.mp4", images)).pick(150)
     assert len(picked.frames) <= 2
     assert kinds(picked) == ["still"]
     assert "hardly moves in 2.9 s; walk around" in picked.findings[0].line()
@@ -135,14 +135,14 @@ def test_a_camera_at_rest(walk, tmp_path):
 
 def test_nothing_to_hold_on_to(tmp_path):
     """A black video has a frame and a finding."""
-    picked = pick_frames(film(tmp_path / "night.mp4", [np.zeros((HEIGHT, WIDTH, 3), np.uint8)] * 12), 150)
+    picked = examine(film(tmp_path / "night.mp4", [np.zeros((HEIGHT, WIDTH, 3), np.uint8)] * 12)).pick(150)
     assert "blank" in kinds(picked)
     assert len(picked.frames) >= 1
 
 
 def test_one_frame(walk, tmp_path):
     """A video of one frame is that frame."""
-    picked = pick_frames(film(tmp_path / "one.mp4", walk[:1]), 150)
+    picked = examine(film(tmp_path / "one.mp4", walk[:1])).pick(150)
     assert indices(picked).tolist() == [0]
     assert picked.frame_seconds == 0
 
@@ -162,9 +162,3 @@ def test_files_that_are_no_videos(walk, tmp_path, capfd, kind):
     assert told.count("\n") == 1
     assert "walk.mp4: must " in told
     assert sorted(tmp_path.rglob("*")) == before
-
-
-def test_bad_number(walk, tmp_path):
-    """At least one frame."""
-    with pytest.raises(ValueError, match="frames: must be at least 1, got 0"):
-        pick_frames(film(tmp_path / "walk.mp4", walk[:2]), 0)

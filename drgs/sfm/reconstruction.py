@@ -127,7 +127,7 @@ class SfmOptions:
         masks: Where features are detected, if an object was turned or moved between photos: a folder with a mask of
             every photo, `NAME.EXT.png` or `NAME.png`, white where the object is, of the photo's shape; or `"alpha"`,
             the photos' own alpha channel. Weights below a half count as black.
-        frames: Largest number of frames of all videos together (`pick_frames`).
+        frames: Largest number of frames of all videos together (`drgs.sfm.video_frames`).
     Raises:
         ValueError: An unknown camera model or way of matching.
     """

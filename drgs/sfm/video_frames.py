@@ -179,31 +179,17 @@ class ExaminedVideo:
         return [finding for _, finding in sorted(findings, key=lambda pair: -pair[0])]
 
 
-def pick_frames(path: Path, most: int = 150, progress: Callable[[int, int], None] | None = None) -> Picked:
-    """Frames of a video for structure from motion.
+def examine(path: Path, progress: Callable[[int, int], None] | None = None) -> ExaminedVideo:
+    """Sharpness and motion throughout a video, one frame after the other.
 
     Args:
         path: The video: mp4, mov, webm, mkv or avi.
-        most: Largest number of frames.
         progress: Called with (samples measured, all samples).
     Raises:
         FileNotFoundError, ValueError: No video, or one that cannot be decoded.
     Reference:
         Lucas and Kanade, "An iterative image registration technique", IJCAI 1981 (tracks); the motion field of a
         rotation, to first order in the angle: Longuet-Higgins and Prazdny 1980, eq. 2.13.
-    """
-    if most < 1:
-        raise ValueError(f"frames: must be at least 1, got {most}; ask for some")
-    return examine(path, progress).pick(most)
-
-
-def examine(path: Path, progress: Callable[[int, int], None] | None = None) -> ExaminedVideo:
-    """Sharpness and motion throughout a video, one frame after the other.
-
-    Args:
-        path, progress: The arguments of `pick_frames`.
-    Raises:
-        FileNotFoundError, ValueError: No video, or one that cannot be decoded.
     """
     report = progress or (lambda done, total: None)
     video = read_video(Path(path))
