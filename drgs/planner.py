@@ -100,7 +100,7 @@ _HEADER = {
     "costs": (None, bool, [float]),
     "scoring": str,
     "asked_in": [float],
-    "answered_in": [float],
+    "answer_shares": [float],
     "origin": (None, [float]),
     "fit": dict,
     "photographs": [_CAMERA],
@@ -415,7 +415,7 @@ class Planner:
                 "costs": True if callable(costs) else costs,
                 "scoring": named_by(self._scoring) or "",
                 "asked_in": list(self._view_seconds.latest),
-                "answered_in": list(self._answer_share.latest),
+                "answer_shares": list(self._answer_share.latest),
                 "origin": origin,
                 "fit": fit_header,
                 "photographs": records(photographs),
@@ -466,7 +466,7 @@ class Planner:
         expected = cameras("expected", planner.info_pixels)
         if header["version"] == runtime.version():  # other versions may compute other information, in other times
             planner._view_seconds.latest.extend(header["asked_in"])
-            planner._answer_share.latest.extend(header["answered_in"])
+            planner._answer_share.latest.extend(header["answer_shares"])
             planner._cache.restore(tensors, header["cache"], expected, str(where))
         planner.notes = header.get("notes")
         if len(planner._known) > planner.max_views:  # saved by one thread while another had just taken a photograph
@@ -782,10 +782,11 @@ def _read_file(path: str | os.PathLike) -> tuple[Path, dict[str, torch.Tensor], 
     if header.pop("kind", None) != _KIND:
         raise ValueError(f"{path}: must be what Planner.save has written, is a checkpoint of a fit; see drgs fit")
     header.pop("schema")
-    check_json(str(path), header, _HEADER, _ADVICE)
+    known = {"answer_shares": header.get("answered_in"), **header}  # as older files call them
+    check_json(str(path), known, _HEADER, _ADVICE)
     if _digest(tensors, header) != header["digest"]:
         raise ValueError(f"{path}: must be as Planner.save has written it, has been changed since; {_ADVICE}")
-    return path, tensors, header
+    return path, tensors, known
 
 
 def _camera_json(camera: Camera) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from test_planner import config, photograph, planner_of
 import drgs
 from drgs.cameras import orbit
 from drgs.files import load_state, save_state
-from drgs.planner import Planner
+from drgs.planner import Planner, _digest
 from drgs.select import Scoring
 from drgs.selection.cache import named_by
 
@@ -106,6 +106,21 @@ def test_a_callers_own_model(world, tmp_path):
     assert plans[0].changed == plans[1].changed == pytest.approx(0.1, rel=1e-3)
     assert plans[0].scores == plans[1].scores
     assert plans[0].computed == plans[1].computed == 0
+
+
+def test_files_of_before(world, tmp_path):
+    """What answers take of the time of their views had another name in the file: it is read under either."""
+    planner = planner_of(world)
+    planner.scores(world[2])
+    planner._answer_share.note(0.25)
+    planner.save(tmp_path / "p.safetensors")
+    tensors, header = load_state(tmp_path / "p.safetensors")
+    header["answered_in"] = header.pop("answer_shares")
+    header["digest"] = _digest(tensors, header := {x: y for x, y in header.items() if x not in ("kind", "schema")})
+    save_state(tmp_path / "p.safetensors", tensors, {"kind": "planner", **header})
+    latest = planner._answer_share.latest
+    assert 0.25 in latest
+    assert list(Planner.load(tmp_path / "p.safetensors")._answer_share.latest) == list(latest)
 
 
 def test_what_is_asked_has_to_be_the_same(world, tmp_path):
