@@ -202,13 +202,7 @@ def crossval(
     model = search.model
     claimed = next(name for name, start in starts.items() if start == search.start)
     drawn = [rendered_by(model, view) for view in range(len(cameras))]
-    if not any(bool(alpha.any()) for _, alpha in drawn):
-        if any(bool(rendered_by(search.start, view)[1].any()) for view in range(len(cameras))):
-            raise ValueError(
-                f"{rasterizer.name}: its image must show Gaussians, shows the background alone where preset {claimed} "
-                "shows some; correct the rasterizer"
-            )
-        raise ValueError(_EMPTY)
+    _check_shown(rasterizer, claimed, drawn, lambda view: rendered_by(search.start, view)[1])
     tolerance = tolerance or _TOLERANCE[dtype]
     ties = functools.partial(ties_of, model)
     case = Case(rasterizer, raw, cameras, background, oracle, tolerance, entries, first, seed, ties, say)
@@ -231,10 +225,7 @@ def crossval(
         report["verdict"] = min((report["verdict"], *verdicts), key=VERDICTS.index)
     report["paths"] = [dataclasses.asdict(row) for row in rows]
     say("pictures")
-    exact = ReferenceModel(RenderSettings.preset("exact", background=background))
-    true = [_rendered(exact, raw, camera, False)[0] for camera in cameras]
-    beside = zip(pictures, [same for same, _ in drawn], true, strict=True)
-    images = [dict(zip(("rasterizer", "model", "exact"), (x.numpy() for x in row), strict=True)) for row in beside]
+    images = _beside(case, pictures, drawn)
     return Result(report, images, comparison.groups, comparison.views, search.findings, model, g, cameras, rows)
 
 
@@ -314,6 +305,40 @@ def _images(
                 f"{picture[..., 0].numel()} pixels, first at ({x}, {y}); correct the rasterizer"
             )
     return pictures, alphas, signs
+
+
+def _check_shown(
+    rasterizer: Rasterizer | Dump,
+    claimed: str,
+    drawn: list[tuple[torch.Tensor, torch.Tensor]],
+    alpha_of_start: Callable[[int], torch.Tensor],
+) -> None:
+    """Raise ValueError if the model that was found shows no Gaussian in any view.
+
+    Args:
+        rasterizer: The rasterizer.
+        claimed: Name of the preset that it claims to be.
+        drawn: Image and alpha of the model, of each view.
+        alpha_of_start: Function of a view's index: (H, W) alpha of that preset.
+    """
+    if any(bool(alpha.any()) for _, alpha in drawn):
+        return
+    if any(bool(alpha_of_start(view).any()) for view in range(len(drawn))):
+        raise ValueError(
+            f"{rasterizer.name}: its image must show Gaussians, shows the background alone where preset {claimed} "
+            "shows some; correct the rasterizer"
+        )
+    raise ValueError(_EMPTY)
+
+
+def _beside(
+    case: Case, pictures: list[torch.Tensor], drawn: list[tuple[torch.Tensor, torch.Tensor]]
+) -> list[dict[str, np.ndarray]]:
+    """`Result.images`: those of the rasterizer, of the model, and of preset `exact`."""
+    exact = ReferenceModel(RenderSettings.preset("exact", background=case.background))
+    true = [_rendered(exact, case.raw, camera, False)[0] for camera in case.cameras]
+    rows = zip(pictures, [image for image, _ in drawn], true, strict=True)
+    return [dict(zip(("rasterizer", "model", "exact"), (x.numpy() for x in row), strict=True)) for row in rows]
 
 
 def _report(
