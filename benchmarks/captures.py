@@ -32,6 +32,7 @@ from studies import PAGE_DATA, ROOT, write_csv
 
 from drgs.studies.rows import read_study
 from drgs.studies.statistics import (
+    FEWEST_UNITS,
     at_views,
     coverage,
     differences,
@@ -66,7 +67,8 @@ def compared(rows: Rows, other: str) -> str:
     values = differences(rows, "psnr", DEFAULT, other)
     found = estimate(values)
     mean = f"{found.mean:+.2f}"
-    return f"{f'**{mean}**' if not found.low <= 0 <= found.high else mean} [{found.low:+.2f}, {found.high:+.2f}]"
+    is_verdict = found.units >= FEWEST_UNITS and not found.low <= 0 <= found.high
+    return f"{f'**{mean}**' if is_verdict else mean} [{found.low:+.2f}, {found.high:+.2f}]"
 
 
 def section(rows: Rows) -> str:
@@ -111,10 +113,10 @@ def free_section(rows: Rows) -> str:
     units = sorted({unit_of(row) for row in rows})
     rooms, commits = (", ".join(sorted({row[key] for row in rows})) for key in ("scene", "commit"))
     head = (
-        f"{len(rows)} fits so far, {len(units)} starts of {rooms}, commits {commits} "
-        "([rows](../benchmarks/free_poses.jsonl)), by `drgs reproduce captures --protocol blind`. PSNR of the default "
-        f"less that of others, in dB; first the average over {len(view_counts(rows))} numbers of views. Three rooms "
-        "with two starts each were named before any fit ran; fewer than six starts give no verdict."
+        "Three rooms with two starts each, named before any fit ran; "
+        f"{len(rows)} fits, {len(units)} starts of {rooms}, commit {commits} "
+        "([rows](../benchmarks/free_poses.jsonl)), in the same way. PSNR of the default less that of others, in dB; "
+        f"first the average over {len(view_counts(rows))} numbers of views."
     )
     lines = [
         [f"`{other}`", str(len(differences(over, "psnr", DEFAULT, other))), compared(over, other)]
