@@ -166,6 +166,9 @@ def test_fitting_on_keeps_to_exposures(tmp_path):
     kept = fit_on(g, dark, config, 20, components=[held])
     assert _psnr(kept, cameras, images) > _psnr(fit_on(g, dark, config, 20), cameras, images) + 5
     assert not held.module.log_gains.requires_grad
+    for damaged in ({}, {"log_gains": torch.zeros(2, 3)}):
+        with pytest.raises(ValueError, match="log_gains must have shape"):
+            held_components(["a"], {"exposure": damaged}, RenderSettings())
 
 
 @pytest.mark.parametrize(

@@ -413,6 +413,8 @@ class Component:
             settings: Settings of the renderings.
         Returns:
             None where they say nothing.
+        Raises:
+            ValueError: If they are not of these photographs.
         """
         return None
 

@@ -516,8 +516,15 @@ class ExposureComponent(Component):
         """See `Component`."""
         if NETWORK not in networks:
             return None
+        gains, wanted = networks[NETWORK].get("log_gains"), (len(names), 3)
+        if gains is None or tuple(gains.shape) != wanted:
+            got = "none" if gains is None else tuple(gains.shape)
+            raise ValueError(
+                f"state.safetensors: {NETWORK}.parameter.log_gains must have shape {wanted}, got {got}; the run is "
+                "damaged, restore it or fit again"
+            )
         component = cls()
-        component.module = Exposure(names, networks[NETWORK]["log_gains"].numpy(), False, settings.background)
+        component.module = Exposure(names, gains.numpy(), False, settings.background)
         return component
 
     def setting(self, setup: Setup) -> str | None:
