@@ -18,7 +18,7 @@ from drgs.scenes.output import DEPTH_UNIT, write_depth, write_png
 __all__ = [
     "noise", "mix", "ramp", "spline", "grid", "revolve", "tube", "join", "turned", "box_corners",
     "box", "material", "shape", "dome", "sensor", "aim", "z_depth", "first_hits", "encode_srgb", "strata",
-    "write_views", "axes",
+    "write_views", "axes", "pinhole_keys", "opengl",
 ]  # fmt: skip
 
 
@@ -327,6 +327,17 @@ def encode_srgb(linear):
 
 
 # ------------------------------------------------------------------------------- data set
+def pinhole_keys(K, width, height):
+    """What a transforms.json says of a camera of intrinsics K (3, 3) in pixels."""
+    size = {"w": width, "h": height}
+    return {"camera_model": "OPENCV", "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], **size}
+
+
+def opengl(c2w):
+    """Camera to world (4, 4) as a transforms.json has it: OpenGL's axes, in lists."""
+    return (c2w @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()
+
+
 def strata(spp):
     """`spp`, rounded up to what the sampler of `sensor` can divide a pixel into."""
     side = int(np.ceil(np.sqrt(spp)))
@@ -364,15 +375,14 @@ def write_views(folder, scene, K, poses, width, height, *, spp, max_depth, expos
             {
                 "file_path": f"images/{name}",
                 "depth_file_path": f"depth/{name}",
-                "transform_matrix": (c2w @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist(),
+                "transform_matrix": opengl(c2w),
             }
         )
         if progress is not None:
             progress(i + 1, len(poses))
     transforms = {
-        "camera_model": "OPENCV",
-        "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": width, "h": height,
+        **pinhole_keys(K, width, height),
         "depth_unit_scale_factor": DEPTH_UNIT,
         "frames": frames,
-    }  # fmt: skip
+    }
     (folder / "transforms.json").write_text(json.dumps(transforms, indent=1) + "\n")

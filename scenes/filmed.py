@@ -14,6 +14,14 @@ layout of Neu3D:
   pose, but no point comes from it nor is observed by it),
 - motion.json, where the play has one: what is where in each frame (docs/run-files.md),
 - params.json.
+
+With free poses (`scenes.free_poses`) each camera takes one photograph instead, at one of the times, from a place that
+is free at that time: what one camera gets that goes about. Then videos, poses_bounds.npy and frame0/ give way to
+
+- images/rgb_NNN.png and transforms.json, in Nerfstudio's layout, with a `time` in each frame; every eighth photograph,
+  from the first, is listed as held out,
+
+and labels and features are semantic_class/semantic_class_NNN.png and rgb_feature_langseg/rgb_NNN_fmap_CxHxW.pt.
 """
 
 from __future__ import annotations
@@ -30,6 +38,7 @@ import numpy as np
 from drgs import runtime, scenes
 from drgs.scenes import labelled, output, teacher, videos
 from drgs.scenes.colmap import SparsePoints, back_project, sparse_points, write_model
+from drgs.scenes.free_poses import free_poses
 from drgs.scenes.moving import Mover
 
 __all__ = ["Play", "Stage", "arc", "film"]
@@ -37,6 +46,7 @@ __all__ = ["Play", "Stage", "arc", "film"]
 # Samples of the lights, beside one of the surface, of each light path; a constant light stands for further bounces.
 _LIGHT_SAMPLES = 3
 _POINTS = 8000  # sparse points that are drawn
+_TEST_EVERY = 8  # of photographs from free poses
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,6 +65,7 @@ class Play:
         light_at: Function of the time: parameters of lights, as `mi.traverse` names them, and their values.
         truth: Function of the time: what motion.json says of a frame beside its time; None writes no such file.
         arc: Function of the number of cameras and the seed: camera-to-world matrices (cameras, 4, 4).
+        box: Lowest and highest corner of where a camera with a free pose may be, in meters.
         fov_x: Degrees across the image width.
         exposure: Factor of the light before it is encoded.
     """
@@ -67,6 +78,7 @@ class Play:
     parts: Callable
     lights: Callable
     arc: Callable
+    box: tuple[tuple[float, float, float], tuple[float, float, float]]
     fov_x: float
     exposure: float
     light_at: Callable[[float], dict] = lambda time: {}
@@ -139,19 +151,94 @@ def arc(cameras, seed, *, target, distance, spread, elevations):
     return poses
 
 
-class _Recording:
-    """A play that is filmed into a folder, frame by frame, and the data set of what was filmed."""
+class _Tracer:
+    """What traces the views of a play: the scene, the camera, the teacher."""
 
-    def __init__(self, play, folder, poses, times, size, teacher_size, spp, seed):
+    def __init__(self, play, size, teacher_size, spp, seed):
         self.play = play
-        self.folder = folder
-        self.poses = poses
-        self.times = times
         self.width, self.height = size
         self.teacher_size = teacher_size
         self.spp = scenes.strata(spp)
         self.seed = seed
         self.K = labelled.intrinsics(*size, play.fov_x)
+
+    @functools.cached_property
+    def stage(self):
+        """The scene, built when something is left to trace."""
+        return Stage(self.play, self.seed)
+
+    def trace(self, c2w, paths, number, camera):
+        """Trace a view into its files, (image, labels, features); the image comes last, and with it the view is.
+
+        Args:
+            c2w: (4, 4) camera to world.
+            paths: The three files.
+            number: Number of the view, of its own: the teacher errs by it.
+            camera: Number that its light paths are drawn by.
+        """
+        import mitsuba as mi
+
+        image_path, label_path, feature_path = paths
+        labels, points, _ = self.visible_surfaces(c2w)
+        feature = teacher.feature_map(
+            labels, points, self.play.classes, self.teacher_size, self.seed, number, self.play.confusions
+        )
+        sensor = scenes.sensor(self.K, self.width, self.height)
+        scenes.aim(sensor, c2w)
+        integrator = mi.load_dict({"type": "direct", "emitter_samples": _LIGHT_SAMPLES, "bsdf_samples": 1})
+        image = scenes.traced(self.stage.scene, sensor, integrator, self.spp, self.seed * 65536 + camera)
+        output.write_png(label_path, labels)
+        output.write_file(feature_path, teacher.tensor_bytes(feature))
+        image = scenes.encode_srgb(image * self.play.exposure)
+        output.write_png(image_path, image[..., ::-1])  # as BGR
+
+    def visible_surfaces(self, c2w):
+        """(labels, world points, depth) of the surfaces at a camera's pixel centers."""
+        depth, numbers = scenes.first_hits(self.stage.scene, self.K, c2w, self.width, self.height)
+        return self.stage.table[numbers], back_project(self.K, c2w, depth), depth
+
+    def finish(self, folder, files, times):
+        """Write what belongs to all views: classes, how good the teacher is in some views, what is where when.
+
+        Args:
+            folder: The data set.
+            files: (features, labels) of these views.
+            times: Number of times.
+        """
+        vectors = teacher.embeddings(self.play.classes, self.seed, self.play.confusions)
+        np.save(folder / "text_embeddings.npy", vectors)
+        right = teacher.accuracy(((teacher.load(path), _read_labels(labels)) for path, labels in files), vectors)
+        for name, content in (
+            ("classes", labelled.class_file(self.play.classes)),
+            ("moving_classes", self.play.moving),
+            ("teacher", {"pixel_accuracy": right, "views": len(files)}),
+        ):
+            (folder / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n")
+        if self.play.truth is not None:
+            moments = [_moment(k, times) for k in range(times)]
+            truth = {"frames": [{"time": time, **self.play.truth(time)} for time in moments]}
+            (folder / "motion.json").write_text(json.dumps(truth, indent=1) + "\n")
+
+
+def _read_labels(path):
+    import cv2
+
+    return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+
+
+def _moment(k, times):
+    """The k-th of so many times, in [0, 1]."""
+    return k / max(times - 1, 1)
+
+
+class _Recording:
+    """A play that is filmed into a folder, frame by frame, and the data set of what was filmed."""
+
+    def __init__(self, tracer, folder, poses, times):
+        self.tracer = tracer
+        self.folder = folder
+        self.poses = poses
+        self.times = times
         digits = max(2, len(str(len(poses) - 1)))  # readers sort by name
         self.names = [f"cam{k:0{digits}d}" for k in range(len(poses))]
         self.digits = max(4, len(str(times - 1)))
@@ -159,11 +246,6 @@ class _Recording:
             (folder / name).mkdir(parents=True, exist_ok=True)
         for name in self.names:
             (folder / "semantic_class" / name).mkdir(parents=True, exist_ok=True)
-
-    @functools.cached_property
-    def stage(self):
-        """The scene, built when something is left to trace."""
-        return Stage(self.play, self.seed)
 
     def paths(self, camera, k):
         """(image, labels, features) of a camera's frame; images are gone when the videos are made."""
@@ -184,7 +266,7 @@ class _Recording:
         for k in range(self.times):
             left = [c for c in range(len(self.poses)) if not self.paths(c, k)[0].exists()]
             if left:
-                self.stage.set(k / max(self.times - 1, 1))
+                self.tracer.stage.set(_moment(k, self.times))
             for c in left:
                 self._trace(c, k)
                 if progress is not None:
@@ -192,84 +274,97 @@ class _Recording:
 
     def _trace(self, camera, k):
         """Trace one frame: labels, features, image."""
-        import mitsuba as mi
-
-        image_path, label_path, feature_path = self.paths(camera, k)
-        c2w = self.poses[camera]
-        number = k * len(self.poses) + camera
-        labels, points, _ = self._visible_surfaces(camera)
-        feature = teacher.feature_map(
-            labels, points, self.play.classes, self.teacher_size, self.seed, number, self.play.confusions
-        )
-        sensor = scenes.sensor(self.K, self.width, self.height)
-        scenes.aim(sensor, c2w)
-        integrator = mi.load_dict({"type": "direct", "emitter_samples": _LIGHT_SAMPLES, "bsdf_samples": 1})
-        seed = self.seed * 65536 + camera
-        image = scenes.traced(self.stage.scene, sensor, integrator, self.spp, seed)
-        output.write_png(label_path, labels)
-        output.write_file(feature_path, teacher.tensor_bytes(feature))
-        image = scenes.encode_srgb(image * self.play.exposure)
-        output.write_png(image_path, image[..., ::-1])  # as BGR; last, since with it the frame is finished
-
-    def _visible_surfaces(self, camera):
-        """(labels, world points, depth) of the surfaces at a camera's pixel centers."""
-        c2w = self.poses[camera]
-        depth, numbers = scenes.first_hits(self.stage.scene, self.K, c2w, self.width, self.height)
-        return self.stage.table[numbers], back_project(self.K, c2w, depth), depth
+        self.tracer.trace(self.poses[camera], self.paths(camera, k), k * len(self.poses) + camera, camera)
 
     def finish(self):
         """Write what belongs to all frames; with poses_bounds.npy, the last file, the data set is complete."""
         import cv2
 
-        folder = self.folder
+        folder, tracer = self.folder, self.tracer
         first = []
-        vectors = teacher.embeddings(self.play.classes, self.seed, self.play.confusions)
-        np.save(folder / "text_embeddings.npy", vectors)
-        some = [(c, k) for k in range(0, self.times, 10) for c in range(len(self.poses))]
-        right = teacher.accuracy(((teacher.load(self.paths(*at)[2]), self._labels(*at)) for at in some), vectors)
-        self.stage.set(0.0)
+        some = [self.paths(c, k) for k in range(0, self.times, 10) for c in range(len(self.poses))]
+        tracer.finish(folder, [(features, labels) for _, labels, features in some], self.times)
+        tracer.stage.set(0.0)
         for c in range(len(self.poses)):
             image = cv2.imread(str(self.paths(c, 0)[0]))
             output.write_png(folder / "frame0" / "images" / f"{self.names[c]}.png", image)
-            labels, _, depth = self._visible_surfaces(c)
+            labels, _, depth = tracer.visible_surfaces(self.poses[c])
             first.append((image[..., ::-1].copy(), depth, labels))
         self._write_frame0(first)
         for name in self.names:
             frames = (cv2.imread(str(path)) for path in sorted((folder / "frames" / name).iterdir()))
             videos.write(folder / f"{name}.mp4", frames)
-        for name, content in (
-            ("classes", labelled.class_file(self.play.classes)),
-            ("moving_classes", self.play.moving),
-            ("teacher", {"pixel_accuracy": right, "views": len(some)}),
-        ):
-            (folder / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n")
-        if self.play.truth is not None:
-            moments = [k / max(self.times - 1, 1) for k in range(self.times)]
-            truth = {"frames": [{"time": moment, **self.play.truth(moment)} for moment in moments]}
-            (folder / "motion.json").write_text(json.dumps(truth, indent=1) + "\n")
         bounds = [(0.9 * depth.min(), 1.1 * depth.max()) for _, depth, _ in first]
-        rows = videos.llff_rows(self.K, self.poses, self.width, self.height, np.array(bounds))
+        rows = videos.llff_rows(tracer.K, self.poses, tracer.width, tracer.height, np.array(bounds))
         np.save(folder / "poses_bounds.part.npy", rows)
         (folder / "poses_bounds.part.npy").replace(folder / "poses_bounds.npy")
-
-    def _labels(self, camera, k):
-        import cv2
-
-        return cv2.imread(str(self.paths(camera, k)[1]), cv2.IMREAD_UNCHANGED)
 
     def _write_frame0(self, views):
         """Write the COLMAP model of frame 0 from each camera's (image, depth, labels); cam00 gives it no points."""
         rest = slice(1, None) if len(views) > 1 else slice(None)
-        points = sparse_points(self.K, self.poses[rest], views[rest].__getitem__, _POINTS, self.seed)
+        tracer = self.tracer
+        points = sparse_points(tracer.K, self.poses[rest], views[rest].__getitem__, _POINTS, tracer.seed)
         if len(views) > 1:
             tracks = [(np.zeros(0, int), np.zeros((0, 2))), *points.tracks]
             points = SparsePoints(points.xyz, points.exact, points.rgb, points.label, points.outlier, tracks)
         names = [f"{name}.png" for name in self.names]
         folder = self.folder / "frame0" / "sparse" / "0"
-        write_model(folder, self.K, self.poses, names, self.width, self.height, points)
+        write_model(folder, tracer.K, self.poses, names, tracer.width, tracer.height, points)
 
 
-def film(play, out_dir, values, teacher_size, progress=None) -> Path:
+class _Walk:
+    """Photographs of a play from free poses, each at one of the times: drawn, taken into a folder, and listed."""
+
+    def __init__(self, tracer, folder, views, times):
+        self.tracer = tracer
+        self.folder = folder
+        self.times = times
+        rng = np.random.default_rng([tracer.seed, 33])
+        self.at = rng.integers(times, size=views)
+        self.poses = np.zeros((views, 4, 4))
+        for k in np.unique(self.at):
+            now = np.flatnonzero(self.at == k)
+            tracer.stage.set(_moment(int(k), times))
+            self.poses[now] = free_poses(tracer.stage.scene, tracer.play.box, len(now), rng)
+        for name in ("images", "semantic_class", "rgb_feature_langseg"):
+            (folder / name).mkdir(parents=True, exist_ok=True)
+
+    def paths(self, view):
+        """(image, labels, features) of a photograph."""
+        return (
+            self.folder / "images" / f"rgb_{view:03d}.png",
+            self.folder / "semantic_class" / f"semantic_class_{view:03d}.png",
+            self.folder / "rgb_feature_langseg" / f"rgb_{view:03d}_fmap_CxHxW.pt",
+        )
+
+    def film(self, progress):
+        """Trace every photograph that is not finished, in the order of their times."""
+        for done, view in enumerate(np.argsort(self.at, kind="stable").tolist(), 1):
+            if not self.paths(view)[0].exists():
+                self.tracer.stage.set(_moment(int(self.at[view]), self.times))
+                self.tracer.trace(self.poses[view], self.paths(view), view, view)
+            if progress is not None:
+                progress(done, len(self.at))
+
+    def finish(self):
+        """Write what belongs to all photographs."""
+        tracer = self.tracer
+        every = [self.paths(view) for view in range(len(self.at))]
+        tracer.finish(self.folder, [(features, labels) for _, labels, features in every], self.times)
+        names = [f"images/{image.name}" for image, _, _ in every]
+        transforms = {
+            **scenes.pinhole_keys(tracer.K, tracer.width, tracer.height),
+            "test_filenames": names[::_TEST_EVERY],
+            "train_filenames": [name for k, name in enumerate(names) if k % _TEST_EVERY],
+            "frames": [
+                {"file_path": name, "time": _moment(int(k), self.times), "transform_matrix": scenes.opengl(c2w)}
+                for name, k, c2w in zip(names, self.at, self.poses, strict=True)
+            ],
+        }
+        (self.folder / "transforms.json").write_text(json.dumps(transforms, indent=1) + "\n")
+
+
+def film(play, out_dir, values, teacher_size, free=False, progress=None) -> Path:
     """Make the data set of a play, unless `out_dir` already holds it; an interrupted call is continued.
 
     Args:
@@ -279,6 +374,7 @@ def film(play, out_dir, values, teacher_size, progress=None) -> Path:
         values: Numbers of cameras, times, width and height (even, in pixels), spp (light paths a pixel) and seed (of
             things, motions, cameras, light paths, sparse points and the teacher's errors).
         teacher_size: (width, height) of the teacher's maps; smaller where the frames are.
+        free: Each camera takes one photograph at one of the times, from a free pose, in place of an arc of videos.
         progress: Function that is called with (frames done, frames) after each frame.
     Returns:
         `out_dir` as a Path.
@@ -292,11 +388,18 @@ def film(play, out_dir, values, teacher_size, progress=None) -> Path:
     if width % 2 or height % 2:
         raise ValueError(f"{where}: width and height must be even, as videos have them, got {width}x{height}; add 1")
     parameters = {"scene": play.name, "version": play.version, **numbers}
+    parameters |= {"free": True} if free else {}  # others keep the mark that they have had
 
     def fill(folder):
         size = min(teacher_size[0], width), min(teacher_size[1], height)
-        poses = play.arc(values["cameras"], values["seed"])
-        work = _Recording(play, folder, poses, values["times"], (width, height), size, values["spp"], values["seed"])
+        tracer = _Tracer(play, (width, height), size, values["spp"], values["seed"])
+        cameras, times = values["cameras"], values["times"]
+        if free:
+            walk = _Walk(tracer, folder, cameras, times)
+            walk.film(progress)
+            walk.finish()
+            return
+        work = _Recording(tracer, folder, play.arc(cameras, values["seed"]), times)
         if not (folder / "poses_bounds.npy").exists():
             work.film(progress)
             work.finish()

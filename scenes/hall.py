@@ -200,6 +200,7 @@ PLAY = Play(
     parts=parts,
     lights=_lights,
     arc=functools.partial(arc, target=(0.0, -0.35, 0.7), distance=2.9, spread=70.0, elevations=(14.0, 24.0)),
+    box=((-_SIDE, -3.0, 0.0), (_SIDE, 0.0, _HIGH)),
     fov_x=54.0,
     exposure=1.25,
     light_at=_light_at,
@@ -218,6 +219,7 @@ def generate(
     seed=0,
     teacher_width=40,
     teacher_height=30,
+    free=False,
     progress=None,
 ) -> Path:
     """Make the data set, unless `out_dir` already holds it; an interrupted call is continued.
@@ -230,6 +232,8 @@ def generate(
         spp: Light paths a pixel.
         seed: Seed of things, cameras, light paths, sparse points and the teacher's errors.
         teacher_width, teacher_height: Size of the teacher's maps; smaller where the frames are.
+        free: Each camera takes one photograph at one of the times, from a pose that is free then (`scenes.free_poses`),
+            in place of an arc of cameras that film at all times.
         progress: Function that is called with (frames done, frames) after each frame.
     Returns:
         `out_dir` as a Path.
@@ -237,4 +241,4 @@ def generate(
         ValueError: If a number is out of range or `out_dir` holds something else.
     """
     values = {"cameras": cameras, "times": times, "width": width, "height": height, "spp": spp, "seed": seed}
-    return film(PLAY, out_dir, values, (teacher_width, teacher_height), progress)
+    return film(PLAY, out_dir, values, (teacher_width, teacher_height), free, progress)

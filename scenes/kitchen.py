@@ -100,6 +100,7 @@ PLAY = Play(
     parts=parts,
     lights=_lights,
     arc=functools.partial(arc, target=(0.0, 0.05, 0.085), distance=1.08, spread=88.0, elevations=(20.0, 33.0)),
+    box=((-tabletop.SIDE, tabletop.WALL - 1.6, 0.0), (tabletop.SIDE, tabletop.WALL, 0.95)),
     fov_x=46.0,
     exposure=1.25,
 )
@@ -116,6 +117,7 @@ def generate(
     seed=0,
     teacher_width=60,
     teacher_height=45,
+    free=False,
     progress=None,
 ) -> Path:
     """Make the data set, unless `out_dir` already holds it; an interrupted call is continued.
@@ -133,6 +135,8 @@ def generate(
         spp: Light paths a pixel.
         seed: Seed of things, motions, cameras, light paths, sparse points and the teacher's errors.
         teacher_width, teacher_height: Size of the teacher's maps; smaller where the frames are.
+        free: Each camera takes one photograph at one of the times, from a pose that is free then (`scenes.free_poses`),
+            in place of an arc of cameras that film at all times.
         progress: Function that is called with (frames done, frames) after each frame.
     Returns:
         `out_dir` as a Path.
@@ -140,4 +144,4 @@ def generate(
         ValueError: If a number is out of range or `out_dir` holds something else.
     """
     values = {"cameras": cameras, "times": times, "width": width, "height": height, "spp": spp, "seed": seed}
-    return film(PLAY, out_dir, values, (teacher_width, teacher_height), progress)
+    return film(PLAY, out_dir, values, (teacher_width, teacher_height), free, progress)

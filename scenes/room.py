@@ -26,9 +26,10 @@ import numpy as np
 from drgs import scenes
 from drgs.scenes import fabrics, furniture, labelled, output, teacher
 from drgs.scenes.colmap import back_project, sparse_points, write_model
+from drgs.scenes.free_poses import CLEARANCE, distances, free_poses
 from drgs.scenes.furniture import MATTE, SATIN, moved, moved_parts, slab
 
-__all__ = ["CLASSES", "TEST_EVERY", "Layout", "free_poses", "generate", "parts", "scene", "trajectory"]
+__all__ = ["CLASSES", "TEST_EVERY", "Layout", "generate", "parts", "scene", "trajectory"]
 
 _VERSION = 1  # bump when a file changes: finished folders of another version are made again
 CLASSES = (
@@ -59,8 +60,6 @@ _FOV_X = 72.0  # degrees across the image width
 _CEILING = 0.4  # radiance of a white ceiling that glows: it stands for the light of many bounces
 _EXPOSURE = 1.8  # factor on radiance of the camera
 _MAX_DEPTH = 3  # vertices of a path after the camera
-_CLEARANCE = 0.35  # meters between a camera and the nearest surface, at least
-_NEAR = 0.2  # meters from what a camera of `free_poses` is in front of
 _POINTS = 8000  # sparse points that are drawn
 
 
@@ -77,6 +76,12 @@ class Layout:
         # Walls of the window and of the sofa; with the seed added, neighbors among the seeds are arranged differently.
         self.sunny = 2 + (int(rng.integers(2)) + seed) % 2
         self.cozy = (int(rng.integers(2)) + seed // 2) % 2
+
+    @property
+    def box(self):
+        """(2, 3) lowest and highest corner."""
+        x, y, z = self.size
+        return np.array([(-x / 2, -y / 2, 0), (x / 2, y / 2, z)])
 
     def at(self, wall, along, out=0.0, up=0.0):
         """(turn, shift) that put a piece's origin on a wall, `along` it to the right of who faces the room."""
@@ -193,66 +198,12 @@ def trajectory(layout, views, seed):
     return poses
 
 
-def free_poses(layout, built, views, seed):
-    """Camera-to-world matrices (views, 4, 4) as a robot may choose them: anywhere in free space, looking anywhere.
-
-    About a third are 20 cm in front of what is there, a wall, the ceiling, a window, a piece of furniture, and look at
-    it; the others are at least `_CLEARANCE` from everything and look in a direction that is uniform on the sphere, but
-    for 11 degrees around straight up and down.
-    """
-    rng = np.random.default_rng([seed, 9])
-    x, y, z = layout.size
-    low, high = np.array([-x / 2, -y / 2, 0]) + _CLEARANCE, np.array([x / 2, y / 2, z]) - _CLEARANCE
-    poses = []
-    while len(poses) < views:
-        eye, forward = rng.uniform(low, high), rng.normal(size=3)
-        forward /= np.linalg.norm(forward)
-        is_near = rng.uniform() < 1 / 3
-        if abs(forward[2]) > 0.98 or not _is_free(built, eye, _CLEARANCE):
-            continue
-        if is_near:
-            eye = eye + (_distances(built, eye, forward[None])[0][0] - _NEAR) * forward
-            if not _is_free(built, eye, _NEAR / 2):
-                continue
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = scenes.axes(forward), eye
-        poses.append(pose)
-    return np.stack(poses)
-
-
-def _distances(built, eye, ways):
-    """Of the first surfaces along unit vectors (K, 3) from a place: distances (K,), and whether their front is seen."""
-    import drjit as dr
-    import mitsuba as mi
-
-    x, y, z = np.ascontiguousarray(ways.T, np.float32)
-    origin = mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in eye))  # a literal is another kernel in each place
-    hit = built.ray_intersect(mi.Ray3f(origin, mi.Vector3f(mi.Float(x), mi.Float(y), mi.Float(z))))
-    return hit.t.numpy(), -(np.array(hit.n).T * ways).sum(1) > 0
-
-
-def _is_free(built, eye, clearance):
-    """Whether everything around a place is so many meters away, and it is not inside of anything."""
-    distance, is_front = _distances(built, eye, _around())
-    return distance.min() > clearance and is_front.mean() > 0.9
-
-
-def _around():
-    """400 unit vectors that are spread evenly."""
-    k = np.arange(400) + 0.5
-    z = 1 - 2 * k / 400
-    around = np.pi * (1 + 5**0.5) * k
-    level = np.sqrt(1 - z**2)
-    return np.stack([level * np.cos(around), level * np.sin(around), z], 1)
-
-
 def _clear(built, poses):
     """Poses whose cameras keep their distance from every surface: those too near go toward the middle."""
-    ways = _around()
     out = poses.copy()
     for pose in out:
         for _ in range(20):
-            if _distances(built, pose[:3, 3], ways)[0].min() > _CLEARANCE:
+            if distances(built, pose[:3, 3])[0].min() > CLEARANCE:
                 break
             pose[:2, 3] *= 0.85
         else:
@@ -364,7 +315,8 @@ def generate(
         teacher_width, teacher_height: Size of the teacher's maps; smaller where the images are.
         test_every: Distance of two test views among the views, counted from the first; they are drawn along the same
             way as the others. 3 gives 25 of 75.
-        free: Cameras anywhere in the room, looking anywhere (`free_poses`), in place of two rounds through its middle.
+        free: Cameras anywhere in the room, looking anywhere (`scenes.free_poses`), in place of two rounds through its
+            middle.
         progress: Function that is called with (views done, views) after each view.
     Returns:
         `out_dir` as a Path.
@@ -381,7 +333,10 @@ def generate(
     def fill(folder):
         built, table = scene(seed)
         layout = Layout(seed)
-        poses = free_poses(layout, built, views, seed) if free else _clear(built, trajectory(layout, views, seed))
+        if free:
+            poses = free_poses(built, layout.box, views, np.random.default_rng([seed, 9]))
+        else:
+            poses = _clear(built, trajectory(layout, views, seed))
         size = min(teacher_width, width), min(teacher_height, height)
         work = _Views(folder, (width, height), size, spp, seed)
         work.trace(built, table, poses, progress)

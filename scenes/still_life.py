@@ -22,6 +22,7 @@ import numpy as np
 from drgs import runtime, scenes
 from drgs.display.progress import Bar
 from drgs.scenes import box, grid, join, mix, noise, output, ramp, revolve, spline, tube, turned
+from drgs.scenes.free_poses import free_poses
 
 __all__ = ["generate", "main", "objects", "stone", "table", "wallpaper"]
 
@@ -30,6 +31,8 @@ _FOV_X = 50.0  # degrees across the image width
 _CENTER_SHIFT = (0.018, -0.014)  # principal point off the image center, in widths and heights
 _MAX_DEPTH = 4  # vertices of a path after the camera; a fifth would add 0.5 % of light
 _EXPOSURE = 0.85  # factor on radiance of the camera
+_RADIUS, _FLOOR, _HIGH = 1.9, -0.75, 1.25  # meters: the round room's radius, its floor, its walls' upper edge
+_BOX = (-_RADIUS, -_RADIUS, _FLOOR), (_RADIUS, _RADIUS, _HIGH)
 # meters; turn in degrees about z
 _BOOK = {"size": (0.20, 0.145, 0.034), "center": (0.225, -0.10, 0.045), "turn": -24.0}
 
@@ -183,10 +186,10 @@ def stone(rng, size=1024, tiles=14):
 # -------------------------------------------------------------------------------- objects
 def _room(rng):
     """Yield the arguments of `scenes.shape` for what stands around."""
-    mesh = list(revolve(np.array([[1.9, 1.25], [1.9, -0.75]]), segments=128))
+    mesh = list(revolve(np.array([[_RADIUS, _HIGH], [_RADIUS, _FLOOR]]), segments=128))
     mesh[2] = mesh[2] * (1, -1) + (0, 1)  # its profile runs downward because it is seen from inside
     yield "wall", mesh, _MATTE, wallpaper(rng)
-    plane = np.stack(np.meshgrid((-1.95, 1.95), (-1.95, 1.95), -0.75), -1)[:, :, 0]
+    plane = np.stack(np.meshgrid((-1.95, 1.95), (-1.95, 1.95), _FLOOR), -1)[:, :, 0]
     yield "floor", grid(plane), _MATTE, stone(rng)
     yield from table(rng)
 
@@ -343,7 +346,7 @@ def _intrinsics(width, height):
 
 
 # ------------------------------------------------------------------------------- data set
-def generate(out_dir, views=32, width=320, height=240, spp=30, seed=0, progress=None) -> Path:
+def generate(out_dir, views=32, width=320, height=240, spp=30, seed=0, free=False, progress=None) -> Path:
     """Make the data set, unless `out_dir` already holds it.
 
     Noise of a pixel at the defaults (standard deviation of the sRGB value in [0, 1], six views, two
@@ -353,10 +356,11 @@ def generate(out_dir, views=32, width=320, height=240, spp=30, seed=0, progress=
     Args:
         out_dir: Folder to make. It appears when it is complete. One made here with other
             parameters is replaced; anything else that is not empty is refused.
-        views: Number of cameras on the dome.
+        views: Number of cameras.
         width, height: Image size in pixels.
         spp: Light paths a pixel.
         seed: Seed of the textures, shapes, poses and light paths.
+        free: Cameras anywhere in the room, looking anywhere (`scenes.free_poses`), in place of a dome.
         progress: Function that is called with (views done, views) after each view.
     Returns:
         `out_dir` as a Path.
@@ -367,12 +371,17 @@ def generate(out_dir, views=32, width=320, height=240, spp=30, seed=0, progress=
     values = {"views": views, "width": width, "height": height, "spp": spp, "seed": seed}
     output.check_numbers(values, where)
     parameters = {"scene": "still_life", "version": _VERSION, **values}
+    parameters |= {"free": True} if free else {}  # others keep the mark that they have had
 
     def fill(folder):
-        poses = scenes.dome(views, seed, (0, -0.02, 0.14), 1.10, 200.0, (15.0, 30.0, 47.0))
+        built = _scene(seed)
+        if free:
+            poses = free_poses(built, _BOX, views, np.random.default_rng([seed, 9]))
+        else:
+            poses = scenes.dome(views, seed, (0, -0.02, 0.14), 1.10, 200.0, (15.0, 30.0, 47.0))
         cameras = _intrinsics(width, height), poses, width, height
         settings = {"spp": spp, "max_depth": _MAX_DEPTH, "exposure": _EXPOSURE, "seed": seed}
-        scenes.write_views(folder, _scene(seed), *cameras, **settings, progress=progress)
+        scenes.write_views(folder, built, *cameras, **settings, progress=progress)
 
     return output.publish(Path(out_dir), parameters, fill, where)
 

@@ -11,11 +11,11 @@ from drgs.scenes import fabrics, grid, join, mix, noise, ramp, revolve, spline, 
 from drgs.scenes.furniture import GLAZE, MATTE, METAL, SATIN, moved, moved_parts, slab
 from drgs.scenes.moving import LEMON
 
-__all__ = ["WALL", "board", "bottle", "bowl", "canister", "herbs", "lemon", "plate", "rail", "shell"]
+__all__ = ["SIDE", "WALL", "board", "bottle", "bowl", "canister", "herbs", "lemon", "plate", "rail", "shell"]
 
 WALL = 0.40  # y of the tiles
 RAIL = 0.335  # height of the rail
-_SIDE = 1.5  # x of the side walls
+SIDE = 1.5  # x of the side walls
 _TILES = (
     ((214, 222, 218), (64, 112, 148)),
     ((226, 214, 190), (170, 84, 58)),
@@ -34,14 +34,14 @@ def shell(rng, style):
     """Worktop, tiled wall and side walls; `style` chooses among the pictures."""
     kind, colors = _WORKTOPS[style % len(_WORKTOPS)]
     paint = fabrics.planks(rng, colors).transpose(1, 0, 2) if kind == "wood" else _stone(rng, colors)
-    yield "worktop", slab((2 * _SIDE, 1.05, 0.05), (0, WALL - 0.525, -0.025), 0.9), SATIN, paint
+    yield "worktop", slab((2 * SIDE, 1.05, 0.05), (0, WALL - 0.525, -0.025), 0.9), SATIN, paint
     base, accent = _TILES[(style // 2 + style) % len(_TILES)]
-    x, z = np.meshgrid((_SIDE, -_SIDE), (0.0, 0.9))
+    x, z = np.meshgrid((SIDE, -SIDE), (0.0, 0.9))
     sheet = grid(np.stack([-x, 0 * x + WALL, z], -1))
     yield "wall", sheet, SATIN, _tiles(rng, base, accent)
     plain = fabrics.plaster(rng, 0.92 * np.asarray(base), "plain")
     for side in (-1, 1):
-        yield "wall", slab((0.05, 1.6, 1.0), (side * (_SIDE + 0.025), WALL - 0.8, 0.45), 1.0), MATTE, plain
+        yield "wall", slab((0.05, 1.6, 1.0), (side * (SIDE + 0.025), WALL - 0.8, 0.45), 1.0), MATTE, plain
 
 
 def _stone(rng, colors, size=768):

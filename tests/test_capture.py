@@ -44,7 +44,7 @@ def truth_of(folder):
 
 def test_files_are_what_the_page_says(made):
     """params.json and truth.json have the fields of docs/run-files.md, and no others."""
-    others = ("cameras", "times", "test_every", "depth_unit", "teacher_width", "teacher_height")
+    others = ("cameras", "times", "test_every", "free", "depth_unit", "teacher_width", "teacher_height")
     check("params.json", json.loads((made / "params.json").read_text()), absent=others)
     check("truth.json", truth_of(made), maps=("log_gains", "shadow", "passer_by", "camera_to_world"))
 

@@ -94,7 +94,7 @@ def test_files(made):
         "params.json", "poses_bounds.npy", "rgb_feature_langseg", "semantic_class", "teacher.json",
         "text_embeddings.npy",
     }  # fmt: skip
-    absent = ("depth_unit", "test_every", "views", *OF_CAPTURE)
+    absent = ("depth_unit", "test_every", "views", "free", *OF_CAPTURE)
     check("params.json", json.loads((made / "params.json").read_text()), absent=absent)
     assert not [path for path in made.rglob("*") if ".part" in path.name]
     maps = sorted(path.name for path in (made / "rgb_feature_langseg").iterdir())

@@ -321,6 +321,7 @@ def test_bad_input(tmp_path, capsys):
         ("still_life --no-shadow", "--no-shadow: is for `drgs scene capture`, not for still_life"),
         ("still_life --teacher-size 8x8", "is for `drgs scene room`"),
         ("still_life --test-every 3", "is for `drgs scene room`"),
+        ("capture --free", "and `drgs scene hall`, not for capture; leave it out"),
         ("bathroom", "NAME must be one of room"),
     ],
 )

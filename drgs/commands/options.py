@@ -845,8 +845,8 @@ class Scene(Common):
     test_every: int | None = option(None, "Hold out every n-th view (room); default 5, which is 15 of 75 views.")
     free: bool = option(
         False,
-        "Cameras anywhere in free space (room), looking anywhere, a third of them at a surface 20 cm away, in place of "
-        "a walk through its middle.",
+        "Cameras anywhere in free space, looking anywhere, a third of them at a surface 20 cm away (not of capture); "
+        "in kitchen and hall each takes one photograph, at one of the times.",
         heading="Views",
     )
     exposure: Literal["auto", "fixed"] | None = option(

@@ -21,7 +21,7 @@ _ONLY = {  # options that not every scene has
     "--times": ("kitchen", "hall"),
     "--teacher-size": ("room", "kitchen", "hall"),
     "--test-every": ("room",),
-    "--free": ("room",),
+    "--free": ("room", "still_life", "kitchen", "hall"),
     "--exposure": ("capture",),
     "--wall": ("capture",),
     "--no-shadow": ("capture",),
