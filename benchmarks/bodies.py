@@ -3,7 +3,7 @@
     python benchmarks/bodies.py [NAME ...] [--page] [--pictures FOLDER]
 
 Appends one row a scene, background, seed and kind of fit to benchmarks/bodies.jsonl as it ends, leaves out what is
-there, then writes the table of docs/dynamic-data.md (what is before white) and docs/data/moving-bodies.csv (every fit).
+there, then writes docs/data/moving-bodies.csv (every fit) and a paragraph of docs/dynamic-data.md (those before white).
 Scenes are those of the folder `bodies`: the layout of D-NeRF, masks of instances beside the photographs. PSNR is also
 that of the pixels of bodies that move alone, and their masks are compared with what is rendered as moving: where
 Gaussians that the field moves or that are there for a time make up more than half of a pixel. Pixels outside the masks
@@ -43,7 +43,7 @@ from drgs.fitting.frames import Frame, load_frames  # noqa: E402
 from drgs.fitting.metrics import psnr  # noqa: E402
 from drgs.fitting.records import load_run  # noqa: E402
 from drgs.integrator import render  # noqa: E402
-from drgs.studies.tables import markdown_table  # noqa: E402
+from drgs.studies.tables import paragraph  # noqa: E402
 from drgs.train import fit  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "bodies.jsonl"
@@ -114,28 +114,25 @@ def measured(scene: str, run: Path, ground: tuple[float, ...], pictures: Path | 
     return told
 
 
-def table(rows: list[dict]) -> str:
-    """A row a scene and kind of fit, before white: means over seeds and, of each number, the worst view of all."""
-    heads = ["scene", "`--lives`", "PSNR (worst view), dB", "moving pixels, dB", "overlap (worst view)"]
-    groups: dict[tuple, list[dict]] = {}
-    for row in rows:
-        if row["ground"] == "white":
-            groups.setdefault((SCENES.index(row["scene"]), row["lives"] != "off"), []).append(row)
-    lines = []
-    for _, group in sorted(groups.items()):
-        mean = {key: np.mean([row[key] for row in group]) for key in ("psnr", "psnr_moving", "overlap")}
-        worst = {key: min(row[f"worst_{key}"] for row in group) for key in ("psnr", "overlap")}
-        name = f"{group[0]['scene']}, {len(group)} seed{'s' if len(group) > 1 else ''}"
-        lines.append(
-            [
-                name,
-                group[0]["lives"],
-                f"{mean['psnr']:.1f} ({worst['psnr']:.1f})",
-                f"{mean['psnr_moving']:.1f}",
-                f"{mean['overlap']:.2f} ({worst['overlap']:.2f})",
-            ]
+def summary(rows: list[dict]) -> str:
+    """What docs/dynamic-data.md says, before white: means over seeds, the worst view of all, and both kinds of fit."""
+    told, overlaps = [], []
+    for scene in SCENES:
+        off, auto = (
+            [row for row in rows if (row["scene"], row["ground"], row["lives"]) == (scene, "white", lives)]
+            for lives in ("off", "auto")
         )
-    return markdown_table(heads, lines)
+        psnr, psnr_off = (np.mean([row["psnr_moving"] for row in kind]) for kind in (auto, off))
+        told.append(f"{psnr:.1f} ({psnr_off:.1f}) dB in `{scene}`")
+        overlap, worst = np.mean([row["overlap"] for row in auto]), min(row["worst_overlap"] for row in auto)
+        overlaps.append(f"{overlap:.2f} ({worst:.2f})")
+    fits = [row for row in rows if row["ground"] == "white" and row["lives"] == "auto"]
+    return paragraph(
+        f"Bodies of a physics simulator, photographed by one of 12 cameras at each time, have {told[0]}, {told[1]} and "
+        f"{told[2]} (in parentheses with `--lives off`); what is rendered as moving overlaps with their masks by "
+        f"{overlaps[0]}, {overlaps[1]} and {overlaps[2]} (in the worst view), as means of {len(fits)} fits "
+        f"(`python benchmarks/bodies.py`, {fits[-1]['machine']}, {fits[-1]['date']}; [each](data/moving-bodies.csv))."
+    )
 
 
 def csv_lines(rows: list[dict]) -> Iterator[list[str]]:
@@ -184,7 +181,7 @@ def main() -> None:
                 print({k: x for k, x in row.items() if k != "views"}, flush=True)
     rows = read_rows(ROWS)
     write_csv(CSV, csv_lines(rows))
-    fill_between(PAGE, "bodies", table(rows))
+    fill_between(PAGE, "bodies", summary(rows))
 
 
 if __name__ == "__main__":

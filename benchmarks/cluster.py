@@ -167,10 +167,9 @@ def report(r: dict) -> str:
     seconds = ", ".join(f"{row['seconds']:.1f} s with {row['workers']}" for row in others)
     same = all(row["same_bits"] for row in others)
     return paragraph(
-        f"A pick among {r['candidates']} candidates with {r['known']} training views, {r['size'][0]}x{r['size'][1]}, "
-        f"of {r['gaussians']:,} Gaussians by `v_opt` takes {alone['seconds']:.1f} s without workers, {seconds}, with "
-        f"{'the same' if same else '**other**'} bits ([all numbers](data/cluster.csv); `python benchmarks/cluster.py`, "
-        f"{where['machine']}, {where['date']}, commit {where['commit']})."
+        f"A pick among {r['candidates']} candidates, {r['size'][0]}x{r['size'][1]}, of {r['gaussians']:,} Gaussians "
+        f"takes {alone['seconds']:.1f} s without workers, {seconds}, with {'the same' if same else '**other**'} bits "
+        f"([all numbers](data/cluster.csv); `python benchmarks/cluster.py`, {where['machine']}, {where['date']})."
     )
 
 

@@ -39,7 +39,6 @@ from drgs.tracing.tiles import TileTraversal  # noqa: E402
 
 Preset = drgs.RenderSettings.preset
 WIDTHS = (3, 16, 32, 64, 128, 512)
-SHOWN = (3, 16, 128, 512)  # on the page; features.json has all
 PAGE = ROOT / "docs" / "semantic.md"
 RESULTS = ROOT / "benchmarks" / "features.json"
 
@@ -142,30 +141,16 @@ def growth(rows: list[dict], way: str) -> dict:
 
 
 def report(result: dict) -> str:
-    """The table and what it says."""
-    told = f"""`python benchmarks/features.py`, {result["machine"]}, {result["date"]}, commit {result["commit"]}:
-        {result["gaussians"]:,} Gaussians, 320x240, forward and backward, over the time of the colors alone (medians of
-        {result["turns"]} interleaved turns, {result["clock"]} time)."""
-    lines = [
-        paragraph(" ".join(told.split())),
-        "",
-        "| preset | channels | not coupled | coupled | coupled, by traversals |",
-        "|---|---|---|---|---|",
-    ]
-    for row in (row for row in result["rows"] if row["width"] in SHOWN):
-        r = row["ratios"]
-        old = f"{r['traversals']:.1f}x" if "traversals" in r else ""
-        cells = f"{r['not coupled']:.2f}x | {r['coupled']:.2f}x | {old}"
-        lines.append(f"| `{row['preset']}` | {row['width']} | {cells} |")
-    lines.append("")
-    costs = " and ".join(
-        f"{fit['at 0']:.1f} + {fit['per 100']:.2f} per 100 channels ({way}; within {100 * fit['error']:.0f} %)"
-        for way, fit in result["growth"].items()
+    """What docs/semantic.md says."""
+    times = {}
+    for preset in ("fast", "exact"):
+        ratios = next(x["ratios"] for x in result["rows"] if (x["preset"], x["width"]) == (preset, 128))
+        times[preset] = f"{ratios['not coupled']:.1f} times ({ratios['coupled']:.1f} coupled)"
+    return paragraph(
+        f"A frame with 128 channels and its gradients takes {times['fast']} as long as with colors alone by `fast`, "
+        f"{times['exact']} by `exact` ([other widths, and memory](../benchmarks/features.json); `python "
+        f"benchmarks/features.py`, {result['machine']}, {result['date']})."
     )
-    told = f"""`fast` costs {costs}, times the colors. Other widths and what weights take are in
-        [features.json](../benchmarks/features.json), and so is memory."""
-    lines.append(paragraph(" ".join(told.split())))
-    return "\n".join(lines)
 
 
 def main():

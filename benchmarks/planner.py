@@ -181,15 +181,14 @@ def summary(rows: list[dict]) -> str:
         told = {
             head: f"{min(cells, key=float)} to {max(cells, key=float)}"
             for head, cells in zip(heads, columns, strict=True)
-            if head.endswith("_median") or head == "computed"
+            if head.endswith("_median")
         }
         parts.append(
             paragraph(
-                f"`{name}`: {len(frames)} photographs, {last['gaussians']:,} Gaussians, {last['machine']}, "
-                f"{last['date']}, commit {last['commit'][:7]}. From photograph {WINDOW + 1} on, as medians of "
-                f"hundreds, `observe` takes {told['observe_median']} s, `scores` {told['scores_median']} s and `next` "
-                f"{told['next_median']} s; `scores` computes {told['computed']} views on average; the process has "
-                f"held {last['memory'] / 1e9:.2f} GB at most ([by hundreds](data/planner.csv))."
+                f"From photograph {WINDOW + 1} to {len(frames)} of `{name}` ({last['gaussians']:,} Gaussians), as "
+                f"medians of hundreds, `observe` takes {told['observe_median']} s, `scores` {told['scores_median']} s "
+                f"and `next` {told['next_median']} s; the process has held {last['memory'] / 1e9:.2f} GB at most ([by "
+                f"hundreds](data/planner.csv); {last['machine']}, {last['date']})."
             )
         )
     return "\n\n".join(parts)

@@ -98,10 +98,9 @@ def summary(lines: list[list[str]]) -> str:
     )
     few, many = (f"{end(map(int, columns['gaussians'])):,}" for end in (min, max))
     return paragraph(
-        f"In {len(runs)} runs of {few} to {many} Gaussians the PSNR of a screenshot in headless Chromium (WebGL in "
-        f"software) against `drgs.render`, preset `gsplat`, of the run's Gaussians is {page}. For packing as SOG alone "
-        f"it is {archive}; of the screenshot against preset `gsplat` of the packed Gaussians {rules} ([each "
-        f"run](data/share.csv))."
+        f"In {len(runs)} runs of {few} to {many} Gaussians a screenshot in Chromium has a PSNR of {page} against `drgs "
+        f"render --preset gsplat` of the run; the packed Gaussians alone have {archive}, and a screenshot against them "
+        f"{rules} ([each run](data/share.csv); `python benchmarks/share.py RUN...`)."
     )
 
 

@@ -247,11 +247,11 @@ def page() -> list[str]:
     found = {(r["renderer"], r["gaussians"], r["kind"]): r for r in rows if "kind" in r}
     columns = list(dict.fromkeys((r["gaussians"], tuple(r["size"])) for r in rows if "kind" in r))
     kinds = {"forward": "forward", "step": "with gradient", "diagonal": "Fisher diagonal"}
-    named = [f"{name}, {count:,} at {width}x{height}" for count, (width, height) in columns for name in kinds.values()]
-    made = ["| ms | " + " | ".join(named) + " |", "|---|" + "---|" * len(named)]
+    named = [f"{count:,} Gaussians, {width}x{height}" for count, (width, height) in columns]
+    made = ["| " + " | ".join(["ms: " + ", ".join(kinds.values()), *named]) + " |", "|---|" + "---|" * len(named)]
     for renderer in dict.fromkeys(name for name, *_ in found):
-        own = [found.get((renderer, count, kind)) for count, _ in columns for kind in kinds]
-        cells = [f"{1e3 * r['median']:.1f}" if r else "" for r in own]
+        own = [[found.get((renderer, count, kind)) for kind in kinds] for count, _ in columns]
+        cells = [", ".join(f"{1e3 * r['median']:.1f}" for r in rows if r) for rows in own]
         label = renderer if "kernels" in renderer else f"`{renderer}`"
         made.append(f"| {label} | " + " | ".join(cells) + " |")
     return made
