@@ -474,13 +474,13 @@ def summary() -> str:
     wrongly = ", ".join(
         f"`{name}` on {scene}" for name, _, scene in (k.partition(" ") for k in wrong if not wrong[k]["right"])
     )
-    defects, paths = len(torch_rasterizer.DEFECTS) + len(torch_rays.DEFECTS), len(torch_rasterizer.PATH_DEFECTS) + 1
+    defects, rays = len(torch_rasterizer.DEFECTS), len(torch_rays.DEFECTS)
     return paragraph(
-        f"Of verdicts on correct rasterizers and five real scenes {agreed(correct, posed)} are right "
-        f"([all](data/crossval-correct.csv)); gradients differ by {largest:.0e} at most. Of those on two correct "
-        f"rasterizers and their {defects} broken copies {judged(wrong, along)} are right; wrong is {wrongly} ([by "
-        f"scene](data/crossval-broken.csv), [along rays](data/crossval-rays.csv)). Of those on {paths} copies that are "
-        f"broken on one [path](#paths), and right ones, {judged(other)} are right ([all](data/crossval-paths.csv))."
+        f"Of verdicts on [correct rasterizers](data/crossval-correct.csv) and five real scenes "
+        f"{agreed(correct, posed)} are right, with gradients that differ by {largest:.0e} at most; on two correct ones "
+        f"and their [{defects}](data/crossval-broken.csv) and, along rays, [{rays}](data/crossval-rays.csv) broken "
+        f"copies {judged(wrong, along)} (wrong is {wrongly}); on [copies that are broken on one "
+        f"path](data/crossval-paths.csv) {judged(other)}."
     )
 
 
