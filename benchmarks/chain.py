@@ -99,15 +99,11 @@ def text(result: dict) -> str:
     told = []
     for form in FORMS:
         own = [x for (_, _, name), x in found.items() if name == form]
-        ratios, means = [x["ratio_median"] for x in own], [100 * x["regret"] for x in own]
-        worst = 100 * max(x["worst_regret"] for x in own)
-        told.append(
-            f"`{form}` {min(ratios):.2g} to {max(ratios):.2g}, {min(means):.1f} to {max(means):.1f} % ({worst:.0f} %)"
-        )
+        means, worst = [100 * x["regret"] for x in own], 100 * max(x["worst_regret"] for x in own)
+        told.append(f"`{form}` {min(means):.1f} to {max(means):.1f} % ({worst:.0f} %)")
     return paragraph(
-        f"Median ratio to the mutual information, mean regret and the worst one: {'; '.join(told)} ([each "
-        f"case](data/criteria.csv); `python benchmarks/chain.py`, {result['machine']}, {result['date']}, commit "
-        f"{result['commit']})."
+        f"Mean regret (and the worst one): {', '.join(told)} ([each case](data/criteria.csv); "
+        f"`python benchmarks/chain.py`, {result['machine']}, {result['date']}, commit {result['commit']})."
     )
 
 

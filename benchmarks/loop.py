@@ -81,15 +81,15 @@ class Robot:
 def report(r: dict) -> str:
     """What docs/information.md says."""
     told = [
-        f"{PICKS} picks on `wolf` ({r['gaussians']:,} Gaussians) at {r['size']}, {KNOWN} training views and "
-        f"{CANDIDATES} candidates at first, {NEW} more with each pick, CPU time without and with a cache:"
+        f"{PICKS} picks on `wolf` ({r['gaussians']:,} Gaussians, {r['size']}), {CANDIDATES} candidates and {NEW} more "
+        "after each pick, CPU time without and with a cache:"
     ]
     for preset, row in r["rows"].items():
         (all_a, all_b), (one_a, one_b) = row["all"], row["later"]
-        told.append(f"`{preset}` {all_a:.0f} and {all_b:.0f} s, a later pick {one_a:.1f} and {one_b:.1f} s;")
+        told.append(f"`{preset}` {all_a:.0f} and {all_b:.0f} s (a later pick {one_a:.1f} and {one_b:.1f} s);")
     told.append(
-        f"the picks are the same, {r['bytes'] / 1e6:.0f} MB were kept (`python benchmarks/loop.py`, {r['machine']}, "
-        f"{r['date']}, commit {r['commit']})."
+        f"the picks are the same, the cache holds {r['bytes'] / 1e6:.0f} MB (`python benchmarks/loop.py`, "
+        f"{r['machine']}, {r['date']}, commit {r['commit']})."
     )
     return paragraph(" ".join(told))
 

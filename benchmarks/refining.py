@@ -84,13 +84,13 @@ def report(rows: list[dict]) -> str:
         seconds = np.mean([row["seconds"] for row in own])
         gained = f", {np.mean(gains):.2f} ({min(gains):.2f} to {max(gains):.2f})" if way != str(START) else ""
         tried = way.partition(" + ")
-        what = f"{tried[0]} candidates" + (f" and {tried[2]} views tried by moving" if tried[2] else "")
-        told.append(f"{what}: {seconds:.1f} s{gained}")
+        what = f"{tried[0]} candidates" + (f" and {tried[2]} moves" if tried[2] else "")
+        told.append(f"{what} {seconds:.1f} s{gained}")
     names = ", ".join(f"`{run}`" for run in runs)
     return paragraph(
-        f"CPU time, and the pick's score over that of {START} candidates, on average over {names} (least to most): "
-        f"{'; '.join(told)}. {PIXELS:,} pixels a view (`python benchmarks/refining.py`, "
-        f"{rows[-1]['machine']}, {rows[-1]['date']}, commit {rows[-1]['commit']})."
+        f"CPU time of a pick, and its score relative to {START} candidates (range over {names}): {'; '.join(told)} "
+        f"({PIXELS:,} pixels a view; `python benchmarks/refining.py`, {rows[-1]['machine']}, {rows[-1]['date']}, "
+        f"commit {rows[-1]['commit']})."
     )
 
 
