@@ -35,7 +35,8 @@ def site(tmp_path_factory) -> Path:
     for block in blocks(PAGE):
         if found := re.match(r"# (my_package/\w+\.py)\n", block.text):
             (folder / found[1]).write_text(block.text)
-    shutil.copy(ROOT / "examples/vignette.py", package)
+    for name in ("lines_loader", "rows_codec", "vignette"):
+        shutil.copy(ROOT / f"examples/{name}.py", package)
     name, version = project["project"]["name"], project["project"]["version"]
     info = folder / f"{name.replace('-', '_')}-{version}.dist-info"
     info.mkdir()
@@ -96,6 +97,17 @@ def test_a_policy_and_a_criterion_by_name(site, folder):
     scores = [x["score"] for x in json.loads((folder / "out/doubled.json").read_text())["picks"]]
     assert all(score == round(score) for score in scores)
     assert scores[0] > 0
+
+
+def test_a_data_set_in_a_script(folder, monkeypatch):
+    """The loader's views, by a row of the table; it gets the option that it has a parameter for."""
+    from examples.lines_loader import LINES
+
+    monkeypatch.setattr(drgs.data.LOADERS, "_rows", {**drgs.data.LOADERS._rows, "lines": LINES})
+    dataset = drgs.load_data(folder / "lines", background=(1.0, 1.0, 1.0))
+    assert [view.name for view in dataset.views] == [str(k) for k in range(6)]
+    assert dataset.views[0].background == (1.0, 1.0, 1.0)
+    assert dataset.views[0].image().shape == (24, 32, 3)
 
 
 @pytest.mark.slow
