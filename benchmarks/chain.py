@@ -103,7 +103,7 @@ def text(result: dict) -> str:
         told.append(f"`{form}` {min(means):.1f} to {max(means):.1f} % ({worst:.0f} %)")
     return paragraph(
         f"Mean regret (and the worst one): {', '.join(told)} ([each case](data/criteria.csv); "
-        f"`python benchmarks/chain.py`, {result['machine']}, {result['date']}, commit {result['commit']})."
+        f"`python benchmarks/chain.py`, {result['machine']}, {result['date']})."
     )
 
 

@@ -80,18 +80,15 @@ class Robot:
 
 def report(r: dict) -> str:
     """What docs/information.md says."""
-    told = [
-        f"{PICKS} picks on `wolf` ({r['gaussians']:,} Gaussians, {r['size']}), {CANDIDATES} candidates and {NEW} more "
-        "after each pick, CPU time without and with a cache:"
-    ]
+    told = []
     for preset, row in r["rows"].items():
-        (all_a, all_b), (one_a, one_b) = row["all"], row["later"]
-        told.append(f"`{preset}` {all_a:.0f} and {all_b:.0f} s (a later pick {one_a:.1f} and {one_b:.1f} s);")
-    told.append(
-        f"the picks are the same, the cache holds {r['bytes'] / 1e6:.0f} MB (`python benchmarks/loop.py`, "
-        f"{r['machine']}, {r['date']}, commit {r['commit']})."
+        without, cached = row["later"]
+        told.append(f"{cached:.1f} s in place of {without:.1f} (`{preset}`)")
+    return paragraph(
+        f"On `wolf` ({r['gaussians']:,} Gaussians, {r['size']}, {CANDIDATES} candidates or more) a later pick takes "
+        f"{', '.join(told)} of CPU time and is the same; {r['bytes'] / 1e6:.0f} MB are kept "
+        f"(`python benchmarks/loop.py`, {r['machine']}, {r['date']})."
     )
-    return paragraph(" ".join(told))
 
 
 def main() -> None:

@@ -89,8 +89,7 @@ def report(rows: list[dict]) -> str:
     names = ", ".join(f"`{run}`" for run in runs)
     return paragraph(
         f"CPU time of a pick, and its score relative to {START} candidates (range over {names}): {'; '.join(told)} "
-        f"({PIXELS:,} pixels a view; `python benchmarks/refining.py`, {rows[-1]['machine']}, {rows[-1]['date']}, "
-        f"commit {rows[-1]['commit']})."
+        f"(`python benchmarks/refining.py`, {PIXELS:,} pixels a view, {rows[-1]['machine']}, {rows[-1]['date']})."
     )
 
 

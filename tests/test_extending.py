@@ -35,7 +35,7 @@ def site(tmp_path_factory) -> Path:
     for block in blocks(PAGE):
         if found := re.match(r"# (my_package/\w+\.py)\n", block.text):
             (folder / found[1]).write_text(block.text)
-    for name in ("lines_loader", "rows_codec", "vignette"):
+    for name in ("brightness_block", "lines_loader", "narrow_response", "rows_codec", "vignette"):
         shutil.copy(ROOT / f"examples/{name}.py", package)
     name, version = project["project"]["name"], project["project"]["version"]
     info = folder / f"{name.replace('-', '_')}-{version}.dist-info"
