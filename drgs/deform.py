@@ -246,6 +246,11 @@ def _deltas(weights: Mapping[str, torch.Tensor], features: torch.Tensor) -> Delt
 class DynamicGaussians:
     """Canonical Gaussians, and the field that moves some of them: a `DeformableScene`.
 
+        sizes = drgs.deform.FieldConfig.preset("neu3d")
+        field = drgs.DeformationField(sizes, bounds=[[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]], span=(0.0, 1.0))
+        moving = drgs.DynamicGaussians(g, field)
+        drgs.render(moving, dataclasses.replace(camera, time=0.5)).rgb
+
     A Gaussian's gate is sigmoid(motion). From 0.5 on it moves, by 2 gate - 1 times the field's deltas: continuously,
     and at most as far as the field says. Below, it is still, and nothing is computed for it.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import inspect
 import re
@@ -84,7 +85,8 @@ def test_examples_of_docstrings_run(folder, tmp_path, monkeypatch):
     g = drgs.load_ply("point_cloud.ply")
     cameras = orbit((0, 0, 0), 3.0, 5, width=32, height=24, up=(0, -1, 0))
     known = {
-        **{"drgs": drgs, "torch": torch, "camera": cameras[0], "cameras": cameras, "width": 32, "height": 24},
+        **{"drgs": drgs, "torch": torch, "dataclasses": dataclasses},
+        **{"camera": cameras[0], "cameras": cameras, "width": 32, "height": 24},
         **{"means": g.means, "quats": g.quats, "scales": g.log_scales.exp(), "sh": g.sh},
         **{"opacities": g.logit_opacities.sigmoid(), "rgb": torch.rand(len(g), 3), "photograph": torch.rand(24, 32, 3)},
         "photographs": [torch.rand(24, 32, 3)] * 5,
