@@ -103,10 +103,9 @@ def section(rows: Rows) -> str:
     detectable = [one.detectable for one in whole if one.detectable is not None]
     commits = ", ".join(sorted({row["commit"] for row in rows}))
     head = (
-        f"Named before any fit ran, with so many starts: {each}; `bonsai` is every fourth photograph. {len(rows)} fits "
-        f"by `drgs reproduce captures --protocol blind`, commits {commits} ([rows](../benchmarks/captures.jsonl), [by "
-        f"fit](data/captures.csv)). PSNR of the default less that of others, in dB; first the average over "
-        f"{len(view_counts(rows))} numbers of views. "
+        f"PSNR of the default less that of others, in dB; first the average over {len(view_counts(rows))} numbers of "
+        f"views. {len(rows)} fits by `drgs reproduce captures --protocol blind`, commits {commits} "
+        f"([rows](../benchmarks/captures.jsonl), [by fit](data/captures.csv)); starts, named before any fit ran: {each}. "
         f"{coverage(len(counts), len(units)):.0%} of such intervals hold the true mean; {min(detectable):.1f} to "
         f"{max(detectable):.1f} dB could be seen."
     )
@@ -122,8 +121,8 @@ def section(rows: Rows) -> str:
     heads = ["against", "starts", "3 to 20 views", *(f"{count} views" for count in SHOWN)]
     tail = (
         f"`{LEFT}`, least sharp rendering, left the race {left.mean:.2f} dB behind [{left.low:.2f}, {left.high:.2f}]. "
-        "Fits are of `fast` alone; `gsplat` shows those of `watch` 7 to 9 dB worse. [What POp-GS and FisherRF report "
-        "for ten views](data/captures-outside.csv) is of other steps, sizes and scenes."
+        "Fits are for `fast` alone; `gsplat` shows those of `watch` 7 to 9 dB worse. What POp-GS and FisherRF report "
+        "for ten views is of other steps, sizes and scenes ([beside ours](data/captures-outside.csv))."
     )
     return "\n\n".join([textwrap.fill(head, 120), markdown_table(heads, lines), textwrap.fill(tail, 120)])
 
@@ -134,10 +133,8 @@ def free_section(rows: Rows) -> str:
     units = sorted({unit_of(row) for row in rows})
     rooms, commits = (", ".join(sorted({row[key] for row in rows})) for key in ("scene", "commit"))
     head = (
-        "Three rooms with two starts each, named before any fit ran; "
-        f"{len(rows)} fits, {len(units)} starts of {rooms}, commit {commits} "
-        "([rows](../benchmarks/free_poses.jsonl)), in the same way. PSNR of the default less that of others, in dB; "
-        f"first the average over {len(view_counts(rows))} numbers of views."
+        f"Three rooms ({rooms}) with two starts each, named before any fit ran; {len(rows)} fits, {len(units)} starts, "
+        f"commit {commits} ([rows](../benchmarks/free_poses.jsonl)), measured and compared as on captures."
     )
     lines = [
         [f"`{other}`", str(len(differences(over, "psnr", DEFAULT, other))), compared(over, other)]

@@ -1,4 +1,4 @@
-"""Two tables of docs/next-views.md, of the rows of the studies: benchmarks/static.jsonl and benchmarks/dynamic.jsonl.
+"""A table of docs/next-views.md and two data files, of the rows of the studies: benchmarks/static.jsonl, dynamic.jsonl.
 
     python benchmarks/results.py        runs nothing
 
@@ -20,14 +20,11 @@ from drgs.studies.cells import Study
 from drgs.studies.experiments import EXPERIMENTS, Experiment, study_of
 from drgs.studies.results import results_rows
 from drgs.studies.rows import read_study
-from drgs.studies.statistics import differences, estimate
 from drgs.studies.tables import markdown_table
 
 PAGE = ROOT / "docs" / "next-views.md"
 TABLES = ("static", "dynamic", "prior", "blocks")
-"""Experiments of the data files."""
-SHOWN = TABLES[:2]
-"""Those of the page, and its parts."""
+"""Experiments of the data files; the first has a table on the page."""
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -41,43 +38,15 @@ def cells(name: str) -> tuple[Study, Experiment, Rows]:
     return study, experiment, mine
 
 
-def table(name: str) -> str:
-    """Means by protocol `blind`, and the paper's PSNR; of `static` also ours by protocol `paper`, of the others PSNR
-    less that of the reference and seconds of a pick.
-    """
-    study, experiment, rows = cells(name)
-    blind = [row for row in rows if row["protocol"] == "blind"]
-    found = {(line["protocol"], line["policy"]): line for line in results_rows(study, experiment, rows)}
-    reference = experiment.policies[experiment.reference]
-    both = name == "static"
+def table() -> str:
+    """Means of the static study by protocol `blind`, and the paper's PSNR."""
     lines = []
-    for policy, title in experiment.policies.items():
-        line = found["blind", policy]
-        numbers = [f"{line['psnr']:.2f}"]
-        if not both and policy == experiment.reference:
-            numbers.append("")
-        elif not both:
-            one = estimate(differences(blind, "psnr", policy, experiment.reference))
-            numbers.append(f"{one.mean:+.2f} [{one.low:+.2f}, {one.high:+.2f}]")
-        numbers.append(f"{line['miou']:.3f}")
-        if both:
-            numbers += [f"{found['paper', policy][key]:.{digits}f}" for key, digits in (("psnr", 2), ("miou", 3))]
-        else:
-            seconds = line["pick_seconds"]
-            numbers.append("" if seconds is None else f"{seconds:.1f}")
-        theirs = line["paper"].get("psnr")
-        told = (
-            f"`{policy}`: {title.partition(':')[0]}"
-            if policy != title and name in ("static", "dynamic")
-            else f"`{policy}`"
-        )
-        lines.append([told, *numbers, f"{theirs:.2f}" if theirs else "–"])
-    heads = ["policy", "PSNR"]
-    heads += (
-        ["mIoU", "PSNR, `paper`", "mIoU, `paper`"] if both else [f"less that of {reference}", "mIoU", "seconds a pick"]
-    )
-    heads.append("PSNR in the paper")
-    return markdown_table(heads, lines)
+    for line in results_rows(*cells(TABLES[0])):
+        if line["protocol"] == "blind":
+            policy, title, theirs = line["policy"], line["name"].partition(":")[0], line["paper"].get("psnr")
+            told = f"`{policy}`" if title == policy else f"`{policy}`: {title}"
+            lines.append([told, f"{line['psnr']:.2f}", f"{line['miou']:.3f}", f"{theirs:.2f}" if theirs else "–"])
+    return markdown_table(["policy", "PSNR", "mIoU", "PSNR in the paper"], lines)
 
 
 def mean_lines() -> list[list[str]]:
@@ -118,8 +87,7 @@ def difference_lines() -> list[list[str]]:
 
 
 def main() -> int:
-    for name in SHOWN:
-        fill_between(PAGE, name, table(name))
+    fill_between(PAGE, "static", table())
     write_csv(PAGE_DATA / "results.csv", mean_lines())
     write_csv(PAGE_DATA / "results-differences.csv", difference_lines())
     return 0
