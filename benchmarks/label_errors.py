@@ -6,7 +6,8 @@ Runs are folders of `drgs fit` with features and classes, whose data set is ther
 the true error of a pixel is 1 where the label that is drawn is not that of the data set. The expected error is once of
 a record of the training views' labels, once of what the teacher's maps say, which err themselves. Features are compared
 with the teacher's maps of held-out views, where there are some. AUSE as in benchmarks/expected_error.py. Rows are kept
-(benchmarks/label_errors.jsonl); docs/uncertainty.md has the table. The part `unseen` was chosen on CHOOSING.
+(benchmarks/label_errors.jsonl), and the table is printed, of which docs/uncertainty.md tells. The part `unseen` was
+chosen on CHOOSING.
 """
 
 from __future__ import annotations
@@ -23,7 +24,6 @@ import numpy as np
 import studies
 import torch
 from expected_error import ause
-from pages import fill_between
 from studies import ROOT
 from where import ran, rows_of_runs
 
@@ -39,7 +39,6 @@ from drgs.studies.tables import markdown_table, paragraph
 
 CHOOSING = ("room21",)
 ROWS = ROOT / "benchmarks" / "label_errors.jsonl"
-PAGE = ROOT / "docs" / "uncertainty.md"
 OF_LABELS, OF_TEACHER = "expected, by labels", "expected, by the teacher"
 RIVALS = ("entropy", "variance", "1 - alpha")
 
@@ -142,8 +141,6 @@ def main() -> int:
     rows = rows_of_runs(ROWS, measured, __doc__)
     text = [f"`python benchmarks/label_errors.py`, {studies.made(rows)}.", label_table(rows), feature_sentence(rows)]
     print("\n\n".join(text))
-    if PAGE.exists():
-        fill_between(PAGE, "label-errors", "\n\n".join(text))
     return 0
 
 

@@ -498,16 +498,15 @@ def write_page() -> None:
     draw_curves(study, rows, METRICS[0], PICTURE)
     commits = ", ".join(sorted({row["commit"] for row in told}))
     head = (
-        f"{len(told)} fits by `python benchmarks/regions.py`, {told[0]['machine']}, {told[0]['date']}, commits "
-        f"{commits} ([rows](../benchmarks/regions.jsonl), [by fit](data/active-region.csv), [IoU, and what such a "
-        "study finds](data/active-region-differences.csv)). PSNR of the object with `region` less that of another "
-        f"policy, mean and 95 % interval, bold where that excludes 0 and there are {FEWEST_UNITS} units; *wins*: units "
-        f"in which `region` is better, 3 to 12 views. {coverage(3, 18):.0%} of such intervals hold the true mean where "
-        "scenes differ as much as their units do."
+        f"PSNR of the object with `region` less that of another policy, in dB, with 95 % intervals, of which "
+        f"{coverage(3, 18):.0%} hold the true mean; bold where that excludes 0 and there are {FEWEST_UNITS} units; "
+        f"*wins*: units in which `region` is better, 3 to 12 views. {len(told)} fits by `python "
+        f"benchmarks/regions.py`, {told[0]['machine']}, {told[0]['date']}, commits {commits} ([rows](../benchmarks/regions.jsonl), [by "
+        "fit](data/active-region.csv), [4 views, and IoU](data/active-region-differences.csv))."
     )
     heads, *lines = main_lines(rows)
-    told = [[line[0].split(",")[0], *line[1:-1]] for line in lines if METRICS[0].title in line[0]]
-    text = [paragraph(head), markdown_table(["scenes", *heads[1:-1]], told)]
+    told = [[line[0].split(",")[0], *line[1:5], *line[6:8]] for line in lines if METRICS[0].title in line[0]]
+    text = [paragraph(head), markdown_table(["scenes", *heads[1:5], *heads[6:8]], told)]
     fill_between(PAGE, "regions", "\n\n".join(text))
     write_csv(PAGE_DATA / "active-region-differences.csv", [["scenes, metric", *heads[1:]], *lines])
     write_csv(PAGE_DATA / "active-region.csv", data_lines(rows))
