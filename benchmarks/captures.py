@@ -106,8 +106,8 @@ def section(rows: Rows) -> str:
         f"PSNR of the default less that of others, in dB; first the average over {len(view_counts(rows))} numbers of "
         f"views. {len(rows)} fits by `drgs reproduce captures --protocol blind`, commits {commits} "
         f"([rows](../benchmarks/captures.jsonl), [by fit](data/captures.csv)); starts, named before any fit ran: "
-        f"{each}. {coverage(len(counts), len(units)):.0%} of such intervals hold the true mean; {min(detectable):.1f} to "
-        f"{max(detectable):.1f} dB could be seen."
+        f"{each}. {coverage(len(counts), len(units)):.0%} of such intervals hold the true mean; "
+        f"{min(detectable):.1f} to {max(detectable):.1f} dB could be seen."
     )
     lines = [
         [

@@ -288,7 +288,7 @@ def halves(rows: list[dict]) -> str:
     values = found(rows)
     named = {
         "whole": 1.0,
-        **dict.fromkeys(("removal", "gaussianpop", "lightgaussian", "opacity", "pup"), 0.5),
+        **dict.fromkeys(("removal", "lightgaussian", "opacity", "pup"), 0.5),
     }
     fitted = {"whole": 1.0, "removal": 0.5, "lightgaussian": 0.5}
     lines = []
@@ -296,7 +296,7 @@ def halves(rows: list[dict]) -> str:
         keys = [(scene, x, keep, 0) for x, keep in named.items()]
         keys += [(scene, x, keep, STEPS) for x, keep in fitted.items()]
         lines.append([scene, *(f"{values[key]:.2f}" if key in values else "" for key in keys)])
-    titles = {"removal": "drgs", "gaussianpop": "squared, once"}
+    titles = {"removal": "drgs"}
     heads = [titles.get(x, x) for x in named] + [f"{titles.get(x, x)}, {STEPS} steps" for x in fitted]
     return markdown_table(["scene", *heads], lines)
 

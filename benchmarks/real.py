@@ -4,7 +4,7 @@
     python benchmarks/real.py --page
 
 Fits with the defaults of `drgs fit` but for what FITS says, appends one row a fit to benchmarks/real.jsonl as it ends,
-then writes the tables of docs/real-data.md, docs/data/real.csv and small pictures. A fit that was stopped goes on from
+then writes the table of docs/real-data.md, docs/data/real.csv and small pictures. A fit that was stopped goes on from
 its last checkpoint. Where captures are, and with how many threads: DRGS_DATA and DRGS_THREADS.
 """
 
@@ -52,12 +52,6 @@ FITS: dict[str, tuple[str, dict]] = {
     "lego": ("lego", LEGO),
     "lego, for fast": ("lego", {**LEGO, "renderers": ("fast",)}),
     "lego, rates of 3DGS": ("lego", {**LEGO, **RATES_OF_3DGS}),
-}
-# OpenSplat's CPU build on the same data, held-out views and sizes, on a machine of the same type:
-# name -> (at most so many of our steps, its dB, what it did)
-OPENSPLAT = {
-    "banana": [(1000, 24.8, "1,000 iterations"), (2000, 27.8, "2,000 of a 3,000-iteration schedule")],
-    "head": [(3000, 22.8, "3,000 iterations")],
 }
 
 
@@ -144,32 +138,18 @@ def short_table(rows: list[dict]) -> str:
     return markdown_table(heads, lines)
 
 
-def beside_opensplat(rows: list[dict]) -> str:
-    """Previews of fits beside another program's figures."""
-    lines = ["| capture | OpenSplat | dB | ours after | dB |", "|---|---|---|---|---|"]
-    for row in rows:
-        for limit, theirs, what in OPENSPLAT.get(row["name"], []):
-            step, ours = [preview for preview in row["previews"] if preview[0] <= limit][-1]
-            lines.append(f"| {row['name']} | {what} | {theirs} | {step:,} of {row['steps']:,} | {ours:.2f} |")
-    return "\n".join(lines)
-
-
 def main() -> None:
     """The program."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", choices=[[], *FITS], help="fits to make")
     parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "real")
-    parser.add_argument("--page", action="store_true", help="fit nothing, write the tables of the rows that there are")
+    parser.add_argument("--page", action="store_true", help="fit nothing, write the table of the rows that there are")
     args = parser.parse_args()
     for name in [] if args.page else args.names:
         add_row(ROWS, measured(name, args.runs))
     rows = read_rows(ROWS)
-    for name, text in (
-        ("real", short_table(rows)),
-        ("opensplat", beside_opensplat(rows)),
-    ):
-        print(text)
-        fill_between(PAGE, name, text)
+    print(text := short_table(rows))
+    fill_between(PAGE, "real", text)
     write_csv(PAGE_DATA / "real.csv", table_lines(table(rows)))
 
 

@@ -501,8 +501,9 @@ def write_page() -> None:
         f"PSNR of the object with `region` less that of another policy, in dB, with 95 % intervals, of which "
         f"{coverage(3, 18):.0%} hold the true mean; bold where that excludes 0 and there are {FEWEST_UNITS} units; "
         f"*wins*: units in which `region` is better, 3 to 12 views. {len(told)} fits by `python "
-        f"benchmarks/regions.py`, {told[0]['machine']}, {told[0]['date']}, commits {commits} ([rows](../benchmarks/regions.jsonl), [by "
-        "fit](data/active-region.csv), [4 views, and IoU](data/active-region-differences.csv))."
+        f"benchmarks/regions.py`, {told[0]['machine']}, {told[0]['date']}, commits {commits} "
+        "([rows](../benchmarks/regions.jsonl), [by fit](data/active-region.csv), [4 views, and "
+        "IoU](data/active-region-differences.csv))."
     )
     heads, *lines = main_lines(rows)
     told = [[line[0].split(",")[0], *line[1:5], *line[6:8]] for line in lines if METRICS[0].title in line[0]]
