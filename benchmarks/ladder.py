@@ -232,11 +232,6 @@ def page(result: dict, made: str) -> str:
     for group in ("means", "log_scales"):
         cells = [percent(total["gradient"][group]["of_exact"]) for total in totals]
         lines.append([f"gradient of `{group}`: difference / `exact`, %", *cells])
-    sizes = [f"{found[place]['sigma']:.2f}" for _, place, _, found in shown]
-    lines.append(["median Gaussian's largest sigma, px", *sizes])
-    for name, step in (("response: peak to integral", "response"), ("sorted to true volume", "volume")):
-        cells = [f"{rms(x['far'], 'forward', step):.1e}" if "far" in x else "-" for x in reports]
-        lines.append([f"{name}, RMS (crops)", *cells])
     return f"{paragraph(f'{made} {apart(result)}')}\n\n{markdown_table(heads, lines)}"
 
 

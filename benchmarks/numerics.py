@@ -57,13 +57,13 @@ def case_of(row: dict[str, Any]) -> tuple[str, str]:
 
 
 def table(found: Rows) -> str:
-    """Traversal and settings against the largest errors; what rounds or warns on `bvh` has a line for each scene."""
+    """Traversals against the largest errors; what rounds or warns on `bvh` has a line for each scene."""
     lines = []
     for traversal in ("tiles", "bvh"):
         mine = [row for row in found if row["traversal"] == traversal]
         plain = [row for row in mine if row["verdict"] != "warns" and "rounding of `bvh`" not in row["remark"]]
-        for name in dict.fromkeys(case_of(row)[1] for row in plain):
-            lines.append(_line(f"`{traversal}`, `{name}`", [row for row in plain if case_of(row)[1] == name]))
+        names = ", ".join(f"`{name}`" for name in dict.fromkeys(case_of(row)[1] for row in plain))
+        lines.append(_line(f"`{traversal}`: {names}", plain))
         for scene in dict.fromkeys(case_of(row)[0] for row in mine if row not in plain):
             some = [row for row in mine if case_of(row)[0] == scene]
             warns = " (warns)" if any(row["verdict"] == "warns" for row in some) else ""
