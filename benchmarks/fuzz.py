@@ -7,7 +7,7 @@ Each reader gets valid files of a few pixels that are made here, damaged in one 
 pieces of other files, JSON of another shape, headers that lie (benchmarks/fuzz_mutators.py, fuzz_formats.py). It reads
 them in a process of its own, one after the other. An input is known by its number, so that every one can be repeated
 (`--again`, with one reader), and counts go on where they ended. What is found is kept in runs/fuzz/findings. Counts go
-to benchmarks/fuzz.json, the table to docs/reliability.md.
+to benchmarks/fuzz.json, the sums to docs/reliability.md.
 
 With `--atheris`, inputs are chosen by what they reach in the Python code of a reader (pip install atheris); these are
 counted apart, and what reached new lines is kept in runs/fuzz/reached.
@@ -191,22 +191,18 @@ def table(result: dict[str, Any]) -> str:
     """The part of docs/reliability.md: all readers together."""
     rows = [result["readers"][name] for name in TARGETS if name in result["readers"]]
     ways = ", ".join(f"{row['ends'].get('ended', 0):,} of the videos" for row in rows if row["ends"].get("ended"))
-    lines = [
-        "| readers | inputs | read all the same | refused in one line | slowest | most memory | findings |",
-        "|---|---|---|---|---|---|---|",
-    ]
     shares = [row["ends"].get("read", 0) / (sum(row["ends"].values()) or 1) for row in rows]
-    lines.append(
-        f"| {len(rows)} | {sum(row['inputs'] for row in rows):,} | {min(shares):.0%} to {max(shares):.0%} | "
-        f"{1 - max(shares):.0%} to {1 - min(shares):.0%} | {max(row['slowest'] for row in rows):.2f} s | "
-        f"{max(row['grown'] for row in rows) / 2**20:.0f} MiB | {sum(map(_found, rows))} |"
+    told = (
+        f"{sum(row['inputs'] for row in rows):,} inputs of {len(rows)} readers, {sum(map(_found, rows))} findings: by "
+        f"reader {min(shares):.0%} to {max(shares):.0%} were read all the same, the others refused in one line; the "
+        f"slowest took {max(row['slowest'] for row in rows):.2f} s, the most memory was "
+        f"{max(row['grown'] for row in rows) / 2**20:.0f} MiB."
     )
     made = f"`python benchmarks/fuzz.py`, {result['machine']}, {result['date']}, commit {result['commit']}"
     reached = [row for row in result.get("reached", {}).values() if row.get("inputs")]
     more = f"; {sum(row['inputs'] for row in reached):,} more by atheris, {sum(map(_found, reached))} findings"
     ended = f" {ways} ended the process that decodes, in one line." if ways else ""
-    lines += ["", paragraph(f"{made} ([each reader](data/fuzz.csv){more if reached else ''}).{ended}")]
-    return "\n".join(lines)
+    return paragraph(f"{told} {made} ([each reader](data/fuzz.csv){more if reached else ''}).{ended}")
 
 
 def sheet(result: dict[str, Any]) -> list[list[str]]:

@@ -6,7 +6,7 @@ Each kind of fit runs by the command line on a small made scene, deterministical
 in four SIGTERM, as a cluster does) at a random moment, time and again, until it is done; then another one begins, until
 there were so many kills. After each kill every file in the run folder must be whole and the checkpoint at least as far
 as the log says; at the end every bit of the checkpoint and every pick must be that of a fit that nobody disturbed. Rows
-go to benchmarks/kills.json, the table to docs/reliability.md.
+go to benchmarks/kills.json, the sums to docs/reliability.md.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from where import ran  # noqa: E402
 from drgs.files import Run, load_ply, load_state  # noqa: E402
 from drgs.io import atomic  # noqa: E402
 from drgs.scenes import kitchen, room, still_life  # noqa: E402
+from drgs.studies.tables import paragraph  # noqa: E402
 
 SIZE = {"width": 48, "height": 36, "spp": 2, "seed": 1}
 MAPS = {"teacher_width": 12, "teacher_height": 9}
@@ -161,13 +162,13 @@ def campaign(kind: str, folder: Path, kills: int, seed: int = 0) -> dict:
 
 def table(result: dict) -> str:
     """The part of docs/reliability.md."""
-    names = ("kind", "kills", "by SIGTERM", "before a checkpoint", "finished", "same bits")
-    rows = [[str(row[name]) for name in names] for row in result["rows"]]
-    total = [sum(row[name] for row in result["rows"]) for name in names[1:]]
-    rows.append(["all", *map(str, total)])
-    lines = [f"`python benchmarks/kills.py`, {result['machine']}, {result['date']}, commit {result['commit']}.", ""]
-    lines += ["| fit | " + " | ".join(names[1:]) + " |", "|---|" + "---|" * (len(names) - 1)]
-    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
+    names = ("kills", "by SIGTERM", "before a checkpoint", "finished", "same bits")
+    kills, saved, early, finished, alike = (sum(row[name] for row in result["rows"]) for name in names)
+    return paragraph(
+        f"{kills} kills of {len(result['rows'])} kinds of fits, {saved} by SIGTERM, {early} before a checkpoint; of "
+        f"{finished} finished fits {alike} have the same bits (`python benchmarks/kills.py`, {result['machine']}, "
+        f"{result['date']}, commit {result['commit']}, [by kind](../benchmarks/kills.json))."
+    )
 
 
 def main() -> None:
