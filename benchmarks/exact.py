@@ -243,21 +243,21 @@ def scene_rows(found: dict) -> str:
     lines = []
     for name, row in found.items():
         if row is None:
-            lines.append([name, "not there", *[""] * 4])
+            lines.append([name, "not there", *[""] * 3])
             continue
-        cells = [f"{ratios({name: row}, kind)[0]:.1f}x" for kind in (*KINDS, "with depth")]
+        cells = [f"{ratios({name: row}, kind)[0]:.1f}x" for kind in KINDS]
         lines.append([name, f"{row['hits']:.0f} ({row['hits of fast']:.0f})", *cells])
-    return markdown_table(["scene", "hits a pixel (of `fast`)", *KINDS, "forward with depth"], lines)
+    return markdown_table(["scene", "hits a pixel (of `fast`)", *KINDS], lines)
 
 
 def missed(rows: dict) -> str:
-    """Which of the targets are missed."""
+    """Which of the targets are missed, with one thread or two."""
     over = []
     for kind, limit in zip(KINDS, LIMITS, strict=True):
-        for threads, found in rows.items():
-            scenes = [name for name, x in zip(found, ratios(found, kind), strict=True) if x > limit]
-            if scenes:
-                over.append(f"{kind}, {threads} thread{'s' if int(threads) > 1 else ''} ({', '.join(scenes)})")
+        both = [zip(found, ratios(found, kind), strict=True) for found in rows.values()]
+        scenes = dict.fromkeys(name for found in both for name, x in found if x > limit)
+        if scenes:
+            over.append(f"{kind} ({', '.join(scenes)})")
     return f"Missed: {'; '.join(over)}." if over else "All are met."
 
 
@@ -266,8 +266,7 @@ def report(result: dict) -> str:
     memory, peers = result["memory"], result["peers"]
     one, two = result["scenes"]["1"], result["scenes"]["2"]
     cost = [between(ratios(one, kind)) for kind in KINDS]
-    rest, busy = ({k: x["volprim, ellipsoids"] / t for k, t in x.items()} for x in (peers["rest"], peers["busy"]))
-    other = "volprim, ellipsoidsmesh"
+    rest = {name: peers["rest"]["volprim, ellipsoids"] / seconds for name, seconds in peers["rest"].items()}
     again = f" ({result['again']})" if "again" in result else ""
     slow = result["torch"]["seconds"]
     theirs, ours = ([slow[f"{name}, {kind}"] for kind in ("forward", "both")] for name in TORCH_ROWS)
@@ -275,23 +274,19 @@ def report(result: dict) -> str:
         f"On one thread `exact` takes {cost[0]} times as long as `fast` for an image, {cost[1]} times with gradients "
         f"and {cost[2]} times for a Fisher diagonal. {result.get('note', '')}",
         f"`python benchmarks/exact.py`, {result['machine']}, {result['date']}, commit {result['commit']}{again}: "
-        "in multiples of `fast` on the same view, one thread. The fits have 1,000 steps at 10,800 pixels. "
-        "`forward` is without depth, with which tiles leave fewer tails out ([numerics.md](numerics.md)).",
+        "in multiples of `fast` on the same view, one thread, without depth. Fits have 1,000 steps at 10,800 pixels.",
         scene_rows(one),
-        f"With two threads: {', '.join(f'{between(ratios(two, kind))}x' for kind in (*KINDS, 'with depth'))} ([all "
+        f"With two threads: {', '.join(f'{between(ratios(two, kind))}x' for kind in KINDS)} ([all "
         "times](../benchmarks/exact.json)). Targets: "
         f"{', '.join(f'{k} {x}x' for k, x in zip(KINDS, LIMITS, strict=True))}. {missed(result['scenes'])}",
         f"`exact` composites {between(hit_ratios(one))} times as many hits, and takes {between(hit_costs(one))} times "
-        f"as long for each. 1,000,000 Gaussians at 1024x1024 take {memory['frame']:.2f} GB at the peak forward + "
-        f"backward, {memory['with the diagonal']:.2f} GB with a Fisher diagonal after it.",
-        f"**Peers**, two threads: on the cube `exact` is {rest['exact']:.1f} times as fast as `volprim_rf_basic`, and "
-        f"{busy['exact']:.1f} times beside two processes that never rest (`fast` {rest['fast']:.1f} and "
-        f"{busy['fast']:.1f}; `volprim_rf_basic` on `ellipsoidsmesh`, with `extent_adaptive_clamping`, "
-        f"{rest[other]:.1f} and {busy[other]:.1f}). gsplat 1.5.3's own torch functions on the CPU "
+        f"as long for each. 1,000,000 Gaussians at 1024x1024 take {memory['frame']:.2f} GB forward + backward, "
+        f"{memory['with the diagonal']:.2f} GB with a Fisher diagonal after it.",
+        f"**Peers**, two threads: on the cube `exact` is {rest['exact']:.1f} times as fast as `volprim_rf_basic`, "
+        f"`fast` {rest['fast']:.1f} times. gsplat 1.5.3's own torch functions on the CPU "
         f"([which](../examples/gsplat_torch.py); {TORCH[0]:,} Gaussians, {TORCH[1]}x{TORCH[1]}) take "
         f"{1e3 * theirs[0]:.0f} ms forward and {1e3 * theirs[1]:.0f} ms forward + backward, our preset `gsplat` "
-        f"{1e3 * ours[0]:.0f} and {1e3 * ours[1]:.0f} ms; 99.9 % of the values differ by less than "
-        f"{result['torch']['difference']:.0e}.",
+        f"{1e3 * ours[0]:.0f} and {1e3 * ours[1]:.0f} ms.",
     ]
     return "\n\n".join(part if part.startswith("|") else paragraph(part) for part in parts)
 
