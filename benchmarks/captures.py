@@ -73,7 +73,7 @@ FREE_ROWS = ROOT / "benchmarks" / "free_poses.jsonl"
 DEFAULT = "geometry+backdrop, v_opt"
 OTHERS = ("farthest", "fisherrf", "uniform")
 LEFT = "blur"
-SHOWN = (4, 10, 20)  # views
+SHOWN = (10, 20)  # views
 
 OUTSIDE = (
     ("Blender, mean of 8 scenes", 23.32, 24.59, 25.52),
