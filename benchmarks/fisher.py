@@ -179,7 +179,9 @@ def growth(turns: int, quick: bool) -> list[dict]:
 def report(r: dict) -> str:
     """The part of the page."""
     fast, t = r["headline"][0], r["tangents"]
-    names = [name for name in fast if name not in ("preset", "sh", "forward", "without SH")]  # those are in fisher.json
+    names = [
+        name for name in fast if name not in ("preset", "sh", "forward", "without SH", "coverage")
+    ]  # those are in fisher.json
     cells = [
         [name, *(f"{1e3 * row[name]:.0f} ({row[name] / row['forward+backward']:.2f})" for row in r["headline"])]
         for name in names

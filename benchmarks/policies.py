@@ -63,7 +63,6 @@ GROUPS = {
     "office": ("office",),
     "statue": ("statue",),
 }
-TABLED = ("all", "rooms", "still lifes", "captures")  # of the policies that pick by poses alone
 SHOWN = (4, 6, 12)  # views, of the page's table
 
 CHOICE = ("head", "banana", "room-3", "room-4", "still-5", "still-6")
@@ -103,19 +102,13 @@ def table(rows: Rows) -> str:
     heads = ["against", "units (scenes)", *(f"{count} views" for count in SHOWN)]
     lines = []
     for other in SIMPLE:
-        for group in TABLED if other in ("uniform", "farthest") else ("all",):
-            found = [
-                estimate(differences(at_views(of_group(blind, group), count), "psnr", DEFAULT, other))
-                for count in SHOWN
-            ]
-            cells = []
-            for one in found:
-                sure = group == "all" and one.units >= FEWEST_UNITS and not one.low <= 0 <= one.high
-                mean = f"**{one.mean:+.2f}**" if sure else f"{one.mean:+.2f}"
-                cells.append(f"{mean} [{one.low:+.2f}, {one.high:+.2f}]")
-            last = found[-1]
-            name = f"`{other}`" if group == "all" else f"– {group}"
-            lines.append([name, f"{last.units} ({last.scenes})", *cells])
+        found = [estimate(differences(at_views(blind, count), "psnr", DEFAULT, other)) for count in SHOWN]
+        cells = []
+        for one in found:
+            sure = one.units >= FEWEST_UNITS and not one.low <= 0 <= one.high
+            mean = f"**{one.mean:+.2f}**" if sure else f"{one.mean:+.2f}"
+            cells.append(f"{mean} [{one.low:+.2f}, {one.high:+.2f}]")
+        lines.append([f"`{other}`", f"{found[-1].units} ({found[-1].scenes})", *cells])
     return markdown_table(heads, lines)
 
 
