@@ -215,9 +215,10 @@ def cell(value: float | None) -> str:
 def text(result: dict[str, Any]) -> str:
     """What the page says."""
     told = (
-        f"`python benchmarks/claims.py`, {result['machine']}, {result['date']}, commit {result['commit']}: preset "
-        f"`exact` against the oracle without a cut. The largest error over {result['scenes']} scenes of each kind; the "
-        "image's absolute, the others relative in norm, of the Fisher diagonal to the group's largest entry."
+        f"`python benchmarks/claims.py`, {result['machine']}, {result['date']}, commit {result['commit']}: the "
+        f"largest error of preset `exact` over {result['scenes']} scenes of each kind, of images absolute, of others "
+        "relative in norm, of the Fisher diagonal to the group's largest entry ([every parameter group and "
+        "response](data/claims.csv))."
     )
     lines = []
     for kind in SCENES:

@@ -87,10 +87,10 @@ def text(result: dict[str, Any]) -> str:
     refused = sum(row["verdict"] == "warns" for row in found if row not in measured)
     scenes = len({case_of(row)[0] for row in measured})
     told = (
-        f"`python benchmarks/numerics.py`, {result['machine']}, {result['date']}, commit {result['commit']}: {scenes} "
-        f"scenes, {len(measured)} rows of a scene, settings and a traversal. {held} hold, {warned} warn, {failed} "
-        f"fail; all outputs, derivatives and information are finite in {sum(bool(row['finite']) for row in measured)}. "
-        f"{refused} of {len(found) - len(measured)} kinds of bad input are refused or warned about."
+        f"`python benchmarks/numerics.py`, {result['machine']}, {result['date']}, commit {result['commit']}: of "
+        f"{len(measured)} rows of {scenes} scenes, settings and traversals {held} hold, {warned} warn, {failed} fail; "
+        f"all is finite in {sum(bool(row['finite']) for row in measured)}. Of {len(found) - len(measured)} kinds of "
+        f"bad input {refused} are refused or warned about."
     )
     return f"{paragraph(told)}\n\n{table(found)}"
 

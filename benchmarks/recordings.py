@@ -169,11 +169,10 @@ def section() -> str:
         found.append(f"{told}: {recorded:.1f} instead of {traced:.1f}")
     made = list(shown.values())[-1]["ran"]
     return paragraph(
-        "Colors, alpha and depth of a pinhole on tiles, and their gradients, are launched as they were recorded at the "
-        "first frame of the same sizes and settings (`drgs/tracing/recordings.py`), with the same bits on LLVM; all "
-        "else is traced by Python each time. Milliseconds of the processor, medians of frames in turns, on a busy "
-        f"machine (`python benchmarks/recordings.py`, {made['machine']}, {made['date']}, commit {made['commit']}): "
-        f"{'; '.join(found)}."
+        "Images of a pinhole on tiles, and their gradients, are launched as they were recorded at the first frame of "
+        "the same sizes and settings (`drgs/tracing/recordings.py`), with the same bits on LLVM; all else is traced by "
+        f"Python each time. Milliseconds of the processor on a busy machine: {'; '.join(found)} (`python "
+        f"benchmarks/recordings.py`, {made['machine']}, {made['date']}, commit {made['commit']})."
     )
 
 

@@ -314,9 +314,9 @@ def write_page() -> None:
     )
     of, plain, cut, small = (f"{min(column)} to {max(column)}" for column in zip(*shares, strict=True))
     told = (
-        f"Of a cycle of `any` at 130,000 pixels, over {len(shares)} captures, `exact` without the tolerance has a "
-        f"share of {of}; a step takes {plain} times as long as one of `fast` without the tolerance and {cut} times "
-        f"with it; a step of half the width and height takes {small} of the time of one of full size."
+        f"At 130,000 pixels, over {len(shares)} captures, a step takes {cut} times as long as one of `fast`, and "
+        f"{plain} times without the tolerance, when `exact` has a share of {of}; a step of half the width and height "
+        f"takes {small} of the time of one of full size."
     )
     fill_between(PAGE, "step_times", paragraph(told))
     everything = [

@@ -132,9 +132,8 @@ def main() -> None:
     made = rows[0]
     where = paragraph(
         f"`python benchmarks/tolerance.py`, {made['machine']} of a busy machine, {made['date']}, commit "
-        f"{made['commit']}: `office`, `banana`, still life, wolf and a cube. Errors against `exact`, the largest over "
-        "the scenes: of a color, and relative of the worst group of gradients; time with gradients in multiples of "
-        "`fast`, over the scenes."
+        f"{made['commit']}: `office`, `banana`, still life, wolf, a cube. Largest errors against `exact` of a color, and "
+        "of the worst group of gradients in norm; time with gradients in multiples of `fast`."
     )
     fill_between(PAGE, "tolerance", f"{where}\n\n{table(rows)}")
 
