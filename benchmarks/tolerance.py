@@ -132,8 +132,8 @@ def main() -> None:
     made = rows[0]
     where = paragraph(
         f"`python benchmarks/tolerance.py`, {made['machine']} of a busy machine, {made['date']}, commit "
-        f"{made['commit']}: `office`, `banana`, still life, wolf, a cube. Largest errors against `exact` of a color, and "
-        "of the worst group of gradients in norm; time with gradients in multiples of `fast`."
+        f"{made['commit']}: `office`, `banana`, still life, wolf, a cube. Largest errors against `exact` of a color, "
+        "and of the worst group of gradients in norm; time with gradients in multiples of `fast`."
     )
     fill_between(PAGE, "tolerance", f"{where}\n\n{table(rows)}")
 
