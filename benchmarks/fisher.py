@@ -192,7 +192,7 @@ def report(r: dict) -> str:
         if x["views"] == 1 and x["pixels"] == 512  # the others are in fisher.json
     ]
     parts = [
-        f"The exact diagonal of a view (means, rotations, log-scales, logit-opacities and SH) takes "
+        "The exact diagonal of a view takes "
         f"{fast['exact diagonal'] / fast['forward+backward']:.2f} times as long as an image with gradients. "
         f"`python benchmarks/fisher.py`, {r['machine']}, {r['date']}, commit {r['commit']}"
         + (f" ({r['again']})" if "again" in r else "")

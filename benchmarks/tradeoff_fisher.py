@@ -131,7 +131,7 @@ def score(parts: list, trained: int) -> list[float]:
     return [information_gain(part, H, "logdet", PRIOR).total for part in parts[trained:]]
 
 
-SHOWN = ("fast", "fast, half resolution", "fisherrf", "probes on fast, K = 1", "probes on fast, K = 16")
+SHOWN = ("fast", "fast, half resolution", "fisherrf", "probes on fast, K = 1")
 """Methods of the page; the others are in the data file."""
 
 
