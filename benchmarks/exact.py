@@ -35,7 +35,7 @@ import drgs  # noqa: E402
 from drgs import data, fisher  # noqa: E402
 from drgs.cameras.sizes import at_most, cropped  # noqa: E402
 from drgs.runtime.machine import peak_memory  # noqa: E402
-from drgs.studies.tables import markdown_table, paragraph  # noqa: E402
+from drgs.studies.tables import paragraph  # noqa: E402
 from drgs.train import FitConfig, fit  # noqa: E402
 
 PIXELS = 76_800  # of a view: 320x240
@@ -238,18 +238,6 @@ def hit_costs(found: dict) -> list[float]:
     return [ratio / many for ratio, many in zip(ratios(found, KINDS[0]), more, strict=True)]
 
 
-def scene_rows(found: dict) -> str:
-    """The table of the scenes, with one thread; Gaussians, sizes and memory are in exact.json."""
-    lines = []
-    for name, row in found.items():
-        if row is None:
-            lines.append([name, "not there", *[""] * 3])
-            continue
-        cells = [f"{ratios({name: row}, kind)[0]:.1f}x" for kind in KINDS]
-        lines.append([name, f"{row['hits']:.0f} ({row['hits of fast']:.0f})", *cells])
-    return markdown_table(["scene", "hits a pixel (of `fast`)", *KINDS], lines)
-
-
 def missed(rows: dict) -> str:
     """Which of the targets are missed, with one thread or two."""
     over = []
@@ -274,10 +262,9 @@ def report(result: dict) -> str:
         f"On one thread `exact` takes {cost[0]} times as long as `fast` for an image, {cost[1]} times with gradients "
         f"and {cost[2]} times for a Fisher diagonal. {result.get('note', '')}",
         f"`python benchmarks/exact.py`, {result['machine']}, {result['date']}, commit {result['commit']}{again}: "
-        "in multiples of `fast` on the same view, one thread, without depth. Fits have 1,000 steps at 10,800 pixels.",
-        scene_rows(one),
-        f"With two threads: {', '.join(f'{between(ratios(two, kind))}x' for kind in KINDS)} ([all "
-        "times](../benchmarks/exact.json)). Targets: "
+        f"views of {', '.join(one)}, without depth ([by scene](../benchmarks/exact.json)). Fits have 1,000 steps at "
+        "10,800 pixels.",
+        f"With two threads: {', '.join(f'{between(ratios(two, kind))}x' for kind in KINDS)}. Targets: "
         f"{', '.join(f'{k} {x}x' for k, x in zip(KINDS, LIMITS, strict=True))}. {missed(result['scenes'])}",
         f"`exact` composites {between(hit_ratios(one))} times as many hits, and takes {between(hit_costs(one))} times "
         f"as long for each. 1,000,000 Gaussians at 1024x1024 take {memory['frame']:.2f} GB forward + backward, "

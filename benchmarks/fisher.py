@@ -202,27 +202,26 @@ def report(r: dict) -> str:
         f"**Tangents**, forward mode, `fast`: one takes {1e3 * t['1']:.0f} ms, the 6 of the pose "
         f"{1e3 * t['pose']:.0f}. **Growth** of the diagonal, `fast`, SH 0, in ms: {', '.join(growth)} Gaussians; "
         "nearly in proportion to the number of views.",
-        *(picks_lines(r["picks"]) if "picks" in r else []),
+        *([picks_line(r["picks"])] if "picks" in r else []),
     ]
     return "\n\n".join(part if part.startswith("|") else paragraph(part) for part in parts)
 
 
-def picks_lines(c: dict) -> list[str]:
-    """The paragraphs and the table of one pick."""
+def picks_line(c: dict) -> str:
+    """The paragraph of one pick."""
     rows = {(row["policy"], row["criterion"], tuple(row["blocks"]), row["preset"]): row["seconds"] for row in c["rows"]}
+    timed = [(*key, rows[key]) for key in PICKS if key in rows]
+    each = "; ".join(
+        f"`{policy}` by `{criterion}`" + (f" ({', '.join(blocks)})" if blocks else "") + f" on `{preset}` {seconds:.2f}"
+        for policy, criterion, blocks, preset, seconds in timed
+    )
     peak = c["memory"][-1] if "memory" in c else None
     memory = f", which takes {peak['GB']:.2f} GB with {peak['candidates']} candidates" if peak else ""
-    lines = []
-    for policy, criterion, blocks, preset in PICKS:
-        seconds = rows.get((policy, criterion, blocks, preset))
-        time = f"{seconds:.2f}" if seconds else "not timed yet"
-        lines.append([", ".join((policy, criterion, *blocks)), preset, time])
-    return [
+    return (
         f"**One pick** among {c['poses']} candidate poses at 320x240, {c['train']} training views, {c['gaussians']:,} "
-        f"Gaussians with SH {c['sh']} ({c['run']}), nothing cached; the first row is the default of `drgs select`"
-        f"{memory}. The paper states about 7 s on an L40 GPU, for a formula that compares with `fisher` by `eig`.",
-        markdown_table(["policy, criterion, blocks", "preset", "seconds a pick"], lines),
-    ]
+        f"Gaussians with SH {c['sh']} ({c['run']}), nothing cached, in s: {each}. The first is the default of `drgs select`"
+        f"{memory}. The paper states about 7 s on an L40 GPU, for a formula that compares with `fisher` by `eig`."
+    )
 
 
 def main():
