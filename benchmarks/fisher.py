@@ -220,7 +220,8 @@ def picks_line(c: dict) -> str:
     return (
         f"**One pick** among {c['poses']} candidate poses at 320x240, {c['train']} training views, {c['gaussians']:,} "
         f"Gaussians with SH {c['sh']} ({c['run']}), nothing cached, in s: {each}. The first is the default of `drgs "
-        f"select`{memory}. The paper states about 7 s on an L40 GPU, for a formula that compares with `fisher` by `eig`."
+        f"select`{memory}. The paper states about 7 s on an L40 GPU, for a formula that compares with `fisher` by "
+        "`eig`."
     )
 
 
