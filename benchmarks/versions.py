@@ -50,6 +50,7 @@ SIZES = {60: (30_000, 12_000), 300: (60_000, 20_000), 900: (130_000, 30_000)}
 ON_WHITE = ("lego",)
 """Photographs with an alpha channel: 864f204 put them on black unless told, and PSNR on black is another number."""
 SEEN = ("fast", "exact", "gsplat", "3dgut")
+SHOWN_SECONDS, SHOWN_RENDERERS = (60, 300), ("fast", "gsplat")  # of the page's table; all are in its data file
 CHOOSING = ("banana", "fern", "statue", "office", "watch", "blowtorch")
 """Captures on which updates a step (the first three), the trial of gains and guesses beside points (the last three)
 were chosen; a mean of its own is of the others."""
@@ -216,35 +217,50 @@ def last_rows() -> list[dict]:
     return sorted(rows.values(), key=lambda row: row["seconds"])
 
 
-def fits_table() -> str:
-    """Held-out PSNR of the second checkout by scene and renderer, its gains on average and in the worst view."""
-    from drgs.studies.tables import markdown_table
+def gains_of(row: dict, renderer: str) -> tuple[float, float, float]:
+    """Held-out PSNR of the second checkout, its gain on average and in the worst view."""
+    before, now = row["before"]["psnr"][renderer], row["now"]["psnr"][renderer]
+    old, new = zip(*((before[view], now[view]) for view in before if view in now), strict=True)
+    return statistics.mean(new), statistics.mean(new) - statistics.mean(old), min(new) - min(old)
 
-    lines, gains = [], {}
+
+def fits_sheet() -> list[list[str]]:
+    """A data file: every fit in every renderer."""
+    sheet = [["data", "seconds", "taken_before", "taken", "steps_before", "steps", "commit", "machine"]]
+    sheet[0] += [f"{name}_{what}" for name in SEEN for what in ("psnr", "gain", "worst_gain")]
     for row in last_rows():
         both = row["before"], row["now"]
-        took, steps = (" / ".join(f"{round(x[key]):,}" for x in both) for key in ("took", "steps"))
-        line = [row["scene"], str(row["seconds"]), took, steps]
-        for name in SEEN:
-            before, now = row["before"]["psnr"][name], row["now"]["psnr"][name]
-            old, new = zip(*((before[view], now[view]) for view in before if view in now), strict=True)
-            mean, worst = statistics.mean(new) - statistics.mean(old), min(new) - min(old)
-            line.append(f"{statistics.mean(new):.2f} ({mean:+.2f} / {worst:+.2f})")
-            for of in ("mean", *(["mean of those that chose nothing"] * (row["scene"] not in CHOOSING))):
-                gains.setdefault((of, row["seconds"], name), []).append((mean, worst))
-        lines.append(line)
-    for of, seconds in dict.fromkeys(key[:2] for key, scenes in gains.items() if len(scenes) > 1):
-        line = [f"**{of}**", str(seconds), "", ""]
-        for name in SEEN:
-            mean, worst = (statistics.mean(x) for x in zip(*gains[of, seconds, name], strict=True))
-            line.append(f"{mean:+.2f} / {worst:+.2f}")
-        lines.append(line)
-    return markdown_table(["data", "seconds", "taken", "steps", *(f"`{name}`" for name in SEEN)], lines)
+        line = [row["scene"], str(row["seconds"])]
+        line += [str(round(x[key])) for key in ("took", "steps") for x in both]
+        line += [row["commit"], row["machine"].split(",")[0]]
+        sheet.append(line + [f"{value:.2f}" for name in SEEN for value in gains_of(row, name)])
+    return sheet
+
+
+def fits_table() -> str:
+    """What the second checkout gains on average and in the worst view, by scene, seconds and renderer."""
+    from drgs.studies.tables import markdown_table
+
+    rows = {(row["scene"], row["seconds"]): row for row in last_rows()}
+    shown = [(seconds, name) for seconds in SHOWN_SECONDS for name in SHOWN_RENDERERS]
+    scenes = list(dict.fromkeys(scene for scene, _ in rows))
+
+    def cell(among: list[str], seconds: int, name: str) -> str:
+        found = [gains_of(rows[scene, seconds], name)[1:] for scene in among if (scene, seconds) in rows]
+        mean, worst = (statistics.mean(values) for values in zip(*found, strict=True))
+        return f"{mean:+.2f} / {worst:+.2f}"
+
+    lines = [[scene, *(cell([scene], *at) for at in shown)] for scene in scenes]
+    lines.append(["**mean**", *(cell(scenes, *at) for at in shown)])
+    untuned = [scene for scene in scenes if scene not in CHOOSING]
+    lines.append(["**of those that chose nothing**", *(cell(untuned, *at) for at in shown)])
+    return markdown_table(["data", *(f"{seconds} s, `{name}`" for seconds, name in shown)], lines)
 
 
 def page() -> None:
     """Write the tables."""
     from pages import fill_between
+    from studies import PAGE_DATA, write_csv
     from where import read_rows
 
     from drgs.studies.tables import markdown_table, paragraph
@@ -273,8 +289,9 @@ def page() -> None:
         )
         text = paragraph(
             f"Commit {commits} beside {rows[-1]['before_commit']}: `python benchmarks/versions.py --fits`, {machines}, "
-            f"{days}."
+            f"{days} ([every renderer, PSNR, seconds and steps](data/versions-fits.csv))."
         )
+        write_csv(PAGE_DATA / "versions-fits.csv", fits_sheet())
         fill_between(PAGE, "fits", text + "\n\n" + fits_table())
 
 
