@@ -17,8 +17,7 @@ import drjit as dr
 from drgs import runtime
 from drgs.ellipsoids import Y_00
 from drgs.tracing.arrays import Float, Lib, Mask, UInt32
-from drgs.tracing.derivatives import if_any_hit
-from drgs.tracing.hit_table import Table, replayed_hit
+from drgs.tracing.hit_table import HitReplay, Table
 from drgs.tracing.kernels import Channels, HitModel
 from drgs.tracing.primitives import Projected, Ray
 from drgs.tracing.protocols import Sink
@@ -81,16 +80,15 @@ class Row(NamedTuple):
     basis: list[Float]
 
 
-class Rows:
+class Rows(HitReplay):
     """Replay of a primal pass that hands the Jacobian's rows of every hit to a sink.
 
     Args:
+        model, channels, finals, table: As of a `HitReplay`.
         buffer: The buffer of `extras`; None leaves the geometry out, only w is known then.
         sink: What becomes of them: `SquareSums`, `BlockSums`, `RemovalSums` or `VarianceSums`.
-        finals: The final state of the Primal pass, one per shared ray.
         color: The color depends on the mean, through the direction.
         masks: What the rows of each shared ray are multiplied by; None: nothing.
-        table: Says what there is of each hit, in whatever order they come; `finals` are not needed then.
     """
 
     def __init__(
@@ -104,12 +102,9 @@ class Rows:
         masks: list[Float] | None = None,
         table: Table | None = None,
     ) -> None:
-        self.m = model
-        self.channels = channels
+        super().__init__(model, channels, finals, table)
         self.sink = sink
-        self.finals = finals
         self.masks = masks
-        self.table = table
         self.buffer = buffer
         self.color = color
         self.size = packed_size(_SHAPE + model.response.extra)
@@ -134,35 +129,20 @@ class Rows:
 
     def init(self, k: int, alive: Mask, nowhere: Float | UInt32) -> dict:
         """State of shared ray k: what is left of each channel behind the last hit."""
-        state = {}
-        if self.table is None:
-            alive = alive & (self.finals[k]["place"] != nowhere)
-            state = {"T": self.m.lib.Float(1), "rest": self.rest(k)}
+        state, alive = self.begun(k, alive, nowhere)
         if self.masks:
             alive = alive & (self.masks[k] > 0)
         return {**state, "alive": dr.select(alive, self.m.lib.UInt32(1), 0), **self.sink.init(k)}
 
-    def shade(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
-        """One hit of each of `rays`."""
-        if self.table is not None:
-            return self.table.if_any_hit(index, rays, states, places, active, self._take)
-        return if_any_hit(self.m, self.channels, index, rays, states, places, active, self._take)
-
-    def _take(
-        self,
-        index: UInt32,
-        rays: list[Ray],
-        states: list[dict],
-        places: list[list],
-        active: Mask,
-        record: list[Float] | None = None,
+    def take(
+        self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask, record: Any
     ) -> list[dict]:
         """Replay a hit that some ray of the packet has: B_c as in derivatives.py, exact as the sums are float64."""
         m = self.m
         lib = self.m.lib
         rows = []
         out = []
-        going = active & (sum((s["alive"] for s in states), lib.UInt32(0)) != 0)
+        going = self.going(states, active)
         only = None if self.colors else "record"
         loaded = self.channels.load(lib, index, rays[0], going, only=only, record=record)
         record = loaded["record"]
@@ -171,12 +151,7 @@ class Rows:
         for k, (ray, st, place) in enumerate(zip(rays, states, places, strict=True)):
             a, depth, ok = m.hit(record, ray, active & (st["alive"] != 0))
             color: list[Float] | Any = self.channels.values(m, loaded, ray) if self.colors else None
-            if self.table is None:
-                terms = self.terms(k, color, depth, place, ok)
-                T, w, behind, new = replayed_hit(self.finals[k], st, a, terms, place, ok)
-            else:
-                T, w, behind, ok = self.table.read(place, a)
-                new = dict(st)
+            T, w, behind, new, ok = self.replayed(k, st, a, self.terms(k, color, depth, place, ok), place, ok)
             slopes = g = turned = None
             if extra:
                 g = [dr.select(ok, dr.fma(T, c, -b), 0) for c, b in zip(color, behind, strict=True)]

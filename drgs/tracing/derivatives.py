@@ -26,7 +26,7 @@ import drjit as dr
 
 from drgs.tracing.arrays import Float, Mask, UInt32
 from drgs.tracing.harmonics import sh_color
-from drgs.tracing.hit_table import Table, replayed_hit
+from drgs.tracing.hit_table import HitReplay, Table
 from drgs.tracing.kernels import Channels, Emit, HitModel, Primal
 from drgs.tracing.primitives import Ray
 from drgs.tracing.records import load_packed, packed_size
@@ -35,46 +35,16 @@ from drgs.tracing.sums import add_row
 Gradient = tuple[dict[int, Float], list[Float]]  # of one hit: by entry of its record, and by what the ray carries
 
 
-def if_any_hit(
-    model: HitModel,
-    channels: Channels,
-    index: UInt32,
-    rays: list[Ray],
-    states: list[dict],
-    places: list[list],
-    active: Mask,
-    take: Callable,
-) -> list[dict]:
-    """`take(index, rays, states, places, active, record)` where a ray of the packet meets the Gaussian, else the same
-    states.
-
-    Most Gaussians of a tile's list miss most packets of its rays, and the branch is cheaper than what it skips.
-    """
-    lib = model.lib
-    going = active & (sum((s["alive"] for s in states), lib.UInt32(0)) != 0)
-    record = channels.load(lib, index, rays[0], going, only="record")["record"]
-    hits = lib.Bool(False)
-    for ray, st in zip(rays, states, strict=True):
-        hits |= model.hit(record, ray, active & (st["alive"] != 0))[2]
-    return dr.if_stmt(
-        (states, index, rays, places, active),
-        hits,
-        lambda states, index, rays, places, active: take(index, rays, states, places, active, record),
-        lambda states, *_: states,
-    )
-
-
-class Adjoint:
+class Adjoint(HitReplay):
     """Replay of a primal pass that scatters the gradient into the records, SH and features that each hit reads.
 
     Args:
+        model, channels, finals, table: As of a `HitReplay`; the table is filled for these cotangents.
         grads: Buffers like `channels.buffers`, added to.
-        finals: Final state of the Primal pass, of each shared ray.
         cotangents: Cotangents of each shared ray: `sum` (a float a channel), `alpha` (of sum w), `depth` (of sum w t*).
         depth: There is a depth cotangent.
         scalar: What the features add to s: `scalar(shared ray, place, is hit)`; None without features here. The
             cotangents then have `rest`, the sum of it over the ray's weights.
-        table: Filled for these cotangents: says what there is of each hit, in whatever order they come.
         absolute: (2 N) added to: |dL / d projected mean| of each hit, in x and y, of a model of the image plane.
     """
 
@@ -91,14 +61,11 @@ class Adjoint:
         table: Table | None = None,
         absolute: Float | None = None,
     ) -> None:
-        self.m = model
+        super().__init__(model, channels, finals, table)
         self.absolute = absolute
-        self.channels = channels
         self.grads = grads
         self.mode = mode
         self.scalar = scalar
-        self.table = table
-        self.finals = finals
         self.cotangents = cotangents
         self.slots = set(model.slots(depth))
 
@@ -126,33 +93,18 @@ class Adjoint:
 
     def init(self, k: int, alive: Mask, nowhere: Float | UInt32) -> dict:
         """State of shared ray k; `carried` collects the gradient of what the ray itself carries."""
-        lib = self.m.lib
-        state = {"carried": [self.m.lib.Float(0) for _ in range(self.cotangents[k]["carried"])]}
-        if self.table is None:
-            alive = alive & (self.finals[k]["place"] != nowhere)
-            state |= {"T": lib.Float(1), "rest": self.rest(k)}
-        return state | {"alive": dr.select(alive, lib.UInt32(1), 0)}
+        state, alive = self.begun(k, alive, nowhere)
+        carried = [self.m.lib.Float(0) for _ in range(self.cotangents[k]["carried"])]
+        return {"carried": carried} | state | {"alive": dr.select(alive, self.m.lib.UInt32(1), 0)}
 
-    def shade(self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask) -> list[dict]:
-        """Back-propagate through Gaussian `index` what the primal pass composited of it."""
-        if self.table is not None:
-            return self.table.if_any_hit(index, rays, states, places, active, self._take)
-        return if_any_hit(self.m, self.channels, index, rays, states, places, active, self._take)
-
-    def _take(
-        self,
-        index: UInt32,
-        rays: list[Ray],
-        states: list[dict],
-        places: list[list],
-        active: Mask,
-        record: list[Float] | None = None,
+    def take(
+        self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask, record: Any
     ) -> list[dict]:
         """One hit of each ray: its local derivative by AD, weighted with dL/da and with w times the cotangents."""
         m = self.m
         lib = self.m.lib
         out = []
-        going = active & (sum((s["alive"] for s in states), lib.UInt32(0)) != 0)
+        going = self.going(states, active)
         with dr.resume_grad():
             # A graph of this hit only, from leaves of its own: the walk has suspended AD.
             loaded = self.channels.load(lib, index, rays[0], going, record=record)
@@ -172,11 +124,7 @@ class Adjoint:
                 # Weights of the local derivative are numbers.
                 a0 = dr.detach(a)
                 (s,) = self.terms(number, values, depth, place, ok)
-                if self.table is None:
-                    T, w, (behind,), new = replayed_hit(self.finals[number], st, a0, [s], place, ok)
-                else:
-                    T, w, (behind,), ok = self.table.read(place, a0)
-                    new = dict(st)
+                T, w, (behind,), new, ok = self.replayed(number, st, a0, [s], place, ok)
                 slope = dr.fma(T, lib.Float(s), -behind)
                 local = dr.fma(slope, a, w * g["depth"] * depth)
                 if self.absolute is not None:
