@@ -35,7 +35,7 @@ from drgs.tracing.kernels import HitModel
 from drgs.tracing.primitives import Projected, Ray
 from drgs.tracing.sort_keys import EMPTY, positive
 from drgs.tracing.tiles import depth_order
-from drgs.tracing.walk import Part
+from drgs.tracing.walk import BUFFER, Part
 
 # relative rounding of the coordinates of a ray's origin: one unit in the last place of float32
 _ORIGIN_ROUNDING = 1.2e-7
@@ -104,7 +104,7 @@ class BvhTraversal:
             stream,
             ordered=True,
             center_key=self.center_key,
-            buffer=_ENTRY_BUFFER if s.order == "entry" else None,
+            buffer=_ENTRY_BUFFER if s.order == "entry" else BUFFER,
         )
         return [part]
 

@@ -95,10 +95,11 @@ class Slots:
     columns: list[UInt32]
 
 
+@dataclasses.dataclass(eq=False)
 class Part:
     """Lanes, their rays and pixels, and the stream of candidates.
 
-    Args:
+    Attributes:
         lib: Dr.Jit types of the backend.
         model: The formula of a hit.
         records: Flat record buffer of the view.
@@ -108,50 +109,32 @@ class Part:
         stream: Candidate Gaussians of every lane.
         ordered: Rays sort their candidates on the way; else these come in the order in which they are composited.
         center_key: (N,) order keys of Gaussians that are sorted by their centers; None where a ray's own order counts.
-        buffer: Number of hits that a ray is sorted among; default `BUFFER`.
+        buffer: Number of hits that a ray is sorted among.
         first: These rays were not walked before, with a shorter buffer.
         slots: Places of entries and pixels in tables, for rays through tiles; None for others. A hit's place is then
             where it stands in the ray's row and in the tile's list.
         in_lists: Makes a part with the same rays along the lists of their tiles; of rays that walk along rows of their
             own hits.
         weights: Holds the weights of these rays; None where they are not held.
-    Attributes:
         failed: Lanes whose buffer was too short, after a primal pass of rays that sort.
     """
 
-    def __init__(
-        self,
-        lib: Lib,
-        model: HitModel,
-        records: Float,
-        rays: list[Ray],
-        flat: list[UInt32],
-        inside: list[Mask],
-        stream: Candidates,
-        *,
-        ordered: bool,
-        center_key: Float | None = None,
-        buffer: int | None = None,
-        first: bool = True,
-        slots: Slots | None = None,
-        in_lists: Callable[[], Part] | None = None,
-        weights: Weights | None = None,
-    ) -> None:
-        self.lib = lib
-        self.model = model
-        self.records = records
-        self.rays = rays
-        self.flat = flat
-        self.inside = inside
-        self.stream = stream
-        self.ordered = ordered
-        self.center_key = center_key
-        self.buffer = buffer or BUFFER
-        self.first = first
-        self.slots = slots
-        self.in_lists = in_lists
-        self.weights = weights
-        self.failed: Mask = None
+    lib: Lib
+    model: HitModel
+    records: Float
+    rays: list[Ray]
+    flat: list[UInt32]
+    inside: list[Mask]
+    stream: Candidates
+    _: dataclasses.KW_ONLY
+    ordered: bool
+    center_key: Float | None = None
+    buffer: int = BUFFER
+    first: bool = True
+    slots: Slots | None = None
+    in_lists: Callable[[], Part] | None = None
+    weights: Weights | None = None
+    failed: Mask = None
 
     @property
     def reduction(self) -> dr.ReduceMode:
