@@ -9,8 +9,9 @@ derivatives da of a hit's opacity by the geometry of its Gaussian are closed for
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import drjit as dr
 
@@ -352,25 +353,22 @@ class SeveralSums:
         return states
 
 
+@dataclasses.dataclass(eq=False)
 class VarianceSums:
     """Per pixel, the sum over parameters of squared derivatives times a weight of each.
 
-    Args:
+    Attributes:
         buffer: 16 floats a Gaussian: the weights of the geometry, then of w^2 in each color, then of w^2 itself.
         weights: Weights of the channels: colors first.
         light: 3 K floats a Gaussian, the weights of SH that are evaluated along each ray, or None.
         plain: Whether there are weights of w^2 itself.
     """
 
-    needs_color = False
-
-    def __init__(
-        self, buffer: Float, weights: Sequence[float], light: Float | None = None, plain: bool = False
-    ) -> None:
-        self.buffer = buffer
-        self.weights = weights
-        self.light = light
-        self.plain = plain
+    buffer: Float
+    weights: Sequence[float]
+    light: Float | None = None
+    plain: bool = False
+    needs_color: ClassVar[bool] = False
 
     def init(self, k: int) -> dict:
         """The sum along a ray."""

@@ -13,6 +13,7 @@ first time on (`_RetainedGraph`): K probes evaluate the function twice, K tangen
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -25,31 +26,25 @@ if TYPE_CHECKING:
 _Tensors = dict[str, torch.Tensor]
 
 
+@dataclasses.dataclass(eq=False)
 class Field:
     """The raw fields of a scene's Gaussians at one time, as a function of the scene's parameters.
 
-    Args:
+    Attributes:
         scene: What is deformed.
         time: Time of the view; None where the parameters have it.
         names: Names of the fields that are wanted.
         shift: (3,) that is taken from the means: the call's own origin; None for no shift.
         fixed: Parameters of the scene that are no floats, by which nothing is differentiated.
+        cached: The fields, once they are computed: a call's parameters are constant.
     """
 
-    def __init__(
-        self,
-        scene: DeformableScene,
-        time: float | None,
-        names: Iterable[str],
-        shift: torch.Tensor | None = None,
-        fixed: Mapping[str, torch.Tensor] | None = None,
-    ) -> None:
-        self.scene = scene
-        self.time = time
-        self.names = tuple(names)
-        self.shift = shift
-        self.fixed = dict(fixed or {})
-        self.cached: _Tensors = {}  # the fields, once they are computed: a call's parameters are constant
+    scene: DeformableScene
+    time: float | None
+    names: Iterable[str]
+    shift: torch.Tensor | None = None
+    fixed: Mapping[str, torch.Tensor] = dataclasses.field(default_factory=dict)
+    cached: _Tensors = dataclasses.field(default_factory=dict)
 
     def __call__(self, parameters: dict) -> dict:
         """Dr.Jit tensors by name to Dr.Jit tensors by name, with AD in both modes, by those that it is enabled of."""

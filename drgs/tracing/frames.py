@@ -257,7 +257,7 @@ def _whole(view: View, a: dict) -> Compositor:
         compositor.parts = seen.parts(pixels_a_lane())
         return compositor
     lib = compositor.lib
-    rows = SortedRows(lib, a["words"], a["first"], a["first"] + a["count"], a["index"])
+    rows = SortedRows(lib, a["index"], a["first"], a["first"] + a["count"], a["words"])
     compositor.parts = [seen.whole_band(1, rows)]
     return compositor
 

@@ -345,6 +345,7 @@ def _rotated(view: list, axes: list) -> list:
     return [[sum(view[r][k] * axes[k][c] for k in range(3)) for c in range(3)] for r in range(3)]
 
 
+@dataclasses.dataclass(eq=False)
 class Projected:
     """The record of each Gaussian in a view, with its bounds and order.
 
@@ -360,19 +361,10 @@ class Projected:
             directions are stored along.
     """
 
-    def __init__(
-        self,
-        record: list[Float],
-        key: Float,
-        bounds: list[Float] | None,
-        alive: Mask,
-        ellipsoids: list[Float] | None = None,
-        frame: tuple | None = None,
-    ) -> None:
-        self.record = record
-        self.key = key
-        self.alive = alive
-        # Any: None where a view has no such thing, and then it is not read.
-        self.bounds: list[Float] | Any = bounds
-        self.ellipsoids: list[Float] | Any = ellipsoids
-        self.frame: tuple | Any = frame
+    record: list[Float]
+    key: Float
+    # Any: None where a view has no such thing, and then it is not read.
+    bounds: list[Float] | Any
+    alive: Mask
+    ellipsoids: list[Float] | Any = None
+    frame: tuple | Any = None

@@ -7,6 +7,7 @@ orders like (t*, index). Sorting short rows is what processors do fast; then eac
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -25,6 +26,7 @@ from drgs.tracing.weights import PIXELS, signed
 _TILES_PER_TASK = 64  # tiles that a thread sorts at a time; chosen
 
 
+@dataclasses.dataclass
 class MemoryBudget:
     """Memory that orders may be held in.
 
@@ -32,8 +34,7 @@ class MemoryBudget:
         left: Bytes that are not taken yet.
     """
 
-    def __init__(self, left: int) -> None:
-        self.left = left
+    left: int
 
     def take(self, size: int) -> bool:
         """Whether there is room for so many bytes, which are taken then."""
@@ -42,33 +43,26 @@ class MemoryBudget:
         return fits
 
 
+@dataclasses.dataclass(eq=False)
 class SortedHits:
     """The hits of the pixels of some tiles, searched and sorted when a walk begins (`opened`).
 
-    Args:
+    Attributes:
         in_lists: Function that makes a part with these pixels, four a lane, along the lists of the tiles.
         index: (entries,) Gaussians of all lists; of the same key the first entry is the nearer hit.
         lengths: (tiles,) of the lists of these tiles.
         cut: (tiles,) what is taken off the squared extents (`trimmed_extent2`), or None.
         budget: Memory to hold the order in once it is known.
+        held: That order, where there was room.
     """
 
-    def __init__(
-        self,
-        lib: Lib,
-        in_lists: Callable[[], Part],
-        index: UInt32,
-        lengths: torch.Tensor,
-        cut: Float | None,
-        budget: MemoryBudget,
-    ) -> None:
-        self.lib = lib
-        self.in_lists = in_lists
-        self.index = index
-        self.lengths = lengths
-        self.budget = budget
-        self.cut = cut
-        self.held: SortedRows | None = None
+    lib: Lib
+    in_lists: Callable[[], Part]
+    index: UInt32
+    lengths: torch.Tensor
+    cut: Float | None
+    budget: MemoryBudget
+    held: SortedRows | None = None
 
     def opened(self) -> SortedRows:
         """The stream to walk along."""
@@ -80,9 +74,9 @@ class SortedHits:
             # The entries alone, one row behind the other: a fraction of what the words take.
             first = dr.cumsum(count) - count
             entries = self._entries(words, start, count, first, total)
-            self.held = SortedRows(self.lib, entries, first, first + count, self.index)
+            self.held = SortedRows(self.lib, self.index, first, first + count, entries)
             return self.held
-        return SortedRows(self.lib, words, start, start + count, self.index)
+        return SortedRows(self.lib, self.index, start, start + count, words)
 
     def _sorted(self) -> tuple[Float, UInt32, UInt32]:
         """Words of the hits, and of each pixel where its row starts and how many it has."""
@@ -134,16 +128,15 @@ def found_hits(lib: Lib, part: Part, tiles: int, cut: Float | None) -> tuple[Flo
     return words, start, count
 
 
+@dataclasses.dataclass(eq=False)
 class SortedRows(ListStream):
     """Sorted hits, of each lane those from `start` to `end`; a `Stream`.
 
-    Args:
+    Attributes:
         hits: Float64 words, whose names are entries of a list of Gaussians, `index`; or UInt32, the entries.
     """
 
-    def __init__(self, lib: Lib, hits: Float | UInt32, start: UInt32, end: UInt32, index: UInt32) -> None:
-        super().__init__(lib, index, start, end)
-        self.hits = hits
+    hits: Float | UInt32
 
     def next(self, i: UInt32, active: Mask) -> tuple[UInt32, Mask, list, Float, UInt32]:
         """One hit."""

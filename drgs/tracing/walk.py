@@ -49,19 +49,19 @@ def pixels_a_lane(basis: int = 0) -> int:
     return 1 if basis or runtime.backend().name == "cuda" else 4
 
 
+@dataclasses.dataclass(eq=False)
 class ListStream:
     """Entries of a list, of each lane those from `start` to `end`; a `Stream`.
 
-    Args:
+    Attributes:
         index: (entries,) Gaussians.
         start, end: (lanes,) first entry of each lane, and that behind its last.
     """
 
-    def __init__(self, lib: Lib, index: UInt32, start: UInt32, end: UInt32) -> None:
-        self.lib = lib
-        self.index = index
-        self.start = start
-        self.end = end
+    lib: Lib
+    index: UInt32
+    start: UInt32
+    end: UInt32
 
     def opened(self) -> ListStream:
         """Itself."""
