@@ -16,20 +16,18 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
+from drgs import fisher, reference
+from drgs.cameras import Camera
 from drgs.cameras.sizes import cropped
-
-if TYPE_CHECKING:
-    from drgs.cameras import Camera
-    from drgs.ellipsoids import Gaussians
-    from drgs.gain import Information
-    from drgs.lab.accuracy import Oracle
-    from drgs.lab.extremes import ExtremeCase, Refusal
-    from drgs.settings import RenderSettings
+from drgs.ellipsoids import Gaussians
+from drgs.gain import Information, Prior, information_gain
+from drgs.lab.accuracy import FIELDS, Oracle, compare, entry_error, jacobian, squares
+from drgs.lab.extremes import ExtremeCase, Refusal
+from drgs.settings import RenderSettings
 
 BOUNDS = {"image": 1e-5, "gradient": 1e-4, "forward": 1e-4, "duality": 1e-4, "fisher": 1e-4}
 """What `exact` claims; every case here is held to it, whatever its settings, but where `bvh` rounds or warns."""
@@ -71,8 +69,6 @@ class StressRow:
 
 def rows(case: ExtremeCase | Refusal) -> Iterator[StressRow]:
     """Measure a case on each of its traversals; what raises becomes a row."""
-    from drgs.lab.extremes import Refusal
-
     if isinstance(case, Refusal):
         yield _caught(case.name, "all", lambda: refused(case))
         return
@@ -112,9 +108,6 @@ class Truth:
 
 def truth_of(case: ExtremeCase) -> Truth:
     """Build a case and compute it by the oracle."""
-    from drgs import reference
-    from drgs.lab.accuracy import FIELDS, Oracle, jacobian, squares
-
     rng = np.random.default_rng(3)
     settings = case.oracle_settings
     g, cam = case.build(rng)
@@ -140,8 +133,6 @@ def truth_of(case: ExtremeCase) -> Truth:
 
 def row_of(case: ExtremeCase, traversal: str, truth: Truth) -> StressRow:
     """One row: every error of a case on `tiles` or `bvh`, and what they amount to."""
-    from drgs.lab.accuracy import compare
-
     g = truth.g
     cam = truth.cam
     oracle = truth.oracle
@@ -210,9 +201,6 @@ def _rounded(g: Gaussians, cam: Camera) -> dict[str, float]:
 
 def _information(case: ExtremeCase, settings: RenderSettings, truth: Truth) -> tuple[float | None, bool, str]:
     """Error of the Fisher diagonal (and gains), whether all of it and of the blocks is finite, and a remark."""
-    from drgs import fisher
-    from drgs.lab.accuracy import entry_error
-
     g, cam, view = truth.g, truth.cam, truth.view
     diagonal = fisher.diagonal(g, cam, settings)
     blocks = fisher.blocks(g, cam, settings)
@@ -237,10 +225,6 @@ def _gain(
         exactly: Settings of the oracle.
         H, truth: Information of the first view, by the renderer and by the oracle.
     """
-    from drgs import fisher, reference
-    from drgs.gain import Prior, information_gain
-    from drgs.lab.accuracy import jacobian, squares
-
     K = cam.K.copy()
     K[0, 2] -= 0.6 * cam.width
     other = dataclasses.replace(cam, K=K)
