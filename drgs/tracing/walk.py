@@ -167,18 +167,9 @@ class Part:
         flat = [pick(f) for f in self.flat]
         stream = divided.of(lanes)
         dr.eval(rays, flat)
-        part = Part(
-            self.lib,
-            self.model,
-            self.records,
-            rays,
-            flat,
-            [self.lib.Bool(True)],
-            stream,
-            ordered=True,
-            center_key=self.center_key,
-            buffer=_DEEP_BUFFER,
-            first=False,
+        inside = [self.lib.Bool(True)]
+        part = dataclasses.replace(
+            self, rays=rays, flat=flat, inside=inside, stream=stream, buffer=_DEEP_BUFFER, first=False
         )
         return [part] if count >= _DEEP_FROM and self.buffer < _DEEP_BUFFER else part._listed(count)
 
@@ -198,9 +189,7 @@ class Part:
             start = dr.cumsum(hits) - hits
             index = self._sorted_hits(start, total, bits)
         stream = ListStream(lib, index, start, start + hits)
-        return [
-            Part(lib, self.model, self.records, self.rays, self.flat, self.inside, stream, ordered=False, first=False)
-        ]
+        return [dataclasses.replace(self, stream=stream, ordered=False)]
 
     def _sorted_hits(self, start: UInt32, total: int, bits: int) -> UInt32:
         """The hits of each ray, from its `start` on, by (key, Gaussian); indices of Gaussians have so many bits."""
