@@ -194,7 +194,7 @@ class LensRays:
                 length=lib.Float(1), direction=values[:3], low=values[3:], carried=carried, basis=basis, shifted=shifted
             )
         x, y, *low = values
-        length = _length(pinhole, x + low[0], y + low[1])
+        length = pinhole_length(pinhole, x + low[0], y + low[1])
         return Ray(x, y, length, low=low, carried=carried, basis=basis, shifted=shifted)
 
     def patch(self, r: list[Float], x: Int32, y: Int32) -> Patch:
@@ -217,7 +217,7 @@ def on_side(side: Float, d: list[Any]) -> tuple[Any, Any, Any]:
     return pick(x, y, z), pick(y, z, x), pick(z, x, y)
 
 
-def _length(pinhole: list[Float], x: Float, y: Float) -> Float:
+def pinhole_length(pinhole: list[Float], x: Float, y: Float) -> Float:
     """|d| of a pinhole ray of direction d with d_z = 1."""
     fx, skew, cx, fy, cy = pinhole
     v = (y - cy) / fy

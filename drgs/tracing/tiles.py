@@ -23,7 +23,7 @@ from drgs.tracing import records as layout
 from drgs.tracing.arrays import Float, Int32, Lib, Mask, UInt32, UInt64
 from drgs.tracing.free_rays import FreeRays
 from drgs.tracing.kernels import HitModel
-from drgs.tracing.lens_rays import LensRays
+from drgs.tracing.lens_rays import LensRays, pinhole_length
 from drgs.tracing.primitives import TOLERANCE_LISTED, TOLERANCE_UNLISTED, Patch, Projected, Ray, trimmed_extent2
 from drgs.tracing.records import load_record
 from drgs.tracing.responses import response_of
@@ -241,11 +241,7 @@ class TileTraversal:
             return Ray(carried=carried, basis=self.basis)
         if self.lens is not None:
             return self.lens.ray(self.pinhole, flat, inside, carried, self.basis, self.shifted)
-        fx, skew, cx, fy, cy = self.pinhole
-        v = (y - cy) / fy
-        u = (x - cx - skew * v) / fx
-        length = dr.sqrt(dr.fma(u, u, dr.fma(v, v, 1)))
-        return Ray(x, y, length, carried, self.basis, shifted=self.shifted)
+        return Ray(x, y, pinhole_length(self.pinhole, x, y), carried, self.basis, shifted=self.shifted)
 
 
 def is_trimmed(settings: RenderSettings) -> bool:
@@ -393,17 +389,17 @@ def listed(
     what = f"({count} Gaussians, {width}x{height} pixels)"
     # A box holds many tiles that its ellipse misses, most of all where a Gaussian reaches behind the camera. Small
     # boxes hold few, and looking for them costs more than they do.
-    tested = boxes.pairs > _TEST_TILES_FROM * boxes_seen
-    loaded = [dr.gather(lib.Float, record, order * layout.RECORD + k) for k in range(layout.RECORD)]
-    if boxes.pairs > _TEST_BLOCKS_FROM * boxes_seen and lens is None:
+    tested = is_tested(boxes.pairs, boxes_seen)
+    loaded = _entries(lib, record, order)
+    if tested is None and lens is None:
         across = -(-columns // _BLOCK)
         found = boxes.of_blocks().keys(across, _Tiles(lib, settings, loaded, size=_BLOCK * TILE), what)
         if not dr.width(found):
             return nothing
         boxes = boxes.within(found, across)
-        at = dr.gather(lib.UInt32, order, boxes.gaussian) * layout.RECORD
-        loaded = [dr.gather(lib.Float, record, at + k) for k in range(layout.RECORD)]
-    keys = boxes.keys(columns, _Tiles(lib, settings, loaded, lens=lens) if tested else None, what)
+        loaded = _entries(lib, record, dr.gather(lib.UInt32, order, boxes.gaussian))
+    tiles = None if tested is False else _Tiles(lib, settings, loaded, lens=lens)
+    keys = boxes.keys(columns, tiles, what)
     pairs = dr.width(keys)
     if pairs == 0:
         return nothing
@@ -480,10 +476,12 @@ def keys_of_boxes(
     gaussian = dr.arange(lib.UInt32, dr.width(amount))
     x, y = ([dr.gather(lib.Int32, b, order) for b in along] for along in (x, y))
     boxes = _Boxes(lib, gaussian, x, y, dr.gather(lib.UInt32, amount, order), pairs)
-    if not is_tested:
-        return boxes.all_keys(columns, None)
-    loaded = [dr.gather(lib.Float, record, order * layout.RECORD + k) for k in range(layout.RECORD)]
-    return boxes.all_keys(columns, _Tiles(lib, settings, loaded))
+    return boxes.all_keys(columns, _Tiles(lib, settings, _entries(lib, record, order)) if is_tested else None)
+
+
+def _entries(lib: Lib, record: Float, gaussian: UInt32) -> list[Float]:
+    """The record of each Gaussian, of which only what is used is read."""
+    return [dr.gather(lib.Float, record, gaussian * layout.RECORD + k) for k in range(layout.RECORD)]
 
 
 def lists_of_keys(lib: Lib, keys: UInt64, order: UInt32, columns: int, rows: int) -> Lists:
