@@ -101,7 +101,7 @@ class _Reverse(torch.autograd.Function):
 
 def _traced(call: Call, values: Iterable[torch.Tensor], needed: Iterable[bool]) -> tuple[list, list]:
     """The ends of a graph: inputs, None where no gradient is needed, and images in the order of `call.image_names`."""
-    inputs = {n: to_drjit(call.lib, x) for n, x in zip(call.inputs, values, strict=True)}
+    inputs = {n: _plain(call.lib, x) for n, x in zip(call.inputs, values, strict=True)}
     ends = [x if need else None for x, need in zip(inputs.values(), needed, strict=True)]
     dr.enable_grad([x for x in ends if x is not None])
     images = call.trace(**inputs)
@@ -125,31 +125,27 @@ class _Functional(torch.autograd.Function):
     @staticmethod
     @runtime.alone
     def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        call, lib = ctx.call, ctx.call.lib
-        inputs = {n: _plain(lib, x) for n, x in zip(call.inputs, ctx.saved_tensors, strict=True)}
-        dr.enable_grad(inputs)
-        images = call.trace(**inputs)
-        for name, g in zip(call.image_names, cotangents, strict=True):
-            dr.set_grad(images[name], _plain(lib, g).array)
+        values = ctx.saved_tensors
+        inputs, images = _traced(ctx.call, values, [True] * len(values))
+        for image, g in zip(images, cotangents, strict=True):
+            dr.set_grad(image, _plain(ctx.call.lib, g).array)
         dr.enqueue(dr.ADMode.Backward, images)
         dr.traverse(dr.ADMode.Backward)
-        gradients = tuple(dr.grad(x).torch().clone() for x in inputs.values())
-        return None, *first_only("render", gradients, (*ctx.saved_tensors, *cotangents))
+        gradients = tuple(dr.grad(x).torch().clone() for x in inputs)
+        return None, *first_only("render", gradients, (*values, *cotangents))
 
     @staticmethod
     @runtime.alone
     def jvp(ctx: Any, _call: None, *tangents: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
-        call, lib = ctx.call, ctx.call.lib
-        inputs = {n: _plain(lib, x) for n, x in zip(call.inputs, ctx.saved_tensors, strict=True)}
-        dr.enable_grad(inputs)
-        images = call.trace(**inputs)
-        for x, v in zip(inputs.values(), tangents, strict=True):
+        values = ctx.saved_tensors
+        inputs, images = _traced(ctx.call, values, [True] * len(values))
+        for x, v in zip(inputs, tangents, strict=True):
             if v is not None:
-                dr.set_grad(x, _plain(lib, v))
+                dr.set_grad(x, _plain(ctx.call.lib, v))
         dr.enqueue(dr.ADMode.Forward, inputs)
         dr.traverse(dr.ADMode.Forward)
-        image_tangents = tuple(dr.grad(images[name]).torch().clone() for name in call.image_names)
-        return first_only("render", image_tangents, (*ctx.saved_tensors, *tangents))
+        image_tangents = tuple(dr.grad(x).torch().clone() for x in images)
+        return first_only("render", image_tangents, (*values, *tangents))
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *_: Any) -> NoReturn:
