@@ -15,6 +15,7 @@ the reduced size.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import random
 import statistics
@@ -475,22 +476,21 @@ def recommend(measured: Measured, use: str, budgets: Sequence[float]) -> list[Ad
         timed = [(row, error, row.full.get(clock) if full else row.times[clock]) for row, error in within]
         faster = [(row, error, times) for row, error, times in timed if times and times.high < sure]
         exact = next((entry for entry in timed if entry[0] is measured.truth), None)
-        pick = Advice(use=use, budget=budget, clock=clock)
-        if faster or exact:
-            if faster:
-                least = min(faster, key=lambda entry: entry[2].ratio)
-                alike = [entry for entry in faster if entry[2].low <= least[2].high]
-                row, error, times = min(alike, key=lambda entry: entry[1])
-            else:
-                row, error, times = exact
-                times = times or row.times[clock]
-                pick = dataclasses.replace(pick, reason="no measurable gain over exact")
-            fields = {"name": row.name, "kind": row.kind, "flags": row.flags, "gain": bool(faster), "full": full}
-            numbers = {name: getattr(times, name) for name in ("ratio", "low", "high", "rounds")}
-            pick = dataclasses.replace(pick, error=error, **fields, **numbers)
+        reason = None
+        if faster:
+            least = min(faster, key=lambda entry: entry[2].ratio)
+            alike = [entry for entry in faster if entry[2].low <= least[2].high]
+            row, error, times = min(alike, key=lambda entry: entry[1])
+        elif exact:
+            row, error, times = exact
+            times = times or row.times[clock]
+            reason = "no measurable gain over exact"
         else:
-            pick = dataclasses.replace(pick, reason=_why_none(measured, use))
-        picks.append(pick)
+            picks.append(Advice(use=use, budget=budget, clock=clock, reason=_why_none(measured, use)))
+            continue
+        numbers = {name: getattr(times, name) for name in ("ratio", "low", "high", "rounds")}
+        fields = {"name": row.name, "kind": row.kind, "flags": row.flags, "gain": bool(faster), "full": full}
+        picks.append(Advice(use=use, budget=budget, clock=clock, reason=reason, error=error, **fields, **numbers))
     return picks
 
 
@@ -659,10 +659,6 @@ class _Setup:
         pairs = zip(self.leaves.items(), derivatives, strict=True)
         return {name: torch.zeros_like(x) if y is None else y for (name, x), y in pairs}
 
-    def information(self, camera: Camera, settings: RenderSettings, share: float) -> Tensors:
-        """The Fisher diagonal by group."""
-        return scaled_diagonal(self.gaussians, camera, settings, share)
-
 
 class _Measurement:
     """One row's measurements, view by view and round by round."""
@@ -712,7 +708,9 @@ class _Measurement:
         diagonal = None
         if "information" not in self.row.notes:
             try:
-                diagonal, took["fisher"] = clocked(lambda: setup.information(camera, self.settings, share))
+                diagonal, took["fisher"] = clocked(
+                    lambda: scaled_diagonal(setup.gaussians, camera, self.settings, share)
+                )
             except NotImplementedError as error:
                 self.row.notes["information"] = why_skipped(error)
         if number == 0:
@@ -1120,30 +1118,23 @@ def _labels(figure: Figure, axis: Axes, points: list[Point], dots: list[Point]) 
     taken = [Bbox.from_bounds(x - 4, y - 4, 8, 8) for x, y in places]
     taken.append(axis.get_legend().get_window_extent(renderer))
     for x, y, row in points:
-        for reach in (6, 16, 30, 46):
-            for angle in (0, 180, 90, 270, 45, 315, 135, 225):
-                dx = reach * math.cos(math.radians(angle))
-                dy = reach * math.sin(math.radians(angle))
-                text = axis.annotate(
-                    row.name,
-                    (x, y),
-                    xytext=(dx, dy),
-                    textcoords="offset points",
-                    fontsize=7.5,
-                    color=_COLORS[row.kind],
-                    ha="left" if dx > 1 else "right" if dx < -1 else "center",
-                    va="bottom" if dy > 1 else "top" if dy < -1 else "center",
-                    arrowprops={"arrowstyle": "-", "lw": 0.4, "color": "gray"} if reach > 6 else None,
-                )
-                box = text.get_window_extent(renderer)
-                if (
-                    inside.contains(box.x0, box.y0)
-                    and inside.contains(box.x1, box.y1)
-                    and not box.count_overlaps(taken)
-                ):
-                    taken.append(box)
-                    break
-                text.remove()
-            else:
-                continue
-            break
+        for reach, angle in itertools.product((6, 16, 30, 46), (0, 180, 90, 270, 45, 315, 135, 225)):
+            dx = reach * math.cos(math.radians(angle))
+            dy = reach * math.sin(math.radians(angle))
+            text = axis.annotate(
+                row.name,
+                (x, y),
+                xytext=(dx, dy),
+                textcoords="offset points",
+                fontsize=7.5,
+                color=_COLORS[row.kind],
+                ha="left" if dx > 1 else "right" if dx < -1 else "center",
+                va="bottom" if dy > 1 else "top" if dy < -1 else "center",
+                arrowprops={"arrowstyle": "-", "lw": 0.4, "color": "gray"} if reach > 6 else None,
+            )
+            box = text.get_window_extent(renderer)
+            corners = (box.x0, box.y0), (box.x1, box.y1)
+            if all(inside.contains(*corner) for corner in corners) and not box.count_overlaps(taken):
+                taken.append(box)
+                break
+            text.remove()
