@@ -17,18 +17,16 @@ from drgs.commands import tradeoff
 from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.files import load_ply, save_ply
 from drgs.integrator import render
-from drgs.lab.tradeoff import (
+from drgs.lab.tradeoff import measure, measure_full
+from drgs.lab.tradeoff_advice import USES, recommend
+from drgs.lab.tradeoff_rows import (
     TRADEOFF_VARIANTS,
-    USES,
     GroupInformation,
     Interval,
     Measured,
     TradeoffRow,
     WorstErrors,
     interval,
-    measure,
-    measure_full,
-    recommend,
 )
 from drgs.settings import RenderSettings
 

@@ -41,20 +41,10 @@ from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import atomic_write, lock_folder, write_json
-from drgs.lab.tradeoff import (
-    CLOCKS,
-    TRADEOFF_VARIANTS,
-    USES,
-    Advice,
-    FullSize,
-    Interval,
-    Measured,
-    TradeoffRow,
-    measure,
-    measure_full,
-    plot,
-    recommend,
-)
+from drgs.lab.tradeoff import FullSize, measure, measure_full
+from drgs.lab.tradeoff_advice import USES, Advice, recommend
+from drgs.lab.tradeoff_plot import plot
+from drgs.lab.tradeoff_rows import CLOCKS, TRADEOFF_VARIANTS, Interval, Measured, TradeoffRow
 from drgs.pages.report import charts
 
 _log = logging.getLogger(__name__)
