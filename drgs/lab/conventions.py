@@ -186,16 +186,13 @@ class ReferenceModel:
         camera = self._camera(posed(raw, camera))
         g, shift = gaussians_of(self._parameters(raw, camera))
         settings = self.settings.replace(background=(0.0, 0.0, 0.0)) if COLORS in raw else self.settings
-        if self._needs_oracle:
-            out = reference.render(g, camera, settings, **self._oracle_arguments())
-            yield ((0, 0), *self._developed(image_of(out, raw, shift), out.alpha))
-            return
-        if not oracle:
-            out = render(g, camera, settings, outputs=())
-            yield ((0, 0), *self._developed(image_of(out, raw, shift), out.alpha))
-            return
-        for x, y, width, height in _windows(camera):
-            out = reference.render(g, camera, settings, window=(x, y, width, height))
+        for x, y, width, height in _windows(camera, whole=self._needs_oracle or not oracle):
+            if self._needs_oracle:
+                out = reference.render(g, camera, settings, **self._oracle_arguments())
+            elif oracle:
+                out = reference.render(g, camera, settings, window=(x, y, width, height))
+            else:
+                out = render(g, camera, settings, outputs=())
             yield ((y, x), *self._developed(image_of(out, raw, shift), out.alpha))
 
     def _oracle_arguments(self) -> dict[str, bool]:
@@ -452,7 +449,8 @@ def find(
 
     start = min(starts, key=distance)
     if distance(start) > settled:
-        counts = _countable(near_ties(start))
+        ties = near_ties(start)
+        counts = ~ties if float((~ties).double().mean()) >= LEAST else counts  # next to none are left
     model = _descend(distance, legal, start, start, settled)
     unusual = [field for field in _different(model, start) if not hasattr(model, field) and field != "background"]
     for other in starts if unusual or distance(model) > settled else ():
@@ -472,11 +470,6 @@ def find(
         without = distance(changed if suits(changed) else start)
         findings.append(Finding(name, _text(usual), _text(_get(model, field)), without, distance(model), groups))
     return SearchResult(start, model, distance(start), distance(model), findings)
-
-
-def _countable(ties: torch.Tensor) -> torch.Tensor:
-    """Pixels to be compared: those without near ties, or all where there would be next to none."""
-    return ~ties if float((~ties).double().mean()) >= LEAST else torch.ones_like(ties)
 
 
 @dataclasses.dataclass(frozen=True)
