@@ -16,6 +16,7 @@ from drgs import reference
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
 from drgs.integrator import Output, render, render_jvp
+from drgs.lab.parameters import twist_basis
 from drgs.settings import RenderSettings
 
 FIELDS = ("rgb", "alpha", "depth", "features")
@@ -89,17 +90,6 @@ def random_gaussians(
 
 
 # -------------------------------------------------- derivatives both ways
-
-
-def twist_basis() -> torch.Tensor:
-    """(6, 4, 4) generators of rigid motions, rotations first."""
-    basis = torch.zeros(6, 4, 4, dtype=torch.float64)
-    for k in range(3):
-        i, j = (k + 1) % 3, (k + 2) % 3
-        basis[k, j, i] = 1
-        basis[k, i, j] = -1
-        basis[3 + k, k, 3] = 1
-    return basis
 
 
 def pose_gradient(w2c: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:

@@ -66,16 +66,19 @@ def _moved(raw: dict[str, torch.Tensor], camera: Camera, field: str, twist: torc
     # The motion is the parameter, not the matrix: a camera whose pose is a leaf gets no gradient here.
     w2c = float64(getattr(camera, field)).detach()
     twist = float64(twist)
-    turn = twist[:3]
-    shift = twist[3:] * depth_of(raw, camera)
-    zero = torch.zeros_like(turn[0])
-    rows = [
-        zero, -turn[2], turn[1], shift[0],
-        turn[2], zero, -turn[0], shift[1],
-        -turn[1], turn[0], zero, shift[2],
-        zero, zero, zero, zero,
-    ]  # fmt: skip
-    return torch.matrix_exp(torch.stack(rows).reshape(4, 4)) @ w2c
+    unit = torch.tensor([1.0] * 3 + [depth_of(raw, camera)] * 3, dtype=torch.float64)
+    return torch.matrix_exp(((unit * twist)[:, None, None] * twist_basis()).sum(0)) @ w2c
+
+
+def twist_basis() -> torch.Tensor:
+    """(6, 4, 4) generators of rigid motions, rotations first."""
+    basis = torch.zeros(6, 4, 4, dtype=torch.float64)
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        basis[k, j, i] = 1
+        basis[k, i, j] = -1
+        basis[3 + k, k, 3] = 1
+    return basis
 
 
 def depth_of(raw: dict[str, torch.Tensor], camera: Camera) -> float:
