@@ -17,6 +17,7 @@ from drgs.information.quantity import Quantity, ViewContext
 from drgs.integrator import render_jvp
 from drgs.settings import RenderSettings
 from drgs.tracing.inputs import check_view, gaussians_at
+from drgs.tracing.pose import twists_about
 
 BATCH = 16  # tangents of one traversal; chosen: bounds memory
 
@@ -86,11 +87,7 @@ class PoseInformation(Quantity):
     def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
         """Float64."""
         colors = view.gaussians.replace(features=None)  # else their columns would be computed, too, for nothing
-        # Rotations are about the Gaussians' origin: one about a 0 that is far away is nearly a translation, and float64
-        # could not tell them apart.
-        twists = np.eye(6)
-        twists[:3, 3:] = np.cross(colors.origin, np.eye(3))
-        out = render_jvp(colors, view.camera, {"camera": torch.from_numpy(twists)}, view.settings, outputs=())
+        out = render_jvp(colors, view.camera, {"camera": twists_about(colors.origin)}, view.settings, outputs=())
         columns = out.rgb.reshape(6, -1).double()
         return {"pose": columns @ columns.T}
 

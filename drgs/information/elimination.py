@@ -11,7 +11,6 @@ import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 
 from drgs.information.complement import Eliminated
@@ -19,10 +18,10 @@ from drgs.information.pullback import Pullback
 from drgs.tracing.bridge import differentiable
 from drgs.tracing.call import Call
 from drgs.tracing.errors import own_errors
+from drgs.tracing.pose import twists_about
 from drgs.tracing.tangents import push_forward
 
 if TYPE_CHECKING:
-    from drgs.cameras import Camera
     from drgs.information.groups import Group
     from drgs.information.nuisances import Nuisances
     from drgs.information.quantity import ViewContext
@@ -53,7 +52,7 @@ def eliminated_of(call: Call, scales: torch.Tensor, nuisances: Nuisances) -> Eli
     if "pose" in nuisances.names:
         assert call.camera is not None  # as of every view; rays have no pose
         with own_errors():
-            moved = push_forward(call, {"camera": _twists(call.camera)})
+            moved = push_forward(call, {"camera": twists_about(call.camera.center)})
         rows = moved.rgb if moved.features is None else torch.cat([moved.rgb, moved.features], -1)
         columns += rows.reshape(6, -1, width).double().cpu()
         turn, shift = nuisances.pose_std or (None, None)
@@ -67,13 +66,6 @@ def eliminated_of(call: Call, scales: torch.Tensor, nuisances: Nuisances) -> Eli
 
 def _precision(std: float | None) -> float:
     return 0.0 if std is None else 1 / std**2
-
-
-def _twists(camera: Camera) -> torch.Tensor:
-    """(6, 6) float64 world-frame twists: rotations about the camera's center, then translations."""
-    center = np.asarray(camera.center, np.float64)
-    turned = np.concatenate([np.eye(3), np.cross(center, np.eye(3))], 1)
-    return torch.from_numpy(np.concatenate([turned, np.eye(3, 6, 3)]))
 
 
 BLOCK_INPUTS = ("means", "rotations", "log_scales", "logit_opacities", "sh")

@@ -53,6 +53,16 @@ def twisted(pose: torch.Tensor, twist: torch.Tensor) -> torch.Tensor:
     return -pose @ generator
 
 
+def twists_about(point: np.ndarray) -> torch.Tensor:
+    """(6, 6) float64 world-frame twists: rotations about a point, then translations.
+
+    About the world's 0, a rotation of what is far away is nearly a translation, and float64 could not tell them apart.
+    """
+    twists = np.eye(6)
+    twists[:3, 3:] = np.cross(point, np.eye(3))
+    return torch.from_numpy(twists)
+
+
 def turned(omega: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
     """(P, 3) tangent of vectors along a rotation omega (3,)."""
     return torch.cross(omega.to(x.device).expand_as(x), x, dim=1)
