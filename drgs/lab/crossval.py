@@ -526,8 +526,7 @@ def _wide_gradients(case: Case, model: ReferenceModel, rgb: Compared, channels: 
         rasterizer.gradient(raw, camera, black, u[0])
     except Exception as error:  # whatever a function raises that knows three channels only
         return {}, f"it draws no image of {channels} channels: {one_line(error)}"
-    ties = lambda _: case.near_ties(case.first)  # noqa: E731
-    wide = dataclasses.replace(case, raw=raw, cameras=[camera], background=black, first=0, near_ties=ties)
+    wide = case.of_view(raw=raw, background=black)
     drawn = [_rendered(model, raw, camera, case.oracle)]
     wider = compared(wide, model, u, [picture], [alpha], drawn)
     right = [name for name, row in rgb.groups.items() if row.verdict == "agreement"]

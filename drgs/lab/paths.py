@@ -58,7 +58,9 @@ _CULLED = 3  # Gaussians behind the camera that are put in front of the others i
 _GROWN = 0.1  # log of the factor by which the Gaussians of a second batch are larger
 _APART = 0.02  # radians and median depths by which a second camera is moved
 
-Draw = Callable[[dict, Camera, tuple], tuple[torch.Tensor, torch.Tensor]]
+Drawn = tuple[torch.Tensor, torch.Tensor]
+"""Image and alpha."""
+Draw = Callable[[dict, Camera, tuple], Drawn]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -273,7 +275,7 @@ class _Tests:
         backgrounds: list[tuple],
         changed: dict | None = None,
         channels: int = 3,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    ) -> Drawn:
         """Images of one call, below each other: (B C H, W, channels) and (B C H, W)."""
         assert self._own.several is not None  # `row` refuses what has none
         images, alphas = self._own.several(raws, cameras, backgrounds, changed or {}, channels)
@@ -293,8 +295,7 @@ class _Tests:
         drawn = model.draw({k: x.detach() for k, x in case.raw.items()}, self._view, case.oracle)
         drawn = tuple(x.detach().cpu() for x in drawn)
         signs = cotangents([self._view], case.seed, channels) * (alpha >= least_alpha)[..., None]
-        ties = lambda _: case.near_ties(case.first)  # noqa: E731
-        other = dataclasses.replace(case, rasterizer=rasterizer, cameras=[self._view], first=0, near_ties=ties)
+        other = case.of_view(rasterizer=rasterizer)
         found = compared(other, model, signs, [picture], [alpha], [drawn])
         right = [k for k, row in self.rgb.groups.items() if row.verdict in ("agreement", "known deviation")]
         found.groups = {k: row for k, row in found.groups.items() if k in right}
@@ -320,16 +321,15 @@ class _Tests:
         unit = depth_of(self.case.raw, camera)
         channels = 1 if hits else 4
 
-        def draw(raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
+        def draw(raw: dict, camera: Camera, background: tuple) -> Drawn:
             image, alpha = self._called([raw], [camera], [background], {"render_mode": mode}, channels)
             return torch.cat([image[..., :-1], image[..., -1:] / unit], -1), alpha
 
-        values = {field.name: getattr(self.model, field.name) for field in dataclasses.fields(self.model)}
-        model = _DepthModel(**values, mode=mode, unit=unit)
+        model = _DepthModel(**vars(self.model), mode=mode, unit=unit)
         return self._beside(path, draw, model, channels, _FAINT if "E" in mode else 0)
 
     def _alpha(self, path: str) -> PathRow:
-        def draw(raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
+        def draw(raw: dict, camera: Camera, background: tuple) -> Drawn:
             _, alpha = self._own.draw(raw, camera, background)
             return alpha[..., None], alpha
 
@@ -337,8 +337,7 @@ class _Tests:
             leaves = {k: x.requires_grad_() for k, x in self._own.prepared(self.case.raw).items() if k not in MOTIONS}
             if not draw(leaves, self._view, self.case.background)[0].requires_grad:
                 raise _NotTested("its alpha has no gradient", "a function whose alpha has one")
-        values = {field.name: getattr(self.model, field.name) for field in dataclasses.fields(self.model)}
-        return self._beside(path, draw, _AlphaModel(**values), 1)
+        return self._beside(path, draw, _AlphaModel(**vars(self.model)), 1)
 
     def _antialiased(self, path: str) -> PathRow:
         if not self.model.settings.planar or self.model.compensation != "none":
@@ -356,6 +355,11 @@ class _Tests:
         images = [dataclasses.replace(self._own, draw=d).image(raw, camera, background) for d in (draw, self._own.draw)]
         if torch.equal(images[0][0], images[1][0]):
             raise _NotTested(f"{argument} changes nothing", f"a function whose signature names {argument}")
+
+    def _require(self, argument: str) -> None:
+        """Raise if the signature does not name an argument."""
+        if argument not in self._own.named:
+            raise _NotTested(f"its signature does not name {argument}", "a function that does")
 
     def _alike(self, path: str, varied: Draw, plain: Draw, what: str = "", raw: dict | None = None) -> PathRow:
         """Whether a call's image and gradients are those of plain calls that amount to the same."""
@@ -385,14 +389,11 @@ class _Tests:
     def _degrees(self, path: str) -> PathRow:
         if COLORS in self.case.raw or self.case.raw["sh"].shape[1] == 1:
             raise _NotTested("the scene has SH of degree 0 alone", "a scene with higher ones")
-        if "sh_degree" not in self._own.named:
-            raise _NotTested("its signature does not name sh_degree", "a function that does")
+        self._require("sh_degree")
         highest = round(self.case.raw["sh"].shape[1] ** 0.5) - 1
         for degree in range(highest):
 
-            def plain(
-                raw: dict, camera: Camera, background: tuple, degree: int = degree
-            ) -> tuple[torch.Tensor, torch.Tensor]:
+            def plain(raw: dict, camera: Camera, background: tuple, degree: int = degree) -> Drawn:
                 return self._own.draw(raw | {"sh": raw["sh"][:, : (degree + 1) ** 2]}, camera, background)
 
             row = self._alike(path, self._with(sh_degree=degree), plain)
@@ -401,12 +402,11 @@ class _Tests:
         return _judged(path, "agreement", f"0 to {highest}, the scene's")
 
     def _backgrounds(self, path: str) -> PathRow:
-        if "backgrounds" not in self._own.named:
-            raise _NotTested("its signature does not name backgrounds", "a function that does")
+        self._require("backgrounds")
         black = (0.0, 0.0, 0.0)
         behind = torch.tensor([(0.3, 0.9, 0.6)], dtype=torch.float64)
 
-        def plain(raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
+        def plain(raw: dict, camera: Camera, background: tuple) -> Drawn:
             own = {name: x for name, x in raw.items() if name != BACKGROUNDS}
             image, alpha = self._own.draw(own, camera, black)
             return image + (1 - alpha[..., None]) * raw[BACKGROUNDS], alpha
@@ -421,10 +421,10 @@ class _Tests:
         still = {"means": self.case.raw["means"], POSE: torch.full((6,), _APART, dtype=torch.float64)}
         second = others[0] if others else posed(still, first)
 
-        def varied(raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
+        def varied(raw: dict, camera: Camera, background: tuple) -> Drawn:
             return self._called([raw], [camera, second], [background, background[::-1]])
 
-        def plain(raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
+        def plain(raw: dict, camera: Camera, background: tuple) -> Drawn:
             return _below(self._own.draw(raw, *x) for x in ((camera, background), (second, background[::-1])))
 
         return self._alike(path, varied, plain, "two")
@@ -433,17 +433,16 @@ class _Tests:
         def raws(raw: dict) -> list[dict]:
             return [raw, raw | {"log_scales": raw["log_scales"] + _GROWN, "sh": 0.8 * raw["sh"]}]
 
-        def varied(raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
+        def varied(raw: dict, camera: Camera, background: tuple) -> Drawn:
             return self._called(raws(raw), [camera], [background])
 
-        def plain(raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
+        def plain(raw: dict, camera: Camera, background: tuple) -> Drawn:
             return _below(self._own.draw(x, camera, background) for x in raws(raw))
 
         return self._alike(path, varied, plain, "two")
 
     def _packed(self, path: str) -> PathRow:
-        if "packed" not in self._own.named:
-            raise _NotTested("its signature does not name packed", "a function that does")
+        self._require("packed")
         return self._alike(path, self._with(packed=True), self._own.draw)
 
     def _culled(self, path: str) -> PathRow:
@@ -459,7 +458,7 @@ class _Tests:
             "sh": torch.full((_CULLED, *self.case.raw["sh"].shape[1:]), 0.7),
         }
 
-        def varied(raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
+        def varied(raw: dict, camera: Camera, background: tuple) -> Drawn:
             longer = {k: torch.cat([x.to(raw[k]), raw[k]]) for k, x in unusual.items()}
             longer |= {k: _posed_as(raw, longer, camera, k) for k in MOTIONS if k in raw}
             return self._called([longer], [camera], [background])
@@ -476,7 +475,7 @@ class _Tests:
         near = float(0.5 * (ahead[k - 1] + ahead[k]))
         beyond = torch.nonzero(depths > near)[:, 0]
 
-        def plain(raw: dict, camera: Camera, background: tuple) -> tuple[torch.Tensor, torch.Tensor]:
+        def plain(raw: dict, camera: Camera, background: tuple) -> Drawn:
             fewer = {k: x if k in MOTIONS else x[beyond.to(x.device)] for k, x in raw.items()}
             fewer |= {k: _posed_as(raw, fewer, camera, k) for k in MOTIONS if k in raw}
             return self._own.draw(fewer, camera, background)
@@ -486,7 +485,7 @@ class _Tests:
         return self._alike(path, self._with(near_plane=near), plain, f"at {near:.3g}")
 
 
-def _below(pairs: Iterable[tuple[torch.Tensor, torch.Tensor]]) -> tuple[torch.Tensor, torch.Tensor]:
+def _below(pairs: Iterable[Drawn]) -> Drawn:
     """Several images and alphas, below each other."""
     images, alphas = zip(*pairs, strict=True)
     return torch.cat(images), torch.cat(alphas)

@@ -14,6 +14,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 
@@ -199,6 +200,11 @@ class Case:
     seed: int
     near_ties: Callable[[int], torch.Tensor]
     say: Callable[[str], None]
+
+    def of_view(self, **changed: Any) -> Case:
+        """The first view alone, drawn in another way."""
+        ties = lambda _: self.near_ties(self.first)  # noqa: E731
+        return dataclasses.replace(self, cameras=[self.cameras[self.first]], first=0, near_ties=ties, **changed)
 
     def theirs(self, u: torch.Tensor) -> dict:
         """The rasterizer's gradient, summed over views, of poses (C, 6); None where there is none."""
