@@ -8,7 +8,7 @@ from __future__ import annotations
 from types import ModuleType
 from typing import Any
 
-Lib = ModuleType  # the module of the backend's array types (runtime.dr_types)
+Lib = ModuleType  # the module of the backend's array types (runtime.dr_types): `lib` of every signature
 
 Float = Any  # Float, or Float64 where a Gaussian is projected
 UInt32 = Any

@@ -90,7 +90,6 @@ class Compositor:
     No dataclass on purpose: Dr.Jit would take it for a tree of arrays and copy it.
 
     Args:
-        lib: Dr.Jit types of the backend.
         settings: Settings of the render.
         traversal: Rays of this view, and where they look for Gaussians.
         want: Extra outputs: `depth`, `median`, `count`, `visibility`.

@@ -33,7 +33,6 @@ class FreeRays(LensRays):
     """The rays of one view, by tile, and the table of where they are on the image.
 
     Args:
-        lib: Dr.Jit types of the backend.
         camera: Its K and size; guides are its pixels.
         tile: Pixels of a tile in a row.
         origins, directions: (P, 3) in the world of the records; unit directions, NaN where a pixel has no ray.

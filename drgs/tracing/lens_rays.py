@@ -65,7 +65,6 @@ class LensRays:
     To make them takes about half a second a million pixels, once for all cameras of a lens (`lens_of`).
 
     Args:
-        lib: Dr.Jit types of the backend.
         camera: Its pose plays no role.
         tile: Pixels of a tile in a row.
     Attributes:

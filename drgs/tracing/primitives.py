@@ -186,7 +186,6 @@ class Activated:
     """Activated parameters of every Gaussian in float64, and their camera-frame geometry.
 
     Args:
-        lib: Dr.Jit types of the backend.
         p: Flat raw parameters by name: means, quats, log_scales, logit_opacities, sh.
         w2c: Float64 of width 12, the upper rows of the world-to-camera matrix, of the re-centered world of the means.
         settings: Cut-offs of the render.

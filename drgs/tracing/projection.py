@@ -41,7 +41,6 @@ def project_screen(
     """Screen records of a camera.
 
     Args:
-        lib: Dr.Jit types of the backend.
         p: Flat parameter arrays: means, quats, log_scales, logit_opacities, sh, and mean_offsets and strains if
             derivatives by projected means and by covariances are wanted.
         w2c: Float64 of width 12, the upper rows of the world-to-camera matrix; differentiable.
@@ -126,7 +125,6 @@ def project_world(
     """World records for arbitrary rays: mean, W = S^-1 R^T and its cofactor matrix, opacity, extent^2, color.
 
     Args:
-        lib: Dr.Jit types of the backend.
         p: Flat parameter arrays: means, quats, log_scales, logit_opacities, sh, and strains if derivatives by
             covariances are wanted.
         w2c: Float64 of width 12, the upper rows of the world-to-camera matrix; differentiable.

@@ -318,7 +318,6 @@ def build(
     """List the Gaussians of each tile.
 
     Args:
-        lib: Dr.Jit types.
         projected: `Projected` of the view.
         record: Flat record buffer.
         trimmed: Leave tails out.

@@ -47,7 +47,6 @@ def unscented_boxes(lib: Lib, g: Activated, camera: Camera, origin: torch.Tensor
     """Bounds x0, y0, x1, y1 in pixels, of whole tiles, and which Gaussians have any.
 
     Args:
-        lib: Dr.Jit types of the backend.
         g: Gaussians, in the axes of the camera.
         camera: Its lens and shutter are followed.
         origin: (3,) what was taken off the camera's world.

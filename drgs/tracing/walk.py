@@ -100,7 +100,6 @@ class Part:
     """Lanes, their rays and pixels, and the stream of candidates.
 
     Attributes:
-        lib: Dr.Jit types of the backend.
         model: The formula of a hit.
         records: Flat record buffer of the view.
         rays: One or four a lane, all of which walk along the same stream.
