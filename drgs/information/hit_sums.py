@@ -19,6 +19,7 @@ import torch
 from drgs.information.jacobian import GEOMETRY, Row
 from drgs.tracing.arrays import Float, Lib, Mask, UInt32
 from drgs.tracing.bridge import to_drjit
+from drgs.tracing.protocols import Sink
 from drgs.tracing.records import packed_size
 from drgs.tracing.sums import add_row
 
@@ -73,7 +74,7 @@ class HitSums:
         return rows[..., :GEOMETRY].permute(1, 0, 2)
 
 
-class _Along:
+class _Along(Sink):
     """The sink of one walk.
 
     Args:
@@ -96,10 +97,6 @@ class _Along:
         self.images = to_drjit(lib, padded.reshape(-1)).array
         # Opaque: another number of either is no other kernel.
         self.count, self.pixels = (dr.opaque(lib.UInt32, x) for x in (count, pixels))
-
-    def init(self, k: int) -> dict:
-        """Nothing is kept per ray."""
-        return {}
 
     def take(self, lib: Lib, index: UInt32, hits: Mask, rows: list[Row], states: list[dict]) -> list[dict]:
         """Add the rows of a hit, if its Gaussian is wanted, along every image."""

@@ -184,7 +184,7 @@ def _entry(slopes: list[Float], g: list[Float], turned: list[list[Float]] | None
     return value + turned[c][j] if turned and j < 3 and c < len(turned) else value
 
 
-class SquareSums:
+class SquareSums(Sink):
     """Sums of squares into a buffer of `width` floats a Gaussian: geometry, sum w^2, by band and channel, then padding.
 
     Args:
@@ -213,10 +213,6 @@ class SquareSums:
         self.bands = bands
         self.summed = summed
         self.needs_color = bands > 0
-
-    def init(self, k: int) -> dict:
-        """Nothing is kept per ray."""
-        return {}
 
     def take(self, lib: Lib, index: UInt32, hits: Mask, rows: list[Row], states: list[dict]) -> list[dict]:
         """Add a hit's rows."""
@@ -255,7 +251,7 @@ def _uncolored(row: Row, weights: Sequence[float]) -> Float:
     return sum(x * x * weight for x, weight in zip(row.g[3:], weights[3:], strict=True))
 
 
-class BlockSums:
+class BlockSums(Sink):
     """Sums of outer products: the lower triangles of (13, 13), row by row, then padding; base colors follow the
     geometry.
     """
@@ -268,10 +264,6 @@ class BlockSums:
         self.buffer = dr.zeros(lib.Float, count * self.WIDTH)
         self.weights = weights
         self.mode = mode
-
-    def init(self, k: int) -> dict:
-        """Nothing is kept per ray."""
-        return {}
 
     def take(self, lib: Lib, index: UInt32, hits: Mask, rows: list[Row], states: list[dict]) -> list[dict]:
         """Add a hit's rows."""
@@ -298,7 +290,7 @@ class BlockSums:
         return states
 
 
-class RemovalSums:
+class RemovalSums(Sink):
     """Sums of the changes of the image where a Gaussian is left out: of a hit, dC / da a, as C is linear in the opacity
     a of each hit.
 
@@ -314,10 +306,6 @@ class RemovalSums:
         self.weights = weights
         self.power = power
         self.mode = mode
-
-    def init(self, k: int) -> dict:
-        """Nothing is kept per ray."""
-        return {}
 
     def take(self, lib: Lib, index: UInt32, hits: Mask, rows: list[Row], states: list[dict]) -> list[dict]:
         """Add a hit's rows."""

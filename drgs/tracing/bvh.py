@@ -33,6 +33,7 @@ from drgs.settings import RenderSettings
 from drgs.tracing.arrays import Float, Lib, Mask, UInt32
 from drgs.tracing.kernels import HitModel
 from drgs.tracing.primitives import Projected, Ray
+from drgs.tracing.protocols import DividedStream
 from drgs.tracing.sort_keys import EMPTY, positive
 from drgs.tracing.tiles import depth_order
 from drgs.tracing.walk import BUFFER, Part
@@ -286,7 +287,7 @@ def _around(
     return near[(local <= _INSIDE_MARGIN * radii[:, near] + spread).all(0)]
 
 
-class _ProxyStream:
+class _ProxyStream(DividedStream):
     """Listed Gaussians, then the proxies along rays in the order of their entry points; a `Stream`."""
 
     def __init__(self, lib: Lib, proxies: Proxies | None, ray: Ray, order: str, signed: bool) -> None:
@@ -303,10 +304,6 @@ class _ProxyStream:
             self.o = [dr.fma(d, self.start, x) for x, d in zip(ray.carried[-6:-3], self.d, strict=True)]
             size = dr.maximum(dr.maximum(abs(self.o[0]), abs(self.o[1])), abs(self.o[2]))
             self.step = _ORIGIN_ROUNDING * dr.maximum(size, proxies.scale)
-
-    def opened(self) -> _ProxyStream:
-        """Itself."""
-        return self
 
     def begin(self) -> tuple:
         """(candidates so far, parameter, step, primitive, next member, end of members, something left)."""

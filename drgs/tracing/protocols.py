@@ -24,6 +24,10 @@ class Candidates(Protocol):
 class Stream(Candidates, Protocol):
     """Candidate Gaussians of every lane, one after the other; its state is part of that of Dr.Jit's loop."""
 
+    def opened(self) -> Stream:
+        """Itself."""
+        return self
+
     def begin(self) -> Any:
         """State before the first candidate."""
 
@@ -65,7 +69,8 @@ class Sink(Protocol):
     needs_color: bool
 
     def init(self, k: int) -> dict:
-        """What is kept along shared ray k."""
+        """What is kept along shared ray k: nothing, unless it says otherwise."""
+        return {}
 
     def take(self, lib: Lib, index: UInt32, hits: Mask, rows: list, states: list[dict]) -> list[dict]:
         """Add the rows of Gaussian `index`, one a shared ray; `hits`: lanes that have any."""

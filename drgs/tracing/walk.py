@@ -25,7 +25,7 @@ from drgs.tracing.errors import own_errors
 from drgs.tracing.kernels import HitModel
 from drgs.tracing.peak import entry
 from drgs.tracing.primitives import Projected, Ray
-from drgs.tracing.protocols import Candidates, DividedStream, Kernel
+from drgs.tracing.protocols import Candidates, DividedStream, Kernel, Stream
 from drgs.tracing.records import RECORD, load_record
 from drgs.tracing.sort_keys import BEYOND, EMPTY, ascending, name_of, positive, push, word_of
 from drgs.tracing.weights import PIXELS, Weights
@@ -50,7 +50,7 @@ def pixels_a_lane(basis: int = 0) -> int:
 
 
 @dataclasses.dataclass(eq=False)
-class ListStream:
+class ListStream(Stream):
     """Entries of a list, of each lane those from `start` to `end`; a `Stream`.
 
     Attributes:
@@ -62,10 +62,6 @@ class ListStream:
     index: UInt32
     start: UInt32
     end: UInt32
-
-    def opened(self) -> ListStream:
-        """Itself."""
-        return self
 
     def begin(self) -> UInt32:
         """The place of the first entry."""
