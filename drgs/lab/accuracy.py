@@ -154,12 +154,12 @@ class Oracle:
         # J^T u is linear in u: differentiating <v, J^T u> by u gives J v.
         loss = sum((images[name] * u).sum() for name, u in self.u.items())
         groups = leaves(g, cam)
-        back = _grad(loss, groups, create_graph=True)
+        back = gradient_by(loss, groups, create_graph=True)
         # Tangents are constants: with the pose's graph, the second differentiation below would go through it again.
         change = dict(self.v)
         for name, pose in _poses(cam).items():
             change[name] = -pose.detach() @ (self.v[name][:, None, None] * twist_basis()).sum(0)
-        self.push = _grad(sum((back[name].double() * change[name]).sum() for name in back), self.u)
+        self.push = gradient_by(sum((back[name].double() * change[name]).sum() for name in back), self.u)
         # The graph has served; kept, it would hold every intermediate of the oracle for as long as this object lives.
         self.back = {n: x.detach().double() for n, x in back.items()}
         self.back |= {name: pose_gradient(pose, self.back[name]) for name, pose in _poses(cam).items()}
@@ -174,7 +174,8 @@ def weight_of(name: str, out: reference.ReferenceOutput) -> torch.Tensor | float
     return torch.where(alpha < _LEAST_ALPHA, 0.0, alpha) if name == "depth" else 1.0
 
 
-def _grad(loss: torch.Tensor, groups: Mapping[str, torch.Tensor], **options: bool) -> dict[str, torch.Tensor]:
+def gradient_by(loss: torch.Tensor, groups: Mapping[str, torch.Tensor], **options: bool) -> dict[str, torch.Tensor]:
+    """Derivative of a number by each group, 0 where it does not depend on it; options of `torch.autograd.grad`."""
     if not loss.requires_grad:
         return {name: torch.zeros_like(x) for name, x in groups.items()}
     derivatives = torch.autograd.grad(loss, list(groups.values()), allow_unused=True, **options)
@@ -187,7 +188,7 @@ def gradients(
     """float64 gradient of sum <u, image> by group, `camera` and `camera_end` as twists."""
     # Sums over an image in float64: in float32 they lose more digits than the gradients are compared by.
     loss = sum((getattr(out, name).double() * w).sum() for name, w in u.items())
-    derivatives = {name: x.double() for name, x in _grad(loss, leaves(g, cam)).items()}
+    derivatives = {name: x.double() for name, x in gradient_by(loss, leaves(g, cam)).items()}
     return derivatives | {name: pose_gradient(pose, derivatives[name]) for name, pose in _poses(cam).items()}
 
 

@@ -22,6 +22,7 @@ from drgs.cameras.shutters import SHUTTERS
 from drgs.display.srgb import linear_from_srgb
 from drgs.ellipsoids import Y_00
 from drgs.integrator import render
+from drgs.lab.accuracy import gradient_by
 from drgs.lab.parameters import COLORS, gaussians_of, image_of, posed
 from drgs.oracle import activate, float64, rolling_poses, screen_rows
 from drgs.settings import RenderSettings
@@ -149,11 +150,9 @@ class ReferenceModel:
         cotangent = self._flipped(cotangent)  # of what is not flipped yet
         # One piece at a time: what autograd keeps of it is freed before the next one is drawn.
         for (y, x), image, _ in self._pieces(leaves, camera, oracle):
-            if image.requires_grad:
-                loss = (image * cotangent[y : y + image.shape[0], x : x + image.shape[1]]).sum()
-                derivatives = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True, retain_graph=True)
-                for name, slope in zip(leaves, derivatives, strict=True):
-                    total[name] += 0 if slope is None else slope.double()
+            loss = (image * cotangent[y : y + image.shape[0], x : x + image.shape[1]]).sum()
+            for name, slope in gradient_by(loss, leaves, retain_graph=True).items():
+                total[name] += slope.double()
         return total
 
     def near_ties(self, raw: dict, camera: Camera) -> torch.Tensor:

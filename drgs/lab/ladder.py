@@ -27,6 +27,7 @@ from drgs import reference
 from drgs.cameras import Camera
 from drgs.ellipsoids import Gaussians
 from drgs.integrator import render
+from drgs.lab.accuracy import gradient_by
 from drgs.lab.parameters import PARAMETERS
 from drgs.oracle import sh_colors
 from drgs.settings import RenderSettings
@@ -314,12 +315,8 @@ class Pictures:
         if self.gradients:
             # In float64, so that rounding of the sum is no rung of the ladder.
             loss: Any = sum((image.double() * u).sum() for image, u in zip(images, cotangents, strict=True))
-            leaves = [g.parameters()[name] for name in PARAMETERS]
-            derivatives: Sequence[torch.Tensor | None] = [None] * len(leaves)
-            if loss.requires_grad:
-                derivatives = torch.autograd.grad(loss, leaves, allow_unused=True)
-            for name, leaf, x in zip(PARAMETERS, leaves, derivatives, strict=True):
-                gradient[name] = torch.zeros_like(leaf) if x is None else x.detach().cpu()
+            slopes = gradient_by(loss, {name: g.parameters()[name] for name in PARAMETERS})
+            gradient = {name: x.detach().cpu() for name, x in slopes.items()}
         # What is kept are numbers: a graph would hold every picture's intermediates.
         return State(torch.cat([x.detach().cpu().double().reshape(-1, 3) for x in images]), gradient)
 

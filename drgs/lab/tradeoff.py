@@ -22,6 +22,7 @@ import torch
 from drgs import fisher, reference, runtime
 from drgs.cameras.sizes import at_most, by_share
 from drgs.integrator import Output, render, render_rays
+from drgs.lab.accuracy import gradient_by
 from drgs.lab.tradeoff_advice import leaders
 from drgs.lab.tradeoff_rows import (
     CLOCKS,
@@ -190,9 +191,7 @@ class _Setup:
 
     def gradient(self, image: torch.Tensor, cotangent: torch.Tensor) -> Tensors:
         """J^T u by group."""
-        derivatives = torch.autograd.grad((image * cotangent).sum(), list(self.leaves.values()), allow_unused=True)
-        pairs = zip(self.leaves.items(), derivatives, strict=True)
-        return {name: torch.zeros_like(x) if y is None else y for (name, x), y in pairs}
+        return gradient_by((image * cotangent).sum(), self.leaves)
 
 
 class _Measurement:
