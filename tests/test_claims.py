@@ -45,7 +45,7 @@ def _extents(g, settings):
     pose = lib.Float64(np.eye(4)[:3].ravel())
     at_most_alpha = settings.response != "integral"
     p = {name: lib.Float64(x) for name, x in raw.items()}
-    return Activated(lib, p, pose, settings, len(g), at_most_alpha).extent.numpy()
+    return Activated(lib, p, pose, settings, at_most_alpha).extent.numpy()
 
 
 @pytest.mark.core

@@ -92,8 +92,7 @@ def fisherrf_map(
             weights[name] = variances({name: known[name]}, prior)[name] / group.fisherrf(inputs)
     # A color that is clamped at 0 is no part of the gray, and nothing is known by it. In float64, so that rounding does
     # not decide which these are.
-    away = torch.from_numpy(g.origin - camera.center).to(g.means.device)
-    lit = (sh_colors(g.sh.double(), g.means.double() + away) > 0).to(g.sh)
+    lit = (_colors(g, camera) > 0).to(g.sh)
     sh = torch.zeros_like(g.sh)
     count = lit.sum(1)
     sh[..., 0] = (g.sh * lit[:, None]).sum(2)
@@ -119,8 +118,7 @@ def moments_map(gaussians: Gaussians, camera: Camera, settings: RenderSettings) 
     g = gaussians.detach()  # a map is numbers
     values = g.features
     if values is None:
-        away = torch.from_numpy(g.origin - camera.center).to(g.means.device)
-        values = sh_colors(g.sh.double(), g.means.double() + away)
+        values = _colors(g, camera)
     values = values.double()  # squares are rounded once, to the float32 that is rendered
     # sum_c w f_c^2 = w |f|^2 is one more channel.
     moments = torch.cat([values, values.square().sum(1, keepdim=True)], 1).float()
@@ -129,3 +127,9 @@ def moments_map(gaussians: Gaussians, camera: Camera, settings: RenderSettings) 
     features = features.double().cpu()
     # A difference of equal numbers where a pixel shows one thing: rounding makes some of them negative.
     return (features[..., -1] - features[..., :-1].square().sum(-1)).clamp_min(0).float()
+
+
+def _colors(g: Gaussians, camera: Camera) -> torch.Tensor:
+    """(N, 3) float64 colors towards the means."""
+    away = torch.from_numpy(g.origin - camera.center).to(g.means.device)
+    return sh_colors(g.sh.double(), g.means.double() + away)

@@ -146,7 +146,7 @@ class Replay:
         """Per channel where the color is not clamped, the SH basis, and dc/dmu (None for degree 0)."""
         lib, K = self.lib, self.call.coefficients
         response = self.compositor.model.response
-        g = Activated(lib, p, p["w2c"], self.settings, self.count, response.at_most_alpha)
+        g = Activated(lib, p, p["w2c"], self.settings, response.at_most_alpha)
         d, inverse, basis, rgb = g.color(K)
         coefficient = lambda k, c: lib.Float(g.column("sh", 3 * k + c, 3 * K))  # noqa: E731
         lit = [dr.select(x > 0, lib.Float(1), 0) for x in rgb]

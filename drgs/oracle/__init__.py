@@ -19,22 +19,6 @@ from drgs.checks.derivatives import refuse_meta
 from drgs.ellipsoids import check_gaussians
 from drgs.settings import RenderSettings, check_settings
 
-__all__ = [
-    "Footprints",
-    "OracleRays",
-    "OracleScene",
-    "Tiles",
-    "activate",
-    "check_oracle",
-    "cull_near",
-    "float64",
-    "scale_and_shift",
-    "sh_basis",
-    "sh_colors",
-    "view_rays",
-    "within",
-]
-
 
 @dataclasses.dataclass(frozen=True)
 class Footprints:

@@ -189,7 +189,6 @@ class Activated:
         p: Flat raw parameters by name: means, quats, log_scales, logit_opacities, sh.
         w2c: Float64 of width 12, the upper rows of the world-to-camera matrix, of the re-centered world of the means.
         settings: Cut-offs of the render.
-        count: N.
         at_most_alpha: `Response.at_most_alpha`.
     Attributes:
         mean, quat, scale, opacity: Activated parameters, columns (N,).
@@ -209,10 +208,9 @@ class Activated:
         stretching: (3,) diagonal of the strain in local axes; None without strains.
     """
 
-    def __init__(
-        self, lib: Lib, p: dict, w2c: Float, settings: RenderSettings, count: int, at_most_alpha: bool
-    ) -> None:
+    def __init__(self, lib: Lib, p: dict, w2c: Float, settings: RenderSettings, at_most_alpha: bool) -> None:
         Float64, UInt32 = lib.Float64, lib.UInt32
+        count = dr.width(p["logit_opacities"])
         self.lib = lib
         self.settings = settings
         self.at_most_alpha = at_most_alpha

@@ -55,7 +55,7 @@ def project_screen(
     """
     Float = lib.Float
     response = response_of(settings)
-    g = Activated(lib, p, w2c, settings, dr.width(p["logit_opacities"]), response.at_most_alpha)
+    g = Activated(lib, p, w2c, settings, response.at_most_alpha)
     screen = _screen(lib, dr.detach(g.center), pinhole, width, height, lens)
     if "mean_offsets" in p:
         screen = screen._replace(offsets=[lib.Float64(g.column("mean_offsets", k, 2)) for k in range(2)])
@@ -137,7 +137,7 @@ def project_world(
     """
     Float = lib.Float
     response = response_of(settings)
-    g = Activated(lib, p, w2c, settings, dr.width(p["logit_opacities"]), response.at_most_alpha)
+    g = Activated(lib, p, w2c, settings, response.at_most_alpha)
     cofactor = g.cofactor
     if g.stretching is not None:
         cofactor = [x * (1 + e) for x, e in zip(cofactor, g.stretching, strict=True)]
