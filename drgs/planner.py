@@ -718,12 +718,7 @@ def _check_seconds(where: str, seconds: float | None) -> None:
 
 
 def _checked_image(image: np.ndarray | None, camera: Camera) -> np.ndarray:
-    shape = (camera.height, camera.width, 3)
-    if not isinstance(image, np.ndarray) or image.shape != shape:
-        got = f"shape {image.shape}" if isinstance(image, np.ndarray) else kind_of(image)
-        raise ValueError(
-            f"Planner.observe: image must be an array of shape {shape}, its camera's, got {got}; resize it"
-        )
+    image = _sized_as("image", image, (camera.height, camera.width, 3))
     if image.dtype != np.uint8 and not (np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1):
         raise ValueError("Planner.observe: image must be uint8, or finite and in [0, 1], got others; scale it")
     return image
@@ -732,13 +727,18 @@ def _checked_image(image: np.ndarray | None, camera: Camera) -> np.ndarray:
 def _checked_depth(depth: np.ndarray | None, camera: Camera) -> np.ndarray | None:
     if depth is None:
         return None
-    shape = (camera.height, camera.width)
-    if not isinstance(depth, np.ndarray) or depth.shape != shape:
-        got = f"shape {depth.shape}" if isinstance(depth, np.ndarray) else kind_of(depth)
-        raise ValueError(
-            f"Planner.observe: depth must be an array of shape {shape}, its camera's, got {got}; resize it"
-        )
+    depth = _sized_as("depth", depth, (camera.height, camera.width))
     return np.nan_to_num(depth.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0).clip(min=0)
+
+
+def _sized_as(name: str, x: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
+    """An array, if it has the shape of its camera's image."""
+    if not isinstance(x, np.ndarray) or x.shape != shape:
+        got = f"shape {x.shape}" if isinstance(x, np.ndarray) else kind_of(x)
+        raise ValueError(
+            f"Planner.observe: {name} must be an array of shape {shape}, its camera's, got {got}; resize it"
+        )
+    return x
 
 
 # ------------------------------------------------------------------------------------------------- file of a planner

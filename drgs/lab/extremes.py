@@ -79,8 +79,7 @@ def _change(change: Callable[[Gaussians, Camera], None], **options) -> Builder:
 
     def build(rng: np.random.Generator) -> Built:
         g, cam = _base(rng, **options)
-        with torch.no_grad():  # leaves are changed in place
-            change(g, cam)
+        change(g, cam)
         return g, cam
 
     return build
@@ -103,13 +102,12 @@ def _on_axes(rng: np.random.Generator) -> Built:
     g = random_gaussians(rng, 12, 4)
     cam = random_camera(rng, SIZE, turn=0.0)
     places = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [1, 1, 1], [1, 1, 0], [0, 1, 1], [1, 0, 1]]
-    with torch.no_grad():  # leaves are changed in place
-        cam.w2c[:3, 3] = torch.tensor([0.125, -0.125, 4.0])  # as a float32 mean can be
-        for i, place in enumerate(places):
-            g.means[i] = torch.tensor(cam.center + 0.25 * np.array(place))
-            g.quats[i] = torch.tensor([1.0, 0, 0, 0])
-            g.log_scales[i] = math.log(0.25)
-            g.logit_opacities[i] = -1.0
+    cam.w2c[:3, 3] = torch.tensor([0.125, -0.125, 4.0])  # as a float32 mean can be
+    for i, place in enumerate(places):
+        g.means[i] = torch.tensor(cam.center + 0.25 * np.array(place))
+        g.quats[i] = torch.tensor([1.0, 0, 0, 0])
+        g.log_scales[i] = math.log(0.25)
+        g.logit_opacities[i] = -1.0
     return g, cam
 
 
@@ -118,11 +116,10 @@ def _scaled(factor: float) -> Builder:
 
     def build(rng: np.random.Generator) -> Built:
         g, cam = _base(rng)
-        with torch.no_grad():  # leaves are changed in place
-            g.means.mul_(factor)
-            g.log_scales.add_(math.log(factor))
-            pose = cam.w2c.clone()
-            pose[:3, 3] *= factor
+        g.means.mul_(factor)
+        g.log_scales.add_(math.log(factor))
+        pose = cam.w2c.clone()
+        pose[:3, 3] *= factor
         return g, dataclasses.replace(cam, w2c=pose.requires_grad_())
 
     return build
@@ -181,8 +178,7 @@ def _fisheye(rng: np.random.Generator) -> Built:
     g, cam = _base(rng, (24, 20), spread=2.0)
     f = 0.5 * cam.width / math.radians(87.5)
     K = np.array([[f, 0, cam.width / 2], [0, f, cam.height / 2], [0, 0, 1]])
-    with torch.no_grad():  # leaves are changed in place
-        g.means[:6] += torch.tensor(cam.center)
+    g.means[:6] += torch.tensor(cam.center)
     return g, dataclasses.replace(cam, K=K, model="opencv_fisheye", distortion=(0.02, -0.01, 0.0, 0.0))
 
 
@@ -204,11 +200,10 @@ def _equal_depths(rng: np.random.Generator) -> Built:
     """A plane of equal camera z, mirrored pairs at equal distance."""
     g = random_gaussians(rng, 12, 4)
     cam = random_camera(rng, SIZE, turn=0.0)
-    with torch.no_grad():  # leaves are changed in place
-        g.means[:, 2] = 0.5
-        g.means[:, 0] = 0.1 + 0 * g.means[:, 0]
-        g.means[:, 1] = torch.linspace(-0.8, 0.8, 12)
-        g.quats[:] = torch.tensor([1.0, 0, 0, 0])
+    g.means[:, 2] = 0.5
+    g.means[:, 0] = 0.1 + 0 * g.means[:, 0]
+    g.means[:, 1] = torch.linspace(-0.8, 0.8, 12)
+    g.quats[:] = torch.tensor([1.0, 0, 0, 0])
     return g, cam
 
 
@@ -216,13 +211,12 @@ def _offset(rng: np.random.Generator, where: str) -> Built:
     """A world 1e6 from zero whose detail is 1e-2: float64 means, or float32 means relative to `origin`."""
     g, cam = _base(rng)
     shift = np.array([1e6, -7e5, 3e5])
-    with torch.no_grad():  # leaves are changed in place
-        g.means.mul_(0.1)
-        g.log_scales.fill_(math.log(1e-2)).add_(0.3 * torch.tensor(rng.normal(size=(len(g), 3))))
-        pose = cam.w2c.clone()
-        pose[:3, 3] *= 0.1
-        pose[:3, 3] -= pose[:3, :3] @ torch.tensor(shift)
-        means = g.means.double() + (torch.tensor(shift) if where == "means" else 0)
+    g.means.mul_(0.1)
+    g.log_scales.fill_(math.log(1e-2)).add_(0.3 * torch.tensor(rng.normal(size=(len(g), 3))))
+    pose = cam.w2c.clone()
+    pose[:3, 3] *= 0.1
+    pose[:3, 3] -= pose[:3, :3] @ torch.tensor(shift)
+    means = g.means.double() + (torch.tensor(shift) if where == "means" else 0)
     means = (means if where == "means" else means.float()).requires_grad_()
     origin = np.zeros(3) if where == "means" else shift
     return g.replace(means=means, origin=origin), dataclasses.replace(cam, w2c=pose.requires_grad_())
@@ -236,9 +230,8 @@ def _focal(focal: float) -> Builder:
         cam = random_camera(rng, SIZE, focal=focal, turn=0.0)
         if focal > 100:
             # The image spans 1e-4 of the distance.
-            with torch.no_grad():  # leaves are changed in place
-                g.means[:, :2].mul_(1e-4).sub_(torch.tensor([0.1, -0.1]))
-                g.log_scales.fill_(math.log(5e-5)).add_(0.3 * torch.tensor(rng.normal(size=(12, 3))))
+            g.means[:, :2].mul_(1e-4).sub_(torch.tensor([0.1, -0.1]))
+            g.log_scales.fill_(math.log(5e-5)).add_(0.3 * torch.tensor(rng.normal(size=(12, 3))))
         return g, cam
 
     return build
@@ -254,9 +247,8 @@ def _layers(rng: np.random.Generator, n: int = 1000) -> Built:
     """Opaque layers: T underflows within a few of them."""
     g = random_gaussians(rng, n, 1)
     cam = random_camera(rng, SIZE)
-    with torch.no_grad():  # leaves are changed in place
-        g.log_scales[:] = torch.tensor([0.4, 0.5, 0.7]).log()
-        g.logit_opacities[:] = 6.0
+    g.log_scales[:] = torch.tensor([0.4, 0.5, 0.7]).log()
+    g.logit_opacities[:] = 6.0
     return g, cam
 
 
@@ -306,8 +298,7 @@ def _at_near(near: float) -> Builder:
 def _translucent_layers(rng: np.random.Generator) -> Built:
     """Layers that end a ray at a transmittance of 1e-4 and are not clamped, so that no product is a tie."""
     g, cam = _layers(rng, 300)
-    with torch.no_grad():  # leaves are changed in place
-        g.logit_opacities[:] = torch.tensor(rng.uniform(0, 2, len(g)))
+    g.logit_opacities[:] = torch.tensor(rng.uniform(0, 2, len(g)))
     return g, cam
 
 
@@ -344,7 +335,7 @@ def _cases(name: str, build: Builder, modes: str = "exact", **options) -> list[E
     return [
         ExtremeCase(
             name if mode == "exact" else f"{name}, `{mode}`",
-            build,
+            torch.no_grad()(build),  # which changes leaves in place
             preset=_MODES[mode].get("preset", "exact"),
             fields={**_MODES[mode].get("fields", {}), **fields},
             **options,
