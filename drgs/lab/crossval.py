@@ -170,11 +170,10 @@ def crossval(
     oracle = isinstance(rasterizer, Rasterizer) and rasterizer.preset is not None
     cameras = [c if c.name else dataclasses.replace(c, name=str(i)) for i, c in enumerate(cameras)]
     given = g, cameras
-    places: list[Crop | None] = [None] * len(cameras)
+    places: list[Crop] | list[None] = [None] * len(cameras)
     if oracle and len(g) * sum(c.width * c.height for c in cameras) > _ORACLE_PAIRS:
         say("crops")
-        g, cameras, of_crops = crops(g, cameras, first_start.settings)
-        places = [*of_crops]
+        g, cameras, places = crops(g, cameras, first_start.settings)
     dtype = getattr(rasterizer, "dtype", torch.float32)
     raw = with_pose(raw_of(g), any(c.is_rolling for c in cameras))
     say("images")
@@ -207,15 +206,10 @@ def crossval(
     ties = functools.partial(ties_of, model)
     case = Case(rasterizer, raw, cameras, background, oracle, tolerance, entries, first, seed, ties, say)
     comparison = compared(case, model, signs, pictures, alphas, drawn)
-    judge(case, model, comparison)
+    not_offered = _explain(case, model, comparison, channels)
     if not comparison.agrees:
         say("what the error looks like")
         comparison.views = with_errors(comparison, pictures, _meant(search, claimed, starts), rendered_by)
-    not_offered = {k: "its image has no gradient of them" for k in MOTIONS if k in raw and k not in comparison.groups}
-    if channels:
-        wide, reason = _wide_gradients(case, model, comparison, channels)
-        comparison.groups |= wide
-        not_offered |= {COLORS: reason} if reason else {}
     report = _report(case, comparison, search, claimed, given, places, not_offered)
     rows: list[PathRow] = []
     if paths:
@@ -227,6 +221,18 @@ def crossval(
     say("pictures")
     images = _beside(case, pictures, drawn)
     return Result(report, images, comparison.groups, comparison.views, search.findings, model, g, cameras, rows)
+
+
+def _explain(case: Case, model: ReferenceModel, comparison: Compared, channels: int) -> dict[str, str]:
+    """Give all groups their verdicts, those of wide colors, too; returns why there are none of the others, by group."""
+    judge(case, model, comparison)
+    missing = [name for name in MOTIONS if name in case.raw and name not in comparison.groups]
+    not_offered = dict.fromkeys(missing, "its image has no gradient of them")
+    if channels:
+        wide, reason = _wide_gradients(case, model, comparison, channels)
+        comparison.groups |= wide
+        not_offered |= {COLORS: reason} if reason else {}
+    return not_offered
 
 
 def _starting_models(
@@ -347,7 +353,7 @@ def _report(
     search: conventions.SearchResult,
     claimed: str,
     given: tuple[Gaussians, list[Camera]],
-    places: list[Crop | None],
+    places: list[Crop] | list[None],
     not_offered: dict[str, str],
 ) -> dict:
     """`Result.report`; `given` are the scene and the cameras before anything was cropped."""
