@@ -365,7 +365,7 @@ def error_parts(scene: Scene, camera: Camera, record: ErrorRecord) -> dict[str, 
         )
     seen = seen.detach()
     (misfit, direction), out = _noise(seen.replace(sh=seen.sh[:, :1]), camera, record)
-    view = ViewContext(scene, camera, record.settings, opacity=out.alpha.cpu())
+    view = ViewContext(scene, camera, record.settings, known_opacity=out.alpha.cpu())
     parts = {"misfit": misfit, "direction": direction, **_left_open(view, record)}
     total = torch.stack(list(parts.values())).sum(0)
     factor = record.calibration(total)

@@ -55,6 +55,7 @@ class HitProbes(Protocol):
         """The computed quantity; a traversal of its own fills the sums if none has."""
 
 
+@dataclasses.dataclass(eq=False)
 class ViewContext:
     """One view while quantities of it are computed: what one computes on its way, others need not compute again.
 
@@ -66,34 +67,22 @@ class ViewContext:
         number: Place of the view in a sum over views, for random images that differ between them.
         photograph: (H, W, 3) what the view should show; None: there is none, or no quantity asks for it.
         residual: (H, W) how wrong each pixel is, where that is known; None: as far as its color is from the photograph.
+        known_opacity: (H, W) float32, where it is known; None: a traversal gives it, or it is rendered (`opacity`).
         probes: Quantity -> its sums over hits that are still to be filled, or have been.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        camera: Camera,
-        settings: RenderSettings,
-        mask: torch.Tensor | None = None,
-        number: int = 0,
-        opacity: torch.Tensor | None = None,
-        photograph: torch.Tensor | None = None,
-        residual: torch.Tensor | None = None,
-    ) -> None:
-        """
-        Args:
-            scene, camera, settings, mask, number, photograph, residual: See the attributes.
-            opacity: (H, W) float32, where it is known; None: a traversal gives it, or it is rendered.
-        """
-        self.scene = once_per_time(scene)
-        self.camera = camera
-        self.settings = settings
-        self.mask = mask
-        self.number = number
-        self.photograph = photograph
-        self.residual = residual
-        self.probes: dict[Quantity, HitProbes] = {}
-        self._opacity = opacity
+    scene: Scene
+    camera: Camera
+    settings: RenderSettings
+    mask: torch.Tensor | None = None
+    number: int = 0
+    photograph: torch.Tensor | None = None
+    residual: torch.Tensor | None = None
+    known_opacity: torch.Tensor | None = None
+    probes: dict[Quantity, HitProbes] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.scene = once_per_time(self.scene)
 
     @property
     def gaussians(self) -> Gaussians:
@@ -103,17 +92,17 @@ class ViewContext:
     @property
     def opacity(self) -> torch.Tensor:
         """(H, W) float32 on the CPU, rendered where no traversal has given it."""
-        if self._opacity is None:
-            self._opacity = opacity_of(self.scene, self.camera, self.settings)
-        return self._opacity
+        if self.known_opacity is None:
+            self.known_opacity = opacity_of(self.scene, self.camera, self.settings)
+        return self.known_opacity
 
     def replay(self, semantics: SemanticMetric | None = None, geometry: bool = True) -> Replay:
         """The view's Gaussians, rendered once to be replayed for each hit; the opacity is known then."""
         from drgs.information.replay import Replay  # loads Dr.Jit, which poses alone need not have
 
         replay = Replay(self.gaussians, self.camera, self.settings, geometry, semantics, self.mask)
-        if self._opacity is None:
-            self._opacity = replay.opacity
+        if self.known_opacity is None:
+            self.known_opacity = replay.opacity
         return replay
 
 
@@ -230,7 +219,8 @@ def sum_over_views(
     total: dict[str, torch.Tensor] = {}
     for number, (camera, own, mask) in enumerate(zip(cameras, settings, masks, strict=True)):
         gaussians_at(quantity.where, scene, camera)  # refuses what has no Gaussians then
-        view = ViewContext(scene, camera, own, mask, number, opacities[number] if opacities else None)
+        known = opacities[number] if opacities else None
+        view = ViewContext(scene, camera, own, mask, number, known_opacity=known)
         part = quantity.summand(quantity.compute(view), camera, mask)
         for name, x in part.items():
             if name in total and total[name].shape != x.shape:

@@ -271,7 +271,6 @@ class Pictures:
         self.crop = crop
         self.gradients = gradients
         self.advance = advance or (lambda: None)
-        self.background = (0.0, 0.0, 0.0)
         rng = np.random.default_rng(seed)
         self.u = [torch.from_numpy(rng.choice([-1.0, 1.0], (c.height, c.width, 3))) for c in self.cameras]
         self.windows: list[tuple[int, int, int, int]] = []
