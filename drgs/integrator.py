@@ -201,16 +201,8 @@ def render_with_offsets(
             I + E along its own axes: `drgs.splats.covariances.factors`.
     """
     check_view("render", gaussians, camera, settings)
-    call = Call(
-        gaussians,
-        camera,
-        settings,
-        _checked_outputs(outputs),
-        pixel_rays=rays,
-        mean_offsets=mean_offsets,
-        mean_absolute=mean_absolute,
-        strains=strains,
-    )
+    of_means = {"mean_offsets": mean_offsets, "mean_absolute": mean_absolute, "strains": strains}
+    call = Call(gaussians, camera, settings, _checked_outputs(outputs), pixel_rays=rays, of_means=of_means)
     with own_errors():
         return call.output(differentiable(call))
 

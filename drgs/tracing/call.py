@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import drjit as dr
 import numpy as np
@@ -82,11 +83,9 @@ class Call:
         couple: The argument `couple_features` of `render`.
         lens: The camera's `lens_parameters`, if derivatives by them are wanted.
         pixel_rays: (H, W, 6) origin and direction of each pixel, in the world, instead of those that the camera has.
-        mean_offsets: (N, 2) zeros in pixels, added to projected means, of a model of the image plane; differentiated.
-        mean_absolute: (N, 2) zeros, whose gradient is to be the sum over all pixels of the absolute value of each
-            pixel's gradient by projected means.
-        strains: (N, 6) zeros, by how much space is stretched around each mean: `drgs.splats.covariances`;
-        differentiated. oriented: The features, (N, 3), are axes that are turned towards each ray: `Channels.oriented`.
+        of_means: `mean_offsets`, `mean_absolute` and `strains` of `drgs.integrator.render_with_offsets`, by name; None
+            of those that are not wanted.
+        oriented: The features, (N, 3), are axes that are turned towards each ray: `Channels.oriented`.
     Attributes:
         inputs: Torch tensors by name, what is differentiated: raw parameters of the Gaussians or of the scene, perhaps
             `time`, `w2c` (12 floats), rays where they are traced.
@@ -113,9 +112,7 @@ class Call:
         timed: bool = False,
         lens: torch.Tensor | None = None,
         pixel_rays: torch.Tensor | np.ndarray | None = None,
-        mean_offsets: torch.Tensor | None = None,
-        mean_absolute: torch.Tensor | None = None,
-        strains: torch.Tensor | None = None,
+        of_means: Mapping[str, torch.Tensor | None] | None = None,
         oriented: bool = False,
     ):
         self.lib = runtime.dr_types()
@@ -156,8 +153,7 @@ class Call:
 
             self.field = Field(scene, camera.time, fields, middle, fixed)
         self.inputs = {name: self._move(x) for name, x in given.items()}
-        of_means = {"mean_offsets": mean_offsets, "mean_absolute": mean_absolute, "strains": strains}
-        self.inputs |= {name: self._move(x) for name, x in of_means.items() if x is not None}
+        self.inputs |= {name: self._move(x) for name, x in (of_means or {}).items() if x is not None}
         self.count = len(gaussians)
         self.coefficients = gaussians.sh.shape[1]
         self.width = 0 if gaussians.features is None else gaussians.features.shape[1]
