@@ -16,7 +16,8 @@ tr(W^T W) / D sum_p w_p^2. Without, they inform about themselves only (uncoupled
 
 Sources: Jiang et al. 2024 (FisherRF) for the criterion, with what its code computes instead under method "fisherrf";
 Wilson et al. 2025 (POp-GS) for blocks. `exact` costs one more traversal than rendering. All of it stands on the
-quantities of a view (`drgs.information.quantity`), which scores of candidates and all maps use as well.
+quantities of a view (`drgs.information.quantity`), which scores of candidates and all maps use as well. Nothing that is
+returned has a graph: information is a number.
 """
 
 from __future__ import annotations
@@ -189,7 +190,9 @@ def blocks(
     Args:
         gaussians, cameras, settings, channel_weights, semantics, masks, nuisances: The same as for `diagonal`.
     Returns:
-        (N, 13, 13) float64: means 3, rotations 3, log-scales 3, logit-opacity 1, base color sh[0] 3.
+        (N, 13, 13) float64 on the CPU: means 3, rotations 3, log-scales 3, logit-opacity 1, base color sh[0] 3.
+    Raises:
+        ValueError: If a weight, mask or parameter is wrong, or the Gaussians of a scene are not as many in all views.
     """
     gaussians = once_per_time(gaussians)
     views = checked_views("fisher.blocks", gaussians, cameras, settings, masks)
@@ -353,6 +356,8 @@ def network_variance_map(
         scene, camera, settings, probes, seed, channel_weights, semantics: The same as for `network`; a pixel of n rows
             has a relative error of about sqrt(2 / (n probes)) at most sqrt(2 / probes).
         weights: Group -> (P,) as `network` returns it, >= 0; groups that are missing weigh 0.
+    Raises:
+        ValueError: If the scene has no network, or a weight is negative, not finite or of another shape.
     """
     from drgs.information.network import NetworkInformation  # scenes that do not move have none
 
@@ -382,6 +387,8 @@ def variance_map(
             (1536, 3), is that of the color behind what the Gaussians leave open. Those above 3e32, as lambda = 0 makes
             them of what was hardly seen, count as 3e32.
         sphere: The same as for `backdrop`.
+    Raises:
+        ValueError: If a weight is not finite, or of an unknown group or another shape than its information.
     """
     where = "fisher.variance_map"
     view = _view(where, gaussians, camera, settings)

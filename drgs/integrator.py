@@ -199,6 +199,8 @@ def render_with_offsets(
             absolute value of each pixel's gradient by the projected means (Ye et al. 2024, AbsGS).
         strains: (N, 6) zeros, the elements xx, xy, xz, yy, yz, zz of a symmetric E that stretches each Gaussian by
             I + E along its own axes: `drgs.splats.covariances.factors`.
+    Returns:
+        An `Output`, with the gradients of `render` and by these three.
     """
     check_view("render", gaussians, camera, settings)
     of_means = {"mean_offsets": mean_offsets, "mean_absolute": mean_absolute, "strains": strains}
@@ -222,6 +224,8 @@ def render_normals(
 
     Args:
         gaussians, camera, settings, rays: Arguments of `render`; for responses along rays.
+    Raises:
+        NotImplementedError: If the response is a model of the image plane (`ewa`).
     Gradients:
         Those of `render`, in reverse and forward mode; which of the two directions is taken has none.
     """
@@ -264,6 +268,11 @@ def render_rays(
         outputs, couple_features: Arguments of `render`.
     Returns:
         An `Output` with the leading shape of the rays instead of (H, W).
+    Raises:
+        ValueError: If a ray is not finite, a direction is 0, or settings are about a camera's axis (`near`, `z`).
+        NotImplementedError: If the traversal is not `bvh`.
+    Gradients:
+        Those of `render`, with respect to origins and directions in place of the pose.
     """
     if isinstance(gaussians, Scene) and not isinstance(gaussians, Gaussians):
         raise ArgumentError(
