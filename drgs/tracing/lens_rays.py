@@ -36,6 +36,12 @@ NARROW = 0.17  # least d_z of the unit directions of a narrow lens: 80 degrees o
 _CELL_PIXELS = 4  # pixels, about, across the smallest cells of a table of displacements; chosen
 _MAX_CELLS = 1024  # cells in a row of it; chosen: bounds memory
 _MAX_TABLE_BYTES = 256 << 20  # bytes of tables that are kept for the next view; chosen
+# Guide -> the model and coefficients of the lens under which it is what a direction is seen at.
+_GUIDING_LENSES: dict[Guide, tuple[str, tuple[float, ...]]] = {
+    "plane": ("pinhole", ()),
+    "fisheye": ("opencv_fisheye", (0.0, 0.0, 0.0, 0.0)),
+    "panorama": ("equirectangular", ()),
+}
 _held: OrderedDict[tuple, LensRays] = OrderedDict()
 _lock = threading.Lock()
 
@@ -226,31 +232,13 @@ def pinhole_length(pinhole: list[Float], x: Float, y: Float) -> Float:
 
 def guides_of(guide: Guide, K: np.ndarray, d: np.ndarray) -> np.ndarray:
     """(P, 2) guides of directions (P, 3) in camera axes, in pixels."""
-    return pixels_of(K, {"plane": on_plane, "fisheye": equidistant, "panorama": _panorama}[guide](d))
-
-
-def _panorama(d: np.ndarray) -> np.ndarray:
-    """(P, 2) longitude and latitude of directions, in radians."""
-    return LENS_MODELS["equirectangular"].project(d, ())
+    model, coefficients = _GUIDING_LENSES[guide]
+    return pixels_of(K, LENS_MODELS[model].project(d, coefficients))
 
 
 def _finite(values: np.ndarray) -> np.ndarray:
     """(P,) bool: rows of (P, C) whose numbers all are finite; by columns, which is faster than along short rows."""
     return np.logical_and.reduce([np.isfinite(x) for x in values.T])
-
-
-def on_plane(d: np.ndarray) -> np.ndarray:
-    """(P, 2) of directions on the plane z = 1."""
-    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-        return d[:, :2] / d[:, 2:]
-
-
-def equidistant(d: np.ndarray) -> np.ndarray:
-    """(P, 2) of directions under the equidistant fisheye: as far from 0 as they are from the axis, in radians."""
-    radius = np.hypot(d[:, 0], d[:, 1])
-    turn = np.arctan2(d[:, 1], d[:, 0])
-    angle = np.arctan2(radius, d[:, 2])
-    return np.stack([angle * np.cos(turn), angle * np.sin(turn)], 1)
 
 
 def pixels_of(K: np.ndarray, plane: np.ndarray) -> np.ndarray:
