@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import drjit as dr
 
@@ -356,7 +356,7 @@ class VarianceSums:
     weights: Sequence[float]
     light: Float | None = None
     plain: bool = False
-    needs_color: ClassVar[bool] = False
+    needs_color: bool = False
 
     def init(self, k: int) -> dict:
         """The sum along a ray."""

@@ -91,7 +91,7 @@ class HitReplay:
         Most Gaussians of a tile's list miss most packets of its rays, and the branch is cheaper than what it skips.
         """
         lib = self.m.lib
-        record = None
+        record: Any = None
         if self.table is None:
             record = self.channels.load(lib, index, rays[0], self.going(states, active), only="record")["record"]
         hits = lib.Bool(False)
