@@ -266,34 +266,19 @@ def rasterization(
     leaf = _means2d_leaf(means, viewmats, opacities, settings, lead, count)
     absolute = _absgrad_leaf(leaf) if absgrad else None
 
-    def by_batch(x: Any) -> Any:
-        """All leading axes as one; None stays None."""
-        return None if x is None else x.reshape(batches, *x.shape[len(lead) :])
-
-    def at(x: Any, batch: int, camera: int) -> Any:
-        """What one view has of a tensor by batch and camera; None of None."""
-        return None if x is None else x[batch, camera]
-
-    means_, quats_, scales_, opacities_, strains_ = map(by_batch, (means, quats, scales, opacities, strains))
-    viewmats_, ends_, Ks_ = map(by_batch, (viewmats, viewmats_rs, Ks))
-    by_view = [by_batch(x) for x in (backgrounds, rays, leaf, absolute)]
+    given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "strains": strains}
+    given |= {"colors": colors, "extra": extra, "viewmats": viewmats, "viewmats_rs": viewmats_rs, "Ks": Ks}
+    given |= {"backgrounds": backgrounds, "rays": rays, "leaf": leaf, "absolute": absolute}
+    # All leading axes as one.
+    flat = {name: x.reshape(batches, *x.shape[len(lead) :]) for name, x in given.items() if x is not None}
     views = []
     for b in range(batches):
-        if ends_ is not None:
-            moving = [{"shutter": shutter, "w2c_end": ends_[b, c]} for c in range(count)]
-            lenses[b] = [lens | fields for lens, fields in zip(lenses[b], moving, strict=True)]
-        for c, camera in enumerate(cameras_of(viewmats_[b], Ks_[b], width, height, lenses[b])):
-            splats = Splats(
-                means=means_[b],
-                quats=quats_[b],
-                scales=scales_[b],
-                opacities=opacities_[b],
-                colors=_colors_of_view(by_batch(colors), b, c, sh_degree),
-                degree=sh_degree,
-                strains=None if strains_ is None else strains_[b],
-            )
-            signals = None if extra is None else _colors_of_view(by_batch(extra), b, c, extra_signals_sh_degree)
-            views.append(_View(options, splats, camera, signals, *(at(x, b, c) for x in by_view)))
+        if "viewmats_rs" in flat:
+            ends = zip(lenses[b], flat["viewmats_rs"][b], strict=True)
+            lenses[b] = [lens | {"shutter": shutter, "w2c_end": end} for lens, end in ends]
+        for c, camera in enumerate(cameras_of(flat["viewmats"][b], flat["Ks"][b], width, height, lenses[b])):
+            # Each view has slices of its own: gradients are then added up view by view.
+            views.append(_view_of(options, {name: x[b] for name, x in flat.items()}, c, camera, sh_degree))
     images, alphas, meta = _drawn(views, (*lead, count))
     if leaf is not None:
         with torch.no_grad():  # its values; the graph of every view begins at the leaf
@@ -458,6 +443,22 @@ class _View:
         return kept
 
 
+def _view_of(options: _Options, own: dict[str, torch.Tensor], number: int, camera: Camera, degree: int | None) -> _View:
+    """A view of a batch, by what the batch has of the tensors of a call; `degree` is that of its colors."""
+    splats = Splats(
+        means=own["means"],
+        quats=own["quats"],
+        scales=own["scales"],
+        opacities=own["opacities"],
+        colors=_colors_of_view(own["colors"], number, degree),
+        degree=degree,
+        strains=own.get("strains"),
+    )
+    extra = _colors_of_view(own["extra"], number, options.extra_degree) if "extra" in own else None
+    of_view = (own[name][number] if name in own else None for name in ("backgrounds", "rays", "leaf", "absolute"))
+    return _View(options, splats, camera, extra, *of_view)
+
+
 def _drawn(views: list[_View], axes: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
     """What views have, with the leading axes and that of cameras: images, alphas and the arrays of `meta`."""
     images, alphas, metas = zip(*(view.draw() for view in views), strict=True)
@@ -503,10 +504,9 @@ def _expanded_to_batches(x: torch.Tensor, degree: int | None, lead: tuple[int, .
     return x
 
 
-def _colors_of_view(x: torch.Tensor, batch: int, camera: int, degree: int | None) -> torch.Tensor:
-    """Colors of one view, from those by batch, or by batch and camera."""
-    by_camera = x.ndim == (4 if degree is None else 5)
-    return x[batch, camera] if by_camera else x[batch]
+def _colors_of_view(x: torch.Tensor, camera: int, degree: int | None) -> torch.Tensor:
+    """Colors of one view, from those of its batch, which all cameras share or which have an axis of them."""
+    return x[camera] if x.ndim == (3 if degree is None else 4) else x
 
 
 def _means2d_leaf(
