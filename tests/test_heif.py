@@ -127,15 +127,16 @@ def test_a_claimed_size_is_not_allocated(tmp_path, gradient, suffix, side, monke
     assert "\n" not in str(error.value)
 
 
-def test_named_when_missing(tmp_path, gradient, monkeypatch, capsys):
-    """One line with the extra, also where there are JPEGs beside; nothing is ignored."""
+@pytest.mark.parametrize("command", ["sfm", "capture"])
+def test_named_when_missing(tmp_path, gradient, monkeypatch, capsys, command):
+    """One line with the extra, also where there are JPEGs beside; nothing is ignored, and no folder is made."""
     photos = tmp_path / "photos"
     photos.mkdir()
     save(photos / "IMG_9.HEIC".lower(), gradient)
     for name in ("a.jpg", "b.jpg"):
         assert cv2.imwrite(str(photos / name), gradient)
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
-    assert main(["sfm", str(photos), "-o", str(tmp_path / "scene")]) == 2
+    assert main([command, str(photos), "-o", str(tmp_path / "scene")]) == 2
     told = capsys.readouterr().err.strip().splitlines()
     assert len(told) == 1
     assert "img_9.heic: HEIC and AVIF photographs need the package pillow-heif, which is missing" in told[0]

@@ -26,7 +26,7 @@ from drgs.capturing.opening import new_files, open_record
 from drgs.capturing.poses import Outcome, add_poses, find_poses, given_poses
 from drgs.capturing.record import FOLDER, CaptureRecord, DoneStep, inputs_of
 from drgs.data import Dataset
-from drgs.data.images import list_images
+from drgs.data.images import check_readers, list_images
 from drgs.display.progress import Bar, duration
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import load_dataset
@@ -78,6 +78,8 @@ def run_capture(options: CaptureOptions, config: FitConfig, say: Callable[[str],
                 f"{options.paths[0]}: must be at least {_FEWEST} photographs, got {len(photographs)}; take thirty to "
                 "eighty, each overlapping the one before by two thirds"
             )
+        if not options.resume:
+            check_readers(photographs)  # before anything is made
         # Not the files: links to them in the folder of the capture may be made anew.
         folders = {path if path.is_dir() else path.parent for path in options.paths}
         with (

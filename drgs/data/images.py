@@ -17,7 +17,7 @@ import os
 import re
 import struct
 import tempfile
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -178,6 +178,14 @@ def native_stderr() -> Iterator[list[str]]:
 
 class MissingReader(ValueError):
     """The package that reads a photograph is missing: nothing is wrong with the photograph."""
+
+
+def check_readers(paths: Iterable[Path]) -> None:
+    """Raise `MissingReader` if the package that reads one of some photographs is missing; only beginnings are read."""
+    for path in paths:
+        with contextlib.suppress(OSError):  # whoever decodes it says what is wrong with the file
+            if is_heif(path):
+                _need_library(path)
 
 
 def is_heif(path: Path) -> bool:
