@@ -73,7 +73,7 @@ def fitted(
     trainer = start_plain(dataset, train, frames, config)
     trainer.terms = [*trainer.terms, *terms(frames)]
     if cycle:
-        trainer.renderers = RendererSchedule(config.max_steps, ((0.0, tuple(cycle)),))
+        trainer.renderers = RendererSchedule(tuple(cycle))
     took: list[float] = []
     began = time.process_time()
     while trainer.step_index < config.max_steps:

@@ -51,7 +51,7 @@ def measured(scene: str, trained: str, seed: int, offset: int, size: dict) -> di
     settings = RenderSettings.preset(trained if trained in PRESETS else "fast")
     config = FitConfig().replace(settings=settings, renderers=names, seed=seed, test_offset=offset, **size)
     fit = fitted(scene, config)
-    schedule = RendererSchedule.of(config.renderers, config.settings, config.max_steps)
+    schedule = RendererSchedule.of(config.renderers, config.settings)
     took: dict[RenderSettings, list[float]] = {}
     for step, seconds in enumerate(fit.step_seconds):
         took.setdefault(schedule.settings_at(step), []).append(seconds)

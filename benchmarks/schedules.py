@@ -44,6 +44,7 @@ from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.fitting.frames import Frame, frames_for  # noqa: E402
 from drgs.fitting.losses import LossTerm, Photometric, padded_ssim  # noqa: E402
+from drgs.fitting.renderers import RendererSchedule  # noqa: E402
 from drgs.fitting.resolution import Resolution  # noqa: E402
 from drgs.fitting.start import start_plain  # noqa: E402
 from drgs.fitting.trainer import Trainer  # noqa: E402
@@ -66,12 +67,9 @@ def exact_to(tolerance: float | None) -> Change:
     """Steps with `exact` among other renderers have a tolerance, or none."""
 
     def change(trainer: Trainer) -> None:
-        schedule = trainer.renderers
-        stages = tuple(
-            (begin, tuple(x.replace(tolerance=tolerance) if x.order == "ray" else x for x in cycle))
-            for begin, cycle in schedule.stages
-        )
-        trainer.renderers = dataclasses.replace(schedule, stages=stages)
+        cycle = trainer.renderers.cycle
+        cycle = tuple(x.replace(tolerance=tolerance) if x.order == "ray" else x for x in cycle)
+        trainer.renderers = RendererSchedule(cycle)
 
     return change
 

@@ -25,13 +25,13 @@ from drgs.train import Trainer, fit
 FAST = RenderSettings.preset("fast")
 
 
-def schedule(*names: str, settings: RenderSettings = FAST, max_steps: int = 800) -> RendererSchedule:
-    return RendererSchedule.of(names, settings, max_steps)
+def schedule(*names: str, settings: RenderSettings = FAST) -> RendererSchedule:
+    return RendererSchedule.of(names, settings)
 
 
 def presets_at(found: RendererSchedule) -> Counter:
     """Preset -> how many steps of the fit have it."""
-    return Counter(found.settings_at(step).nearest_preset()[0] for step in range(found.max_steps))
+    return Counter(found.settings_at(step).nearest_preset()[0] for step in range(800))
 
 
 # --------------------------------------------------------------------------------------------------- the schedule
@@ -79,13 +79,6 @@ def test_the_background_is_of_all():
     found = schedule("auto", settings=white)
     assert len(found.all_settings) > 1
     assert {settings.background for settings in found.all_settings} == {white.background}
-
-
-def test_stages_hold_from_a_share_of_the_steps_on():
-    """A later stage has a cycle of its own; a step has the same settings whichever came before it."""
-    first, second = (FAST,), (RenderSettings.preset("exact"),)
-    found = RendererSchedule(10, ((0.0, first), (0.75, second)))
-    assert [found.settings_at(step) for step in (9, 7, 8, 0)] == [second[0], first[0], second[0], first[0]]
 
 
 @pytest.mark.parametrize("views", [1, 2, 3, 4, 8])

@@ -40,7 +40,7 @@ class _Used(NamedTuple):
     def rendered(self) -> tuple[RenderSettings, ...]:
         """What its steps were rendered with."""
         config = self.record.config
-        return RendererSchedule.of(config.renderers, config.settings, config.max_steps).all_settings
+        return RendererSchedule.of(config.renderers, config.settings).all_settings
 
     def chose(self, *policies: str) -> bool:
         """Whether views were chosen by one of these policies."""

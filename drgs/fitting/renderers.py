@@ -26,13 +26,13 @@ _MEANINGS: dict[str, tuple[Preset, ...]] = {"any": ANY, "drgs": ("exact", "fast"
 # half of the time, of which steps without a tolerance take up to 0.6 (docs/one-model.md).
 _TOLERANCE = 0.01
 
-# Name -> (share of the steps from which on, presets in turn). `exact` takes three to six times as long as the others,
-# so that one step of ten makes a fit 1.2 to 1.4 times as long as one with `fast` alone.
+# Name -> presets in turn. `exact` takes three to six times as long as the others, so that one step of ten makes a fit
+# 1.2 to 1.4 times as long as one with `fast` alone.
 # `inria` differs from `gsplat` in cut-offs only, and looks right where that does.
-_CYCLES: dict[str, tuple[tuple[float, tuple[Preset, ...]], ...]] = {
-    "any": ((0.0, (*("gsplat", "fast", "3dgut") * 3, "exact")),),
-    "drgs": ((0.0, ("fast", "fast", "fast", "exact")),),
-    "viewers": ((0.0, ("gsplat", "inria")),),
+_CYCLES: dict[str, tuple[Preset, ...]] = {
+    "any": (*("gsplat", "fast", "3dgut") * 3, "exact"),
+    "drgs": ("fast", "fast", "fast", "exact"),
+    "viewers": ("gsplat", "inria"),
 }
 
 
@@ -121,52 +121,34 @@ def renderers_to_measure(
 
 @dataclasses.dataclass(frozen=True)
 class RendererSchedule:
-    """What each step of a fit is rendered with.
+    """What each step of a fit is rendered with: `cycle`, settings taken in turn."""
 
-    Attributes:
-        max_steps: Steps of the fit.
-        stages: Shares of the steps from which on each holds, in their order, with the settings taken in turn.
-    """
-
-    max_steps: int
-    stages: tuple[tuple[float, tuple[RenderSettings, ...]], ...]
+    cycle: tuple[RenderSettings, ...]
 
     @classmethod
-    def of(cls, names: Sequence[str], settings: RenderSettings, max_steps: int) -> RendererSchedule:
+    def of(cls, names: Sequence[str], settings: RenderSettings) -> RendererSchedule:
         """That of a fit.
 
         Args:
             names: Its `renderers`, as `check_renderers` takes them.
             settings: Its own: all there is with a single renderer, else only their background counts.
-            max_steps: Its steps.
         """
         named = named_renderers(names, settings)
         if _is_single(named):
-            return cls(max_steps, ((0.0, (settings,)),))
-        cycles = _CYCLES.get(named[0], ((0.0, named),))
-        background = settings.background
-        return cls(
-            max_steps,
-            tuple(
-                (begin, tuple(_one_of_several(name).replace(background=background) for name in cycle))
-                for begin, cycle in cycles
-            ),
-        )
+            return cls((settings,))
+        # `exact` has a tolerance where it takes turns with others.
+        fields = {"exact": {"tolerance": _TOLERANCE}}
+        cycle = _CYCLES.get(named[0], named)
+        return cls(tuple(RenderSettings.preset(x, background=settings.background, **fields.get(x, {})) for x in cycle))
 
     def settings_at(self, step: int) -> RenderSettings:
         """The settings that a step, from 0 on, is rendered with."""
-        cycle = next(cycle for begin, cycle in reversed(self.stages) if step >= begin * self.max_steps)
-        return cycle[step % len(cycle)]
+        return self.cycle[step % len(self.cycle)]
 
     @property
     def all_settings(self) -> tuple[RenderSettings, ...]:
         """All settings of its steps, each once, in the order of their first turn."""
-        return tuple(dict.fromkeys(settings for _, cycle in self.stages for settings in cycle))
-
-
-def _one_of_several(name: str) -> RenderSettings:
-    """Settings of a preset that takes turns with others: `exact` has a tolerance then."""
-    return RenderSettings.preset(name, **({"tolerance": _TOLERANCE} if name == "exact" else {}))
+        return tuple(dict.fromkeys(self.cycle))
 
 
 def _is_single(names: Sequence[str]) -> bool:

@@ -102,7 +102,7 @@ class Trainer:
         self.rows = rows
         self.extent = extent
         self.components = components_of() if components is None else components
-        self.renderers = RendererSchedule.of(config.renderers, config.settings, config.max_steps)
+        self.renderers = RendererSchedule.of(config.renderers, config.settings)
         self.resolution = Resolution.of(config)
         self.step_index = self.bad_steps = self._bad_in_a_row = 0
         self._bad: str | None = None  # what was not finite first
@@ -235,7 +235,6 @@ class Trainer:
         if max_steps <= self.step_index:
             raise ValueError(f"fit: steps must be more than the {self.step_index} done, got {max_steps}; ask for more")
         self.config = self.config.replace(max_steps=max_steps)
-        self.renderers = RendererSchedule.of(self.config.renderers, self.config.settings, max_steps)
         self.resolution = Resolution.of(self.config)
 
     def trial(self, config: FitConfig, frames: list[Frame], rows: GaussianRows, component: Component) -> Trainer:

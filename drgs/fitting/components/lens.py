@@ -77,7 +77,7 @@ def lens_choice(config: FitConfig, views: Sequence[View], otherwise: str | None 
         return LensChoice("on", lost, "use --for drgs, or another renderer along rays")
     if otherwise is not None:
         return LensChoice("on", lost, otherwise)
-    drawn = RendererSchedule.of(config.renderers, config.settings, config.max_steps).all_settings
+    drawn = RendererSchedule.of(config.renderers, config.settings).all_settings
     if any(settings.near > 0 for settings in drawn) and any(_looks_behind(camera) for camera in cameras.values()):
         return LensChoice("on", lost, "use --for drgs: near planes leave out what lenses see behind the camera's plane")
     return LensChoice("off", lost)
