@@ -24,7 +24,6 @@ from drgs.fitting.components.lifespans import (
     REFERENCE_TIMES,
     LifetimeTerm,
     NewGaussians,
-    Search,
     agreed_trajectories,
     find_new_gaussians,
 )
@@ -319,7 +318,7 @@ def test_places_of_a_thing_tell_how_it_goes_on():
         photographs=40,
     )
     off = []
-    for found in (places, agreed_trajectories(places, 3.0, 1.0, Search())):
+    for found in (places, agreed_trajectories(places, 3.0, 1.0)):
         predicted = 12 * found.velocities + 72 * found.accelerations
         off.append(float((predicted - (way(12) - way(0))).norm(dim=1).median()))
     assert off[0] > radius

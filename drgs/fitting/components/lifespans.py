@@ -78,68 +78,33 @@ _TOGETHER = 256  # places whose trajectories are corrected at once, so that they
 _NO_SURFACE = 1e9  # distance in world units of a ray that meets no surface: farther than any surface, and finite
 
 
-@dataclasses.dataclass(frozen=True)
-class Search:
-    """How new Gaussians are searched for. The defaults are those that docs/dynamic-data.md was measured with.
-
-    Attributes:
-        pixels: Pixels of the pictures that are compared, at most: few enough that the search takes seconds.
-        difference: Mean difference of colors, in [0, 1], from which on a pixel shows something else: above noise.
-        background_photographs: Photographs from one place from which on their median is what is seen there at most
-            times; fewer have no majority.
-        samples: Pixels of a photograph whose depth is searched, at most.
-        same_time, other_times: Photographs of the same time, and of the nearest other times, that they are compared
-            with.
-        iterations: Rounds of the search.
-        random, changed, neighbors: Candidates of a pixel in each round: drawn at random, its own with a change, and of
-            other pixels.
-        least_depth: Least random depth, as part of the way to what is rendered: nothing stands before the lens.
-        decades, resting: Powers of ten that random speeds span below the fastest, and part of them that are 0.
-        change: Relative change of depths and velocities in the second round; it halves with each.
-        propagated: Score in [0, 1] from which on other photographs take over a pixel's depth and velocity.
-        accepted: Score in [0, 1] from which on a new Gaussian is added: most photographs agree.
-        color: Standard deviation of the color of one thing in two photographs, in [0, 1].
-        fewest: Photographs that must show a place.
-        enough: Photographs of the same time that say where something is without those of others.
-        minor: Weight of what decides only between equals: agreement of other times, and a low speed.
-        occluded: Part of the distance to a place below which what is rendered stands before it; 1 up to rounding.
-        window: Within so many times velocities and accelerations are made to agree.
-        spread: How far apart places of one thing are, in extents of the scene.
-        rounds: How often they are made to agree, each time with what is found along what they agreed on before.
-        reach: What velocity and acceleration may be off by at the end of the window, in extents of the scene.
-        turned: Part of its way that a thing may be off its straight path.
-        far: Quantile of the distances to all Gaussians beyond which nothing is looked for.
-        fastest: Largest speed, in extents of the scene in the time between two photographs.
-    """
-
-    pixels: int = 10_000
-    difference: float = 0.08
-    background_photographs: int = 4
-    samples: int = 128
-    same_time: int = 6
-    other_times: int = 8
-    iterations: int = 8
-    random: int = 24
-    changed: int = 8
-    neighbors: int = 5
-    least_depth: float = 0.02
-    decades: float = 2.5
-    resting: float = 0.3
-    change: float = 0.25
-    propagated: float = 0.3
-    accepted: float = 0.6
-    color: float = 0.15
-    fewest: int = 2
-    enough: int = 3
-    minor: float = 0.02
-    occluded: float = 0.98
-    window: float = 16.0
-    spread: float = 0.06
-    rounds: int = 2
-    reach: float = 0.05
-    turned: float = 0.25
-    far: float = 0.95
-    fastest: float = 0.15
+# Of the search; docs/dynamic-data.md was measured with these.
+_PIXELS = 10_000  # of the pictures that are compared, at most: few enough that the search takes seconds
+_DIFFERENCE = 0.08  # mean difference of colors, in [0, 1], from which on a pixel shows something else: above noise
+# Photographs from one place from which on their median is what is seen there at most times; fewer have no majority.
+_BACKGROUND_PHOTOGRAPHS = 4
+_SAMPLES = 128  # pixels of a photograph whose depth is searched, at most
+_SAME_TIME, _OTHER_TIMES = 6, 8  # photographs of the same time, and of the nearest others, that they are compared with
+_ITERATIONS = 8  # rounds of the search
+_RANDOM, _CHANGED, _NEIGHBORS = 24, 8, 5  # candidates in a round: drawn at random, its own with a change, of others
+_LEAST_DEPTH = 0.02  # least random depth, as part of the way to what is rendered: nothing stands before the lens
+_DECADES, _RESTING = 2.5, 0.3  # powers of ten that random speeds span below the fastest, and part of them that are 0
+_CHANGE = 0.25  # relative change of depths and velocities in the second round; it halves with each
+_PROPAGATED = 0.3  # score in [0, 1] from which on other photographs take over a pixel's depth and velocity
+_ACCEPTED = 0.6  # score in [0, 1] from which on a new Gaussian is added: most photographs agree
+_COLOR = 0.15  # standard deviation of the color of one thing in two photographs, in [0, 1]
+_FEWEST = 2  # photographs that must show a place
+_ENOUGH = 3  # photographs of the same time that say where something is without those of others
+_MINOR = 0.02  # weight of what decides only between equals: agreement of other times, and a low speed
+_OCCLUDED = 0.98  # part of the distance to a place below which what is rendered stands before it; 1 up to rounding
+_FAR = 0.95  # quantile of the distances to all Gaussians beyond which nothing is looked for
+_FASTEST = 0.15  # largest speed, in extents of the scene in the time between two photographs
+# Of trajectories that are made to agree.
+_WINDOW = 16.0  # times within which velocities and accelerations agree
+_SPREAD = 0.06  # how far apart places of one thing are, in extents of the scene
+_ROUNDS = 2  # how often they are made to agree, each time with what is found along what they agreed on before
+_REACH = 0.05  # what velocity and acceleration may be off by at the end of the window, in extents of the scene
+_TURNED = 0.25  # part of its way that a thing may be off its straight path
 
 
 class LifespansComponent(Component):
@@ -172,7 +137,6 @@ class LifespansComponent(Component):
         wait = WARM_UP if shows_first_time(fit.frames) else 0.0
         if fit.step_index != stage.begin + round(wait * stage.length):
             return []
-        self.terms = [LifetimeTerm(fit.rows, spacing(self.times), fit.config.motion.life_weight)]
         most = round(MOST_ADDED * fit.config.density.max_gaussians) - fit.reserved
         if most <= 0:
             return []
@@ -194,11 +158,11 @@ class LifespansComponent(Component):
     def resume(self, fit: Fit, checkpoint: Checkpoint) -> None:
         """See `Component`."""
         if self.times and REFERENCE_TIMES in fit.rows.tensors:
-            self.terms = [LifetimeTerm(fit.rows, spacing(self.times), fit.config.motion.life_weight)]
             self._use(fit)
 
     def _use(self, fit: Fit) -> None:
-        """Rates of tensors of lifetimes, in the unit of length of the field."""
+        """The term of lifetimes, and rates of their tensors, in the unit of length of the field."""
+        self.terms = [LifetimeTerm(fit.rows, spacing(self.times), fit.config.motion.life_weight)]
         length = next((x.field_length for x in fit.components if isinstance(x, MotionComponent)), fit.extent)
         self.rates = lifespan_rates(fit.config, self.times, length)
 
@@ -467,7 +431,6 @@ def find_new_gaussians(
     most: int,
     generator: torch.Generator,
     shown: Callable[[Output, Frame], Output] | None = None,
-    search: Search = Search(),  # noqa: B008
 ) -> NewGaussians:
     """Look for what photographs show and the scene does not.
 
@@ -479,39 +442,38 @@ def find_new_gaussians(
         most: How many places are returned at most, drawn at random from those that are found.
         generator: Generator of all random choices.
         shown: What a photograph shows of a rendering; None: the rendering.
-        search: How they are searched for.
     """
     beside = scene.at(frames[0].camera.time)
     means = beside.means.detach()  # how far things are is a constant
     places = torch.from_numpy(np.stack([frame.camera.center - beside.origin for frame in frames])).to(means)
-    far = float(torch.cdist(places, means).quantile(search.far, dim=1).max())
+    far = float(torch.cdist(places, means).quantile(_FAR, dim=1).max())
     comparisons = []
-    background = _backgrounds(frames, search)
-    with Bar("looking for what moves", (1 + search.iterations) * len(frames)) as bar:
+    background = _backgrounds(frames)
+    with Bar("looking for what moves", (1 + _ITERATIONS) * len(frames)) as bar:
         for frame, still in zip(frames, background, strict=True):
-            comparisons.append(_compared(frame, still, scene, beside.origin, settings, generator, shown, search))
+            comparisons.append(_compared(frame, still, scene, beside.origin, settings, generator, shown))
             bar.advance()
         times = np.array([comparison.time for comparison in comparisons])
         step = spacing([comparison.time for comparison in comparisons])
-        neighbors = [_neighbors(i, comparisons, times, search) for i in range(len(comparisons))]
-        fastest = search.fastest * extent / step
-        for iteration in range(search.iterations):
+        neighbors = [_neighbors(i, comparisons, times) for i in range(len(comparisons))]
+        fastest = _FASTEST * extent / step
+        for iteration in range(_ITERATIONS):
             for i, comparison in enumerate(comparisons):
                 if len(comparison.samples):
                     near = [comparisons[j] for j in neighbors[i]]
-                    _search_round(iteration, comparison, near, far, fastest, generator, search)
+                    _search_round(iteration, comparison, near, far, fastest, generator)
                 bar.advance()
-    found = NewGaussians.joined([_accepted(comparison, search) for comparison in comparisons])
+    found = NewGaussians.joined([_accepted(comparison) for comparison in comparisons])
     count = len(found.points)
     if count > most:
         found = found.take(torch.randperm(count, generator=generator)[:most])
         found = found._replace(sizes=found.sizes * math.sqrt(count / most))
-    return agreed_trajectories(found, extent, step, search)
+    return agreed_trajectories(found, extent, step)
 
 
-def _accepted(comparison: _Comparison, search: Search) -> NewGaussians:
+def _accepted(comparison: _Comparison) -> NewGaussians:
     """The places that the pixels of a photograph agree with others about."""
-    good = comparison.score > search.accepted
+    good = comparison.score > _ACCEPTED
     depth, rays, colors = comparison.depth[good], comparison.rays[good], comparison.colors[good]
     camera = comparison.camera
     pixels = comparison.share * camera.width * camera.height / max(len(comparison.samples), 1)  # of one sample
@@ -527,7 +489,7 @@ def _accepted(comparison: _Comparison, search: Search) -> NewGaussians:
     )
 
 
-def agreed_trajectories(places: NewGaussians, extent: float, step: float, search: Search) -> NewGaussians:
+def agreed_trajectories(places: NewGaussians, extent: float, step: float) -> NewGaussians:
     """Places with the velocities and accelerations that those of times near theirs agree on.
 
     Each place predicts where it is at those times. What else is there then, of its color, is a measurement of how far
@@ -539,21 +501,20 @@ def agreed_trajectories(places: NewGaussians, extent: float, step: float, search
         places: What is known of each.
         extent: Extent of the scene, world units.
         step: Time between one photograph and the next.
-        search: Window, spread, rounds, reach and turned count.
     """
-    with Bar("how it moves", search.rounds * len(places.times.unique())) as bar:
-        for _ in range(search.rounds):
-            places = _corrected(places, extent, step, search, bar)
+    with Bar("how it moves", _ROUNDS * len(places.times.unique())) as bar:
+        for _ in range(_ROUNDS):
+            places = _corrected(places, extent, step, bar)
     return places
 
 
-def _corrected(places: NewGaussians, extent: float, step: float, search: Search, bar: Bar) -> NewGaussians:
+def _corrected(places: NewGaussians, extent: float, step: float, bar: Bar) -> NewGaussians:
     """A round of `agreed_trajectories`; `bar` advances with each time."""
     velocities, accelerations = places.velocities.clone(), places.accelerations.clone()
     times = places.times
-    late = search.window * step
+    late = _WINDOW * step
     # Of an offset, and of what velocity and acceleration come to at the end of the window, over the noise of a place.
-    ratio = search.reach / search.spread
+    ratio = _REACH / _SPREAD
     prior = torch.tensor([1.0, ratio, ratio]).square().reciprocal().diag()
     for time in times.unique():
         there = ((times - time).abs() < late).nonzero()[:, 0]
@@ -565,8 +526,8 @@ def _corrected(places: NewGaussians, extent: float, step: float, search: Search,
             bent = places.velocities[here][:, None] + 0.5 * ahead * places.accelerations[here][:, None]
             off = places.points[there][None] - (places.points[here][:, None] + ahead * bent)  # (here, there, 3)
             speed = places.velocities[here].norm(dim=1, keepdim=True)
-            same = off.norm(dim=2) < search.spread * extent * 2 + search.turned * speed * ahead[:, 0].abs()
-            same &= torch.cdist(places.colors[here], places.colors[there]) < 2 * search.color
+            same = off.norm(dim=2) < _SPREAD * extent * 2 + _TURNED * speed * ahead[:, 0].abs()
+            same &= torch.cdist(places.colors[here], places.colors[there]) < 2 * _COLOR
             # A time counts once: its photographs show one side of a thing, all places of which are off alike.
             counted = same.float() @ each.float() @ each.float().T
             weighted = (same / counted.clamp(min=1))[..., None] * basis
@@ -578,13 +539,13 @@ def _corrected(places: NewGaussians, extent: float, step: float, search: Search,
     return places._replace(velocities=velocities, accelerations=accelerations)
 
 
-def _reduced(frame: Frame, search: Search) -> torch.Tensor:
+def _reduced(frame: Frame) -> torch.Tensor:
     """(3, H, W) of a photograph, at the size at which photographs are compared."""
-    width, height = reduced_size(frame.camera, search.pixels)
+    width, height = reduced_size(frame.camera, _PIXELS)
     return interpolate(frame.image().permute(2, 0, 1)[None], (height, width), mode="area")[0]
 
 
-def _backgrounds(frames: list[Frame], search: Search) -> list[torch.Tensor | None]:
+def _backgrounds(frames: list[Frame]) -> list[torch.Tensor | None]:
     """(3, H, W) of each photograph, what its camera sees at most times; None where it took fewer than 4 from there."""
     groups: dict[bytes, list[int]] = {}
     for i, frame in enumerate(frames):
@@ -593,8 +554,8 @@ def _backgrounds(frames: list[Frame], search: Search) -> list[torch.Tensor | Non
         groups.setdefault(key.round(6).tobytes(), []).append(i)
     background: list[torch.Tensor | None] = [None] * len(frames)
     for listed in groups.values():
-        if len(listed) >= search.background_photographs:
-            median = torch.stack([_reduced(frames[i], search) for i in listed]).median(0).values
+        if len(listed) >= _BACKGROUND_PHOTOGRAPHS:
+            median = torch.stack([_reduced(frames[i]) for i in listed]).median(0).values
             for i in listed:
                 background[i] = median
     return background
@@ -608,17 +569,16 @@ def _compared(
     settings: RenderSettings,
     generator: torch.Generator,
     shown: Callable[[Output, Frame], Output] | None,
-    search: Search,
 ) -> _Comparison:
     """A photograph beside its rendering, and the pixels whose depth is to be searched."""
-    width, height = reduced_size(frame.camera, search.pixels)
+    width, height = reduced_size(frame.camera, _PIXELS)
     camera = frame.camera.resized(width, height)
     with torch.no_grad():  # compared, not optimized
         out = render(colors_only(scene, camera.time), camera, settings, outputs=("depth",))
         if shown is not None:
             out = shown(out, frame)
     rgb = out.rgb.cpu().clamp(0, 1).permute(2, 0, 1)
-    image = _reduced(frame, search)
+    image = _reduced(frame)
     assert out.depth is not None  # an output of this rendering
     assert camera.time is not None  # a fit to what moves
     distance = torch.where(out.alpha.cpu() > _SOLID, out.depth.cpu(), torch.inf)
@@ -626,9 +586,9 @@ def _compared(
     if settings.planar and settings.depth_key == "z":
         distance = distance / (rays @ torch.from_numpy(camera.c2w[:3, 2]).float())
     residual = avg_pool2d((image - rgb).abs().mean(0)[None], 3, 1, 1)[0]
-    other = residual > search.difference
+    other = residual > _DIFFERENCE
     if background is not None:
-        other &= avg_pool2d((image - background).abs().mean(0)[None], 3, 1, 1)[0] > search.difference
+        other &= avg_pool2d((image - background).abs().mean(0)[None], 3, 1, 1)[0] > _DIFFERENCE
     if frame.mask is not None:
         other &= interpolate(frame.mask[None, None], (height, width), mode="area")[0, 0] > _SOLID
     # What is thinner than three pixels is an edge that is not sharp yet.
@@ -636,7 +596,7 @@ def _compared(
     other = (max_pool2d(core, 3, 1, 1)[0] > 0) & other
     where = other.nonzero()
     if len(where):
-        where = where[torch.randperm(len(where), generator=generator)[: search.samples]]
+        where = where[torch.randperm(len(where), generator=generator)[:_SAMPLES]]
     rows, columns = where[:, 0], where[:, 1]
     moved = camera.relative_to(origin)
     return _Comparison(
@@ -656,14 +616,14 @@ def _compared(
     )
 
 
-def _neighbors(i: int, comparisons: list[_Comparison], times: np.ndarray, search: Search) -> list[int]:
+def _neighbors(i: int, comparisons: list[_Comparison], times: np.ndarray) -> list[int]:
     """Photographs that the pixels of one are compared with: of its time, and nearest in time."""
     apart = np.abs(times - times[i])
     centers = np.stack([comparison.camera.center for comparison in comparisons])
     beside = np.linalg.norm(centers - centers[i], axis=1)
     order = np.lexsort((beside, apart))
-    same = [j for j in order if apart[j] == 0 and j != i][: search.same_time]
-    other = [j for j in order if apart[j] > 0][: search.other_times]
+    same = [j for j in order if apart[j] == 0 and j != i][:_SAME_TIME]
+    other = [j for j in order if apart[j] > 0][:_OTHER_TIMES]
     return [*same, *other]
 
 
@@ -674,7 +634,6 @@ def _search_round(
     far: float,
     fastest: float,
     generator: torch.Generator,
-    search: Search,
 ) -> None:
     """Try other depths and velocities for the pixels of a photograph, and keep what agrees better."""
     samples = len(comparison.samples)
@@ -682,31 +641,31 @@ def _search_round(
     end = comparison.distance[y, x].clamp(max=far)
     rand = lambda *shape: torch.rand(*shape, generator=generator)  # noqa: E731
     randn = lambda *shape: torch.randn(*shape, generator=generator)  # noqa: E731
-    depths = [end[:, None] * (search.least_depth + (1 - search.least_depth) * rand(samples, search.random))]
-    speed = fastest * 10 ** (-search.decades * rand(samples, search.random, 1))
-    speed = speed * (rand(samples, search.random, 1) > search.resting)
-    direction = torch.nn.functional.normalize(randn(samples, search.random, 3), dim=-1)
+    depths = [end[:, None] * (_LEAST_DEPTH + (1 - _LEAST_DEPTH) * rand(samples, _RANDOM))]
+    speed = fastest * 10 ** (-_DECADES * rand(samples, _RANDOM, 1))
+    speed = speed * (rand(samples, _RANDOM, 1) > _RESTING)
+    direction = torch.nn.functional.normalize(randn(samples, _RANDOM, 3), dim=-1)
     velocities = [speed * direction]
     if comparison.is_searched:
         depth, velocity = comparison.depth[:, None], comparison.velocity[:, None]
         depths.append(depth)
         velocities.append(velocity)
-        scale = search.change * 0.5 ** (iteration - 1)
-        depths.append(depth * (scale * randn(samples, search.changed)).exp())
+        scale = _CHANGE * 0.5 ** (iteration - 1)
+        depths.append(depth * (scale * randn(samples, _CHANGED)).exp())
         # Most changes of a velocity are small ones.
-        change = scale * fastest * randn(samples, search.changed, 3)
-        velocities.append(velocity + change * rand(samples, search.changed, 1) ** 3)
-        others = torch.randint(samples, (samples, search.neighbors), generator=generator)
+        change = scale * fastest * randn(samples, _CHANGED, 3)
+        velocities.append(velocity + change * rand(samples, _CHANGED, 1) ** 3)
+        others = torch.randint(samples, (samples, _NEIGHBORS), generator=generator)
         depths.append(comparison.depth[others])
         velocities.append(comparison.velocity[others])
-        taken = _propagated(comparison, neighbors, search)
+        taken = _propagated(comparison, neighbors)
         if taken is not None:
             depths.append(taken[0])
             velocities.append(taken[1])
     depth = torch.cat(depths, 1).clamp(min=1e-3 * far)
     depth = torch.minimum(depth, end[:, None])
     velocity = torch.cat(velocities, 1)
-    score, confirmed = _agreement(comparison, depth, velocity, neighbors, fastest, search)
+    score, confirmed = _agreement(comparison, depth, velocity, neighbors, fastest)
     best = score.argmax(1)
     rows = torch.arange(samples)
     comparison.depth, comparison.velocity = depth[rows, best], velocity[rows, best]
@@ -714,13 +673,11 @@ def _search_round(
     comparison.is_searched = True
 
 
-def _propagated(
-    comparison: _Comparison, neighbors: list[_Comparison], search: Search
-) -> tuple[torch.Tensor, torch.Tensor] | None:
+def _propagated(comparison: _Comparison, neighbors: list[_Comparison]) -> tuple[torch.Tensor, torch.Tensor] | None:
     """(S, T) depths and (S, T, 3) velocities that pixels of other photographs have, of those seen nearest to each."""
     points, velocities = [], []
     for other in neighbors:
-        good = other.score > search.propagated
+        good = other.score > _PROPAGATED
         place = other.center + other.depth[:, None] * other.rays + other.velocity * (comparison.time - other.time)
         points.append(place[good])
         velocities.append(other.velocity[good])
@@ -731,7 +688,7 @@ def _propagated(
         return None
     place, speed, pixels = place[front], speed[front], torch.from_numpy(projected)[front]
     apart = torch.cdist(comparison.samples.double() + 0.5, pixels)
-    nearest = apart.topk(min(search.neighbors, len(place)), dim=1, largest=False).indices
+    nearest = apart.topk(min(_NEIGHBORS, len(place)), dim=1, largest=False).indices
     return (place[nearest] - comparison.center).norm(dim=-1), speed[nearest]
 
 
@@ -741,7 +698,6 @@ def _agreement(
     velocity: torch.Tensor,
     neighbors: list[_Comparison],
     fastest: float,
-    search: Search,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """How well other photographs agree with depths (S, T) and velocities (S, T, 3) of the pixels of one.
 
@@ -762,13 +718,13 @@ def _agreement(
         maps = torch.cat([other.maps, other.distance.clamp(max=_NO_SURFACE)[None]])[None]
         sampled = grid_sample(maps, where.nan_to_num(2.0).clamp(-2, 2)[None], align_corners=False)[0]
         away = (place - other.center).norm(dim=-1)
-        inside &= sampled[4] > search.occluded * away  # else something stands before it
+        inside &= sampled[4] > _OCCLUDED * away  # else something stands before it
         difference = (sampled[:3].permute(1, 2, 0) - comparison.colors[:, None]).square().sum(-1)
-        same = sampled[3] * torch.exp(-0.5 * difference / search.color**2)
+        same = sampled[3] * torch.exp(-0.5 * difference / _COLOR**2)
         agreed[is_later] += torch.where(inside, same, 0.0)
         shown[is_later] += inside
     # One more that does not agree: a place that many see is better than one that few do, where as large a part agrees.
     now, confirmed = agreed / (shown + 1)
-    everything = torch.where(shown.sum(0) >= search.fewest, agreed.sum(0) / (shown.sum(0) + 1), 0.0)
-    score = torch.where(shown[0] >= search.enough, now + search.minor * confirmed, everything)
-    return score - search.minor * velocity.norm(dim=-1) / fastest, confirmed
+    everything = torch.where(shown.sum(0) >= _FEWEST, agreed.sum(0) / (shown.sum(0) + 1), 0.0)
+    score = torch.where(shown[0] >= _ENOUGH, now + _MINOR * confirmed, everything)
+    return score - _MINOR * velocity.norm(dim=-1) / fastest, confirmed
