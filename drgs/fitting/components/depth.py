@@ -160,6 +160,7 @@ _RECORD = {
 
 class DepthComponent(Component):
     """Rendered depth is fitted to depth maps: `depth` on, or auto, where they agree with what photographs triangulate.
+    It is its own term of the loss.
 
     Attributes:
         found: What maps say of triangulated points; None where there are no maps, or nobody asked.
@@ -167,6 +168,7 @@ class DepthComponent(Component):
     """
 
     name = "depth"
+    outputs: ClassVar[tuple[str, ...]] = ("depth",)
     option = ("depth", "off")
     where = "where depth maps are fitted to"
     header_kinds: ClassVar[Mapping[str, Any]] = {"depth": _RECORD}
@@ -233,7 +235,7 @@ class DepthComponent(Component):
                         f"of relative ones, got {self.found.points} points; add photographs, or leave --depth out"
                     )
             bar.note(f"depth: {self.found.words()}; {self._effect()}")
-        self.terms = [_DepthTerm(self)] if self.used else []
+        self.terms = [self] if self.used else []
 
     def _effect(self) -> str:
         """What follows from the comparison, in words."""
@@ -267,7 +269,7 @@ class DepthComponent(Component):
         record = checkpoint.header.get("depth")
         if record is not None:
             self.found, self.used = Comparison.from_json(record), record["used"]
-            self.terms = [_DepthTerm(self)] if self.used else []
+            self.terms = [self] if self.used else []
         self._read(fit.frames)
 
     def _read(self, frames: Sequence[Frame]) -> None:
@@ -314,14 +316,18 @@ class DepthComponent(Component):
         cosines = self._cosines[lens]
         return torch.where(cosines > 0, z / cosines, 0.0)
 
-    def loss(self, out: Output, frame: Frame) -> torch.Tensor | None:
-        """The term for a step's view; see `_DepthTerm`."""
+    def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor | None:
+        """See `drgs.fitting.losses.LossTerm`: w mean(alpha b c log(1 + |r| / c)) of the relative errors r of rendered
+        depth, 0 where a map says nothing; b is 1 before the map's depth, `depth_behind` behind it.
+
+        It is a mean over all pixels, so that a map that knows few counts for little; gradients reach depth, not alpha.
+        """
         if self._target is None:
             return None
-        assert out.depth is not None  # an output of every step's rendering
-        depth = out.depth
+        assert output.depth is not None  # an output of every step's rendering
+        depth = output.depth
         target = _nearest(self._target, depth.shape[0], depth.shape[1]).to(depth)
-        counts = (target > 0).to(depth) * out.alpha.detach()  # where next to nothing is, its depth is noise
+        counts = (target > 0).to(depth) * output.alpha.detach()  # where next to nothing is, its depth is noise
         if frame.mask is not None:
             counts = counts * frame.mask
         if frame.transient is not None:
@@ -365,23 +371,6 @@ class DepthComponent(Component):
             except ValueError as error:
                 return f"the depth map of {str(error).rstrip('; ')}"
         return None
-
-
-@dataclasses.dataclass(frozen=True)
-class _DepthTerm:
-    """w mean(alpha b c log(1 + |r| / c)) of the relative errors r of rendered depth, 0 where a map says nothing; b is 1
-    before the map's depth, `depth_behind` behind it.
-
-    It is a mean over all pixels, so that a map that knows few counts for little; gradients reach depth, not alpha.
-    """
-
-    component: DepthComponent
-    name: ClassVar[str] = "depth"
-    outputs: ClassVar[tuple[str, ...]] = ("depth",)
-
-    def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor | None:
-        """See `drgs.fitting.losses.LossTerm`."""
-        return self.component.loss(output, frame)
 
 
 def compare(views: Sequence[View], points: np.ndarray, shown: np.ndarray) -> Comparison:
