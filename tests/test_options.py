@@ -35,9 +35,6 @@ class Inner(Record):
     count: int = option(3, "How many.", within=(1, 9))
     names: tuple[str, ...] = option(("a",), "Names.", commas=True, none="none", rare=True)
 
-    def __post_init__(self) -> None:
-        self.check()
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Toy(options.Common):

@@ -194,7 +194,7 @@ class Record:
     where: ClassVar[str] = ""
     heading: ClassVar[str] = _FIRST_HEADING
 
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Raise ValueError unless every field has its type and is in the range that it declares."""
         kind: Any = type(self)
         check_fields(self.where, self, _ranges_of(kind), _words_of(kind))

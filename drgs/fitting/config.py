@@ -144,7 +144,7 @@ class DataConfig(Record):
     heading: ClassVar[str] = "Data"
 
     def __post_init__(self) -> None:
-        self.check()
+        super().__post_init__()
         if self.test_every == 1:
             raise ValueError("fit: test_every must be 0 (hold out none) or >= 2, got 1")
         if self.test_offset >= max(self.test_every, 1):
@@ -215,9 +215,6 @@ class DensityConfig(Record):
     where: ClassVar[str] = "fit"
     heading: ClassVar[str] = "Quality"
 
-    def __post_init__(self) -> None:
-        self.check()
-
     def start_of(self, dense: bool) -> tuple[float, float]:
         """Opacity, and factor of the scales, of new Gaussians; `dense` for points from depth maps."""
         return (self.dense_opacity, self.dense_scale) if dense else (self.initial_opacity, 1.0)
@@ -245,9 +242,6 @@ class RateConfig(Record):
     sh_every: float = option(1 / 30, "Fraction of the steps between two degrees of SH.", within=FRACTION, rare=True)
     where: ClassVar[str] = "fit"
     heading: ClassVar[str] = "Quality"
-
-    def __post_init__(self) -> None:
-        self.check()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -300,9 +294,6 @@ class LossConfig(Record):
     where: ClassVar[str] = "fit"
     heading: ClassVar[str] = "Quality"
 
-    def __post_init__(self) -> None:
-        self.check()
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FeatureConfig(Record):
@@ -349,9 +340,6 @@ class FeatureConfig(Record):
     )
     where: ClassVar[str] = "fit"
     heading: ClassVar[str] = "Features"
-
-    def __post_init__(self) -> None:
-        self.check()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -435,7 +423,7 @@ class MotionConfig(Record):
     heading: ClassVar[str] = "Motion"
 
     def __post_init__(self) -> None:
-        self.check()
+        super().__post_init__()
         if self.static_share == 1:
             raise ValueError("fit: static_share must be below 1, got 1; --dynamics ignore fits no motion at all")
 
@@ -449,9 +437,6 @@ class SavingConfig(Record):
         10.0, "Minutes between checkpoints, if --save-every takes longer.", within=(1e-3, 1e9), rare=True
     )
     where: ClassVar[str] = "fit"
-
-    def __post_init__(self) -> None:
-        self.check()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -552,7 +537,7 @@ class SelectionConfig(Record):
             RegionText.of(self.region, "active")
         if self.add == 0:
             raise ValueError("active: add must be >= 1, got 0; without --views active all views are used")
-        self.check()
+        super().__post_init__()
         if self.scoring.settings != Scoring.settings or self.scoring.semantics is not None:
             raise ValueError("active: scoring must leave settings and semantics to the fit, got others; drop them")
 
@@ -634,7 +619,7 @@ class FitConfig(Record):
     where: ClassVar[str] = "fit"
 
     def __post_init__(self) -> None:
-        self.check()
+        super().__post_init__()
         check_renderers(self.renderers, self.settings)
         if self.data.undistort == "off":
             _check_lenses(self)

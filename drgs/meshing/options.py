@@ -43,6 +43,3 @@ class MeshOptions(Record):
     min_piece: float = option(
         0.01, "Remove loose pieces with less than this fraction of the largest one's area.", within=(0.0, 1.0)
     )
-
-    def __post_init__(self) -> None:
-        self.check()
