@@ -6,7 +6,7 @@ Metrics that cannot be computed are None with a reason, never left out. `DEFINIT
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -292,13 +292,47 @@ def evaluate(
         `pixel_accuracy` and `miou`, too; and `scores`, every single number that there is: the means and, of a run with
         features, the scores of its labels.
     """
+    measured = None if isinstance(segmentation, str) else segmentation
+    views = []
+    reasons = {}
+    if lpips is None:
+        reasons["lpips"] = _NO_WEIGHTS if importlib.util.find_spec("lpips") else _NO_LPIPS
+    is_cut_out = any(frame.empty() is not None for frame in frames)
+    has_depth = any(frame.depth is not None for frame in frames)
     with Bar("measuring views", len(frames)) as bar:
-        measured = None if isinstance(segmentation, str) else segmentation
-        result = _evaluated(g, frames, settings, lpips, pictures, measured, moving, as_photograph, bar)
-    result["scores"] = dict(result["mean"])
+        for frame, file_name in zip(frames, file_names([frame.name for frame in frames]), strict=True):
+            with torch.no_grad():  # pictures of whatever an optimizer may hold
+                out = render(g if measured else colors_only(g, frame.camera.time), frame.camera, settings)
+                out = out if as_photograph is None else as_photograph(out, frame)
+            row, missing = _view_metrics(out, frame, settings.background if is_cut_out else None, lpips, moving)
+            reasons |= missing
+            if has_depth:
+                row["depth_error"] = depth_error(out, frame, settings)
+            if measured and out.features is not None:
+                row |= measured.add(frame, out.features)
+                if pictures is not None:
+                    measured.write(pictures / f"{file_name}.semantics.png", frame, out.features)
+            views.append(row)
+            if pictures is not None:
+                shown, target = _inside_mask(out, frame), frame.target()
+                error = (4 * (shown - target).abs()).clamp(0, 1)
+                write_png(pictures / f"{file_name}.png", torch.cat([target, shown, error], dim=1).numpy())
+            bar.advance()
+    variants = DEFINITIONS | (OBJECT if is_cut_out else {}) | (MOVING if moving else {}) | (DEPTH if has_depth else {})
+    mean, median = _averages(views, variants)
+    if not views:
+        reasons |= dict.fromkeys(DEFINITIONS, "no view is held out")
+    if moving and mean["psnr_moving"] is None:
+        reasons["psnr_moving"] = "no view shows anything with the label of a class that moves"
+    if lpips is not None:
+        variants["lpips"] += f", {lpips.backbone} backbone"
+    if as_photograph is not None:
+        variants["psnr"] += "; renderings have the exposure that the camera would have chosen for them"
+    result: dict[str, Any] = {"views": views, "mean": mean, "median": median, "variants": variants, "reasons": reasons}
+    result["scores"] = dict(mean)
     if isinstance(segmentation, str):
         result["segmentation"] = None
-        result["reasons"]["segmentation"] = segmentation
+        reasons["segmentation"] = segmentation
     elif segmentation is not None:
         labels = result["segmentation"] = segmentation.result()
         numbers = [name for name in labels["variants"] if name != "iou"]  # a list
@@ -306,59 +340,18 @@ def evaluate(
     return result
 
 
-def _evaluated(
-    g: Scene,
-    frames: list[Frame],
-    settings: RenderSettings,
-    lpips: Lpips | None,
-    pictures: Path | None,
-    segmentation: Segmentation | None,
-    moving: frozenset[int],
-    as_photograph: AsPhotograph | None,
-    bar: Bar,
-) -> dict:
-    """`evaluate`, under a bar that it has begun."""
-    views = []
-    reasons = {}
-    if lpips is None:
-        reasons["lpips"] = _NO_WEIGHTS if importlib.util.find_spec("lpips") else _NO_LPIPS
-    is_cut_out = any(frame.empty() is not None for frame in frames)
-    has_depth = any(frame.depth is not None for frame in frames)
-    for frame, file_name in zip(frames, file_names([frame.name for frame in frames]), strict=True):
-        with torch.no_grad():  # pictures of whatever an optimizer may hold
-            out = render(g if segmentation else colors_only(g, frame.camera.time), frame.camera, settings)
-            out = out if as_photograph is None else as_photograph(out, frame)
-        row, missing = _view_metrics(out, frame, settings.background if is_cut_out else None, lpips, moving)
-        reasons |= missing
-        if has_depth:
-            row["depth_error"] = depth_error(out, frame, settings)
-        if segmentation and out.features is not None:
-            row |= segmentation.add(frame, out.features)
-            if pictures is not None:
-                segmentation.write(pictures / f"{file_name}.semantics.png", frame, out.features)
-        views.append(row)
-        if pictures is not None:
-            shown, target = _inside_mask(out, frame), frame.target()
-            error = (4 * (shown - target).abs()).clamp(0, 1)
-            write_png(pictures / f"{file_name}.png", torch.cat([target, shown, error], dim=1).numpy())
-        bar.advance()
-    variants = DEFINITIONS | (OBJECT if is_cut_out else {}) | (MOVING if moving else {}) | (DEPTH if has_depth else {})
+def _averages(
+    views: list[dict[str, Any]], names: Iterable[str]
+) -> tuple[dict[str, float | None], dict[str, float | None]]:
+    """Mean and median of each metric over the views; None where it has none."""
     mean: dict[str, float | None] = {}
     median: dict[str, float | None] = {}
-    for name in variants:
+    for name in names:
         values = [row[name] for row in views if row[name] is not None]
         # Not every view shows the object or what moves; else a number that one view lacks has no average.
         there = values and (name in OBJECT | MOVING | DEPTH or len(values) == len(views))
         mean[name], median[name] = (sum(values) / len(values), float(np.median(values))) if there else (None, None)
-        if not views and name in DEFINITIONS:
-            reasons[name] = "no view is held out"
-    if moving and mean["psnr_moving"] is None:
-        reasons["psnr_moving"] = "no view shows anything with the label of a class that moves"
-    if lpips is not None:
-        variants["lpips"] += f", {lpips.backbone} backbone"
-    if as_photograph is not None:
-        variants["psnr"] += "; renderings have the exposure that the camera would have chosen for them"
-    return {"views": views, "mean": mean, "median": median, "variants": variants, "reasons": reasons}
+    return mean, median
 
 
 def _view_metrics(
