@@ -161,38 +161,33 @@ def load_frames(
         undistort: Whether lenses are taken out, likewise; `auto`, which a fit decides, is on.
     """
     views = [dataclasses.replace(view, keeps_lens=undistort == "off") for view in views]
-    with Bar("photographs", len(views)) as bar:
-        return _frames(views, max_pixels, mask, bar)
-
-
-def _frames(views: list[View], max_pixels: int, mask: str, bar: Bar) -> list[Frame]:
-    """`load_frames`, under a bar that it has begun."""
-    views = [view.checked() for view in views]
-    sizes = [reduced_size(view.camera, max_pixels) for view in views]
-    is_float = sum(12 * w * h for w, h in sizes) <= _FLOAT_BYTES
     frames = []
-    for view, (width, height) in zip(views, sizes, strict=True):
-        image, alpha = view.image_and_alpha(width, height)
+    with Bar("photographs", len(views)) as bar:
+        views = [view.checked() for view in views]
+        sizes = [reduced_size(view.camera, max_pixels) for view in views]
+        is_float = sum(12 * w * h for w, h in sizes) <= _FLOAT_BYTES
         store = _as_stored if is_float else _as_bytes
-        weights = None if mask == "ignore" else view.mask(width, height)
-        is_empty = mask == "object" or (mask == "auto" and view.empty_outside)  # outside of a mask or by alpha
-        if alpha is not None and mask == "auto" and not is_empty:
-            weights = alpha if weights is None else weights * alpha
-        frames.append(
-            Frame(
-                name=view.name,
-                camera=dataclasses.replace(view.shown_camera.resized(width, height), name=view.name),
-                pixels=store(image),
-                mask=None if weights is None else torch.from_numpy(np.ascontiguousarray(weights)),
-                is_object=mask == "object" or (is_empty and view.mask_path is not None),
-                alpha=store(alpha) if alpha is not None and is_empty else None,
-                teacher=cast("_Map | None", None if view.teacher_path is None else view.teacher),
-                labels=_reader(view.label_path, view.labels, width, height),
-                depth=_reader(view.depth_path, view.depth, width, height),
-                relative_depth=_reader(view.relative_depth_path, view.relative_depth, width, height),
+        for view, (width, height) in zip(views, sizes, strict=True):
+            image, alpha = view.image_and_alpha(width, height)
+            weights = None if mask == "ignore" else view.mask(width, height)
+            is_empty = mask == "object" or (mask == "auto" and view.empty_outside)  # outside of a mask or by alpha
+            if alpha is not None and mask == "auto" and not is_empty:
+                weights = alpha if weights is None else weights * alpha
+            frames.append(
+                Frame(
+                    name=view.name,
+                    camera=dataclasses.replace(view.shown_camera.resized(width, height), name=view.name),
+                    pixels=store(image),
+                    mask=None if weights is None else torch.from_numpy(np.ascontiguousarray(weights)),
+                    is_object=mask == "object" or (is_empty and view.mask_path is not None),
+                    alpha=store(alpha) if alpha is not None and is_empty else None,
+                    teacher=cast("_Map | None", None if view.teacher_path is None else view.teacher),
+                    labels=_reader(view.label_path, view.labels, width, height),
+                    depth=_reader(view.depth_path, view.depth, width, height),
+                    relative_depth=_reader(view.relative_depth_path, view.relative_depth, width, height),
+                )
             )
-        )
-        bar.advance()
+            bar.advance()
     return frames
 
 
