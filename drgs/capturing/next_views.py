@@ -19,7 +19,6 @@ from drgs.data.camera_layout import upright
 from drgs.data.camera_lists import camera_to_json
 from drgs.display.progress import Bar
 from drgs.ellipsoids import Gaussians
-from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import LoadedRun, fitted_views, load_run
 from drgs.information.region import Region, RegionText, masked_photographs
 from drgs.information.scoring import Scoring
@@ -70,9 +69,8 @@ def rank_next(
         if loaded.moving is not None:
             raise ValueError(f"{run}: --more must have a scene that stands still, this one moves; use drgs select")
         record.check_data(run)
-        dataset = load_dataset(record.data, record.config, lazy=True, points=False, semantics=False)
         pixels = min(_INFORMATION_PIXELS, record.config.data.max_pixels)
-        views = {view.name: view for view in record.with_refined_poses(dataset).views}
+        views = {view.name: view for view in record.dataset().views}
         cameras = {name: pinhole_of(view, pixels) for name, view in views.items()}
         meters = None if length is None else meters_of(length, {name: x.center for name, x in cameras.items()})
         train = [cameras[name] for name in fitted_views(folder, record) if name in cameras]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,7 @@ from drgs.commands.options import Fit, Report
 from drgs.commands.values import override
 from drgs.data import Dataset
 from drgs.fitting.config import FitConfig
-from drgs.fitting.frames import load_dataset
-from drgs.fitting.records import fit_record
+from drgs.fitting.records import FitRecord, fit_record
 from drgs.fitting.renderers import own_preset
 from drgs.fitting.resume import lock_run
 from drgs.io.outputs import check_file
@@ -38,16 +38,10 @@ def run(args: Report) -> None:
     else:
         if path.suffix.lower() not in (".html", ".htm"):
             raise ValueError(f"{path}: must be named *.html, which is what is written; choose another (-o)")
-        check_file(path, "report", [folder.path / "config.json"], is_report)
+        check_file(path, "report", [folder.path / "config.json"], written_by(GENERATOR))
     if not charts.is_available():
         _log.warning("no charts will be drawn: matplotlib is not installed; pip install 'drgs[report]'")
-    try:
-        dataset = load_dataset(record.data, record.config, lazy=True, points=False, semantics=False)
-        dataset = record.with_refined_poses(dataset)
-    except (OSError, ValueError) as error:
-        _log.warning("%s; the report goes without the data set's cameras", str(error).partition(";")[0])
-        dataset = None
-    report_of(folder, path, dataset)
+    report_of(folder, path, dataset_of(record, "the report goes without the data set's cameras"))
     args.say(f"report: {path}")
 
 
@@ -71,10 +65,24 @@ def report_of(run: Run, path: Path, dataset: Dataset | None) -> None:
     write_report(run, path, command, text, dataset)
 
 
-def is_report(path: Path) -> bool:
-    """Whether `drgs report` wrote a file, by its first 1,000 bytes."""
-    with path.open("rb") as file:
-        return f'<meta name="generator" content="{GENERATOR}">'.encode() in file.read(1000)
+def dataset_of(record: FitRecord, otherwise: str) -> Dataset | None:
+    """The data set of a run, for its cameras; None where it has gone, with a line that ends with what follows."""
+    try:
+        return record.dataset()
+    except (OSError, ValueError) as error:
+        _log.warning("%s; %s", str(error).partition(";")[0], otherwise)
+        return None
+
+
+def written_by(generator: str) -> Callable[[Path], bool]:
+    """Whether a file is a page that names this generator in its first 1,000 bytes."""
+    mark = f'<meta name="generator" content="{generator}">'.encode()
+
+    def is_ours(path: Path) -> bool:
+        with path.open("rb") as file:
+            return mark in file.read(1000)
+
+    return is_ours
 
 
 # --------------------------------------------------------------------------------------- the command that repeats a fit

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +11,11 @@ from drgs.cameras import Camera
 from drgs.cameras.origins import origin_text
 from drgs.commands.options import Share
 from drgs.commands.orbits import scene_orbit
+from drgs.commands.report import dataset_of, written_by
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import known_views
-from drgs.data import Dataset
 from drgs.ellipsoids import Gaussians
-from drgs.fitting.frames import load_dataset
-from drgs.fitting.records import FitRecord, is_run, load_run
+from drgs.fitting.records import is_run, load_run
 from drgs.fitting.resume import lock_run
 from drgs.io.foreign import refuse_foreign
 from drgs.io.outputs import check_file
@@ -28,8 +26,6 @@ from drgs.pages.sharing.write import Shared, write_page
 from drgs.viewing.placed_views import read_ranking
 
 _DEFAULT_SIZE = 960, 640  # pixels of the first view of a scene without photographs: about the shape of a screen; chosen
-
-_log = logging.getLogger(__name__)
 
 
 def run(args: Share) -> None:
@@ -57,14 +53,8 @@ def _output(args: Share) -> Path:
     if path.suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"{path}: must be named *.html, which is what is written; choose another (-o)")
     inputs = [args.scene / "config.json" if args.scene.is_dir() else args.scene, args.selection or ""]
-    check_file(path, "share", inputs, is_page)
+    check_file(path, "share", inputs, written_by(SHARED_BY))
     return path
-
-
-def is_page(path: Path) -> bool:
-    """Whether `drgs share` wrote a file, by its first 1,000 bytes."""
-    with path.open("rb") as file:
-        return f'<meta name="generator" content="{SHARED_BY}">'.encode() in file.read(1000)
 
 
 def shared_of(args: Share) -> Shared:
@@ -100,23 +90,13 @@ def shared_of(args: Share) -> Shared:
     loaded = load_run(run)
     return scene_of_run(
         run,
-        _dataset(loaded.record),
+        dataset_of(loaded.record, "the page goes without the photographs' cameras"),
         loaded=loaded,
         ranking=ranking,
         around=_overview_camera,
         moments=args.moments,
         uncertainty=args.uncertainty,
     )
-
-
-def _dataset(record: FitRecord) -> Dataset | None:
-    """The data set of a run, for its cameras; None, with a line, where it has gone."""
-    try:
-        dataset = load_dataset(record.data, record.config, lazy=True, points=False, semantics=False)
-        return record.with_refined_poses(dataset)
-    except (OSError, ValueError) as error:
-        _log.warning("%s; the page goes without the photographs' cameras", str(error).partition(";")[0])
-        return None
 
 
 def _overview_camera(gaussians: Gaussians) -> Camera:

@@ -28,7 +28,6 @@ from drgs.commands.orbits import OrbitShape, capture_orbit, dome, scene_orbit
 from drgs.commands.values import UP
 from drgs.data.camera_lists import is_camera_list, load_cameras_json
 from drgs.fitting.config import FitConfig
-from drgs.fitting.frames import load_dataset
 from drgs.fitting.records import FitRecord, fit_record, fitted_views, is_run
 from drgs.io.run import Run
 from drgs.meshing.depths import seen_distance
@@ -232,10 +231,9 @@ def captured_cameras(given: SceneInput) -> list[Camera]:
         return []
     try:
         names = set(fitted_views(given.run, given.record))
-        dataset = load_dataset(given.record.data, given.record.config, lazy=True, points=False, semantics=False)
+        views = given.record.dataset().views
     except (ValueError, OSError, KeyError):
         return []
-    views = given.record.with_refined_poses(dataset).views
     return [view.camera.undistorted() for view in views if view.name in names]
 
 

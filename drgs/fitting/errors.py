@@ -15,7 +15,7 @@ import numpy as np
 
 from drgs.display.progress import Bar
 from drgs.fitting.components.table import held_components
-from drgs.fitting.frames import Frame, frames_for, load_dataset
+from drgs.fitting.frames import Frame, frames_for
 from drgs.fitting.records import fitted_views, load_run
 from drgs.fitting.resume import lock_run
 from drgs.information.expected_error import ErrorRecord, error_record
@@ -70,9 +70,9 @@ def run_error_record(
     rows = _evenly(len(names), most)
     if (saved := saved_error_record(run, loaded.scene, settings, pixels, len(rows))) is not None:
         return saved
-    if dataset is None:
-        dataset = load_dataset(loaded.record.data, config, lazy=True, points=False, semantics=False)
-    views = {view.name: view for view in loaded.record.with_refined_poses(dataset).views}
+    known = loaded.record
+    dataset = known.dataset() if dataset is None else known.with_refined_poses(dataset)
+    views = {view.name: view for view in dataset.views}
     if missing := [name for name in names if name not in views]:
         raise ValueError(f"{loaded.record.data}: must still hold photograph {missing[0]!r}, it is gone; restore it")
     frames = frames_for([views[names[row]] for row in rows], config.data, pixels)

@@ -25,6 +25,7 @@ from drgs.fitting.components.poses import CAMERAS
 from drgs.fitting.components.semantics import SemanticRecord
 from drgs.fitting.components.table import COMPONENTS
 from drgs.fitting.config import FitConfig
+from drgs.fitting.frames import Frame, load_dataset
 from drgs.fitting.networks import saved_networks
 from drgs.fitting.rows import GaussianRows
 from drgs.information.nuisances import NUISANCES, Nuisance
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
     from drgs.features.decoder import Decoder
     from drgs.features.segmentation import Classes
     from drgs.fitting.active import ActiveViews
-    from drgs.fitting.frames import Frame
     from drgs.fitting.trainer import Trainer
 
 __all__ = [
@@ -110,6 +110,15 @@ class FitRecord:
             if view.name in self.refined:
                 view.camera = dataclasses.replace(view.camera, w2c=self.refined[view.name])
         return dataset
+
+    def dataset(self) -> Dataset:
+        """The data set for its cameras, where the fit has found them: no view opened, no points, maps or labels.
+
+        Raises:
+            FileNotFoundError, ValueError: As `drgs.data.load`.
+        """
+        found = load_dataset(self.data, self.config, lazy=True, points=False, semantics=False)
+        return self.with_refined_poses(found)
 
     @property
     def is_active(self) -> bool:
