@@ -9,6 +9,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from drgs.checks.records import options_in
+from drgs.commands.command_line import words_of
 from drgs.commands.values import parsed_size
 from drgs.display.progress import Bar
 
@@ -16,39 +18,27 @@ if TYPE_CHECKING:
     from drgs.commands.options import Scene
 
 _ONLY = {  # options that not every scene has
-    "--views": ("capture", "room", "still_life"),
-    "--cameras": ("kitchen", "hall"),
-    "--times": ("kitchen", "hall"),
-    "--teacher-size": ("room", "kitchen", "hall"),
-    "--test-every": ("room",),
-    "--free": ("room", "still_life", "kitchen", "hall"),
-    "--exposure": ("capture",),
-    "--wall": ("capture",),
-    "--no-shadow": ("capture",),
-    "--no-passer-by": ("capture",),
-    "--pose-error": ("capture",),
+    "views": ("capture", "room", "still_life"),
+    "cameras": ("kitchen", "hall"),
+    "times": ("kitchen", "hall"),
+    "teacher_size": ("room", "kitchen", "hall"),
+    "test_every": ("room",),
+    "free": ("room", "still_life", "kitchen", "hall"),
+    "exposure": ("capture",),
+    "wall": ("capture",),
+    "shadow": ("capture",),
+    "passer_by": ("capture",),
+    "pose_error": ("capture",),
 }
 
 
 def run(args: Scene) -> None:
     """`drgs scene room -o DATA`."""
-    given = {
-        "--views": args.views,
-        "--cameras": args.cameras,
-        "--times": args.times,
-        "--teacher-size": args.teacher_size,
-        "--test-every": args.test_every,
-        "--free": args.free or None,
-        "--exposure": args.exposure,
-        "--wall": args.wall,
-        "--no-shadow": None if args.shadow else False,
-        "--no-passer-by": None if args.passer_by else False,
-        "--pose-error": args.pose_error,
-    }
-    for option, value in given.items():
-        if value is not None and args.name not in _ONLY[option]:
-            scenes = " and ".join(f"`drgs scene {name}`" for name in _ONLY[option])
-            raise ValueError(f"{option}: is for {scenes}, not for {args.name}; leave it out")
+    for name, owners in _ONLY.items():
+        option, value = options_in(type(args))[name], getattr(args, name)
+        if value != option.default and args.name not in owners:
+            scenes = " and ".join(f"`drgs scene {owner}`" for owner in owners)
+            raise ValueError(f"{words_of(option, value)[0]}: is for {scenes}, not for {args.name}; leave it out")
     names = ("views", "cameras", "times", "spp", "test_every", "exposure", "wall")
     numbers: dict[str, Any] = {"seed": args.seed} | {
         name: getattr(args, name) for name in names if getattr(args, name) is not None
