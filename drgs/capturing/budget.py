@@ -361,25 +361,20 @@ class Stopwatch:
             config: Configuration with the sizes.
             is_first: Whether to take all renderers' first steps, which compile, beforehand.
         """
-        return _seconds_per_step(train, dataset, config, is_first)
-
-
-def _seconds_per_step(train: list[View], dataset: Dataset, config: FitConfig, is_first: bool) -> float:
-    """`Stopwatch.step`."""
-    views = train[:: max(1, len(train) // _TIMED_VIEWS)]
-    with Bar("", show=False), _without_log(), fewer_torch_threads():  # that of how long steps take is shown
-        frames = frames_for(views, config.data)
-        timed = config.replace(data=dataclasses.replace(config.data, skybox="off", exposure="off", poses="fixed"))
-        trainer = start_plain(_with_more_points(dataset, config), views, frames, timed)
-        # As late in a fit, where all degrees of color are there.
-        while trainer.rows.sh_degree < config.sh_degree:
-            trainer.rows.raise_sh_degree()
-        for _ in range(_TIMED_STEPS if is_first else 0):
-            trainer.step()
-        began = time.perf_counter()
-        for _ in range(_TIMED_STEPS):
-            trainer.step()
-        return (time.perf_counter() - began) / _TIMED_STEPS
+        views = train[:: max(1, len(train) // _TIMED_VIEWS)]
+        with Bar("", show=False), _without_log(), fewer_torch_threads():  # that of how long steps take is shown
+            frames = frames_for(views, config.data)
+            timed = config.replace(data=dataclasses.replace(config.data, skybox="off", exposure="off", poses="fixed"))
+            trainer = start_plain(_with_more_points(dataset, config), views, frames, timed)
+            # As late in a fit, where all degrees of color are there.
+            while trainer.rows.sh_degree < config.sh_degree:
+                trainer.rows.raise_sh_degree()
+            for _ in range(_TIMED_STEPS if is_first else 0):
+                trainer.step()
+            began = time.perf_counter()
+            for _ in range(_TIMED_STEPS):
+                trainer.step()
+            return (time.perf_counter() - began) / _TIMED_STEPS
 
 
 @contextlib.contextmanager
