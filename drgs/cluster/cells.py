@@ -8,9 +8,11 @@ such a cell is left to a worker of that machine, or counts as taken.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import queue
 import time
 import uuid
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -112,37 +114,35 @@ def _not_shared(worker: str, folder: Path) -> str:
     )
 
 
+@dataclasses.dataclass(eq=False)
 class _Round:
-    """Cells that are being computed, and their results."""
+    """Cells that are being computed, and their results.
 
-    def __init__(
-        self,
-        cluster: Cluster,
-        study: Study,
-        cells: Sequence[tuple[int, Cell]],
-        count: int,
-        runs: Path,
-        rows: Path,
-        token: Path,
-        say: Callable[[str], object],
-    ) -> None:
-        self.cluster = cluster
-        self.study = study
-        self.cells = cells
-        self.count = count
-        self.runs = runs
-        self.rows = rows
-        self.token = token
-        self.say = say
-        self.payload = cluster.send(study)
-        self.topic = _TOPIC + uuid.uuid4().hex
-        self.news: queue.Queue = queue.Queue()
-        self.begun: dict[int, tuple[str, str]] = {}  # number of the cell -> name and address of who has begun it
-        self.pending: dict[int, Future] = {}
-        self.tries: dict[int, int] = {}
-        self.moved: dict[int, int] = {}  # how often a cell was handed to the machine that has its lock
-        self.taken: list[Cell] = []
-        self.failed: dict[Cell, str] = {}
+    Attributes:
+        cells: Cells with their numbers, of `count` in all.
+        begun: Number of a cell -> name and address of who has begun it.
+        moved: Number of a cell -> how often it was handed to the machine that has its lock.
+    """
+
+    cluster: Cluster
+    study: Study
+    cells: Sequence[tuple[int, Cell]]
+    count: int
+    runs: Path
+    rows: Path
+    token: Path
+    say: Callable[[str], object]
+    topic: str = dataclasses.field(default_factory=lambda: _TOPIC + uuid.uuid4().hex)
+    news: queue.Queue = dataclasses.field(default_factory=queue.Queue)
+    begun: dict[int, tuple[str, str]] = dataclasses.field(default_factory=dict)
+    pending: dict[int, Future] = dataclasses.field(default_factory=dict)
+    tries: Counter[int] = dataclasses.field(default_factory=Counter)
+    moved: Counter[int] = dataclasses.field(default_factory=Counter)
+    taken: list[Cell] = dataclasses.field(default_factory=list)
+    failed: dict[Cell, str] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.payload = self.cluster.send(self.study)
 
     def all(self) -> tuple[list[Cell], dict[Cell, str]]:
         """Hand out the cells and wait until every one is done, taken or failed."""
@@ -198,7 +198,7 @@ class _Round:
             self.fail(cell, "its workers died of it")
             return
         if "missing" in found:
-            self.tries[number] = self.tries.get(number, 0) + 1
+            self.tries[number] += 1
             if self.tries[number] > _MAX_TRIES:
                 raise ConnectionError(f"cluster: worker {found['worker']} must keep what it is sent, but forgets it")
             self.cluster.send_again([self.payload], [found["address"]])
@@ -207,10 +207,9 @@ class _Round:
             raise ValueError(_not_shared(found["worker"], self.runs))
         elif "taken" in found:
             # A worker that is far away may have it again, when all that are near are busy, or have gone.
-            tried = self.moved.get(number, 0)
             far = found["host"] != found["taken"]
-            if far and tried < _MAX_TRIES and (near := self.cluster.workers_of(found["taken"])):
-                self.moved[number] = tried + 1
+            if far and self.moved[number] < _MAX_TRIES and (near := self.cluster.workers_of(found["taken"])):
+                self.moved[number] += 1
                 self.hand_out(number, cell, near)
             else:
                 self.say(f"{cell.name}: taken: {found['why']}")
