@@ -17,7 +17,7 @@ import numpy as np
 
 from drgs.cameras import Camera, intrinsics
 from drgs.checks.arguments import kind_of
-from drgs.data.checks import inverse_pose
+from drgs.data.checks import inverse_pose, said_of
 from drgs.io.json_files import check_json, read_json
 from drgs.io.outputs import atomic_write
 
@@ -119,11 +119,9 @@ def _of_inria(where: str, entry: Any) -> Camera:
         raise ValueError(f"{where}: position must hold 3 numbers and rotation 3x3, got other sizes; correct them")
     w2c = inverse_pose(where, np.column_stack([entry["rotation"], entry["position"]]))
     name = str(entry.get("img_name", entry.get("id", where.rpartition(" ")[2])))
-    try:
+    with said_of(where):
         K = intrinsics(entry["fx"], entry["fy"], center["cx"], center["cy"])
         return Camera(K=K, w2c=w2c, width=w, height=h, name=name, time=entry.get("time"))
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
 
 
 def is_camera_list(path: Path) -> bool:
@@ -172,7 +170,5 @@ def camera_from_json(where: str, value: object) -> Camera:
     fields = {name: value[name] for name in ("name", "width", "height", "model")}
     w2c = inverse_pose(where, np.array(value["c2w"]))
     lens = tuple(value["distortion"])
-    try:
+    with said_of(where):
         return Camera(K=np.array(value["K"]), w2c=w2c, distortion=lens, time=value.get("time"), **fields)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None

@@ -214,6 +214,15 @@ def _reading_archive(path: Path, what: str) -> Iterator[None]:
         raise ValueError(f"{path}: must hold {what}, got {said(error)}; save it with numpy.savez") from None
 
 
+@contextlib.contextmanager
+def said_of(where: str) -> Iterator[None]:
+    """A ValueError of the block names what it is about: the file, and the place in it."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
 def inverse_pose(where: str, c2w: np.ndarray) -> np.ndarray:
     """(4,4) w2c of a c2w (3 or 4 rows) that a file states; the inverse of its rotation is its transpose.
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from drgs.cameras import Camera, intrinsics
+from drgs.data.checks import said_of
 from drgs.io.atomic import temporary_folder
 from drgs.io.foreign import refuse_foreign
 
@@ -64,10 +65,8 @@ def model_camera(reconstruction: Any, image: Any, where: str) -> Camera:
     elif any(rest):
         model = "opencv"
         distortion = (*rest, *([0.0] * (4 - len(rest))))
-    try:
+    with said_of(where):
         return Camera(K, w2c, camera.width, camera.height, model, distortion, image.name)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
 
 
 def model_points(reconstruction: Any, model: Path, seen_by: set[int] | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from drgs.cameras import Camera, c2w_from_llff, intrinsics
 from drgs.cameras.checks import check_handedness
-from drgs.data.checks import inverse_pose, read_npy
+from drgs.data.checks import inverse_pose, read_npy, said_of
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
 from drgs.data.images import list_images
@@ -88,8 +88,6 @@ def row_camera(where: str, row: np.ndarray, name: str) -> Camera:
     check_handedness(where, matrix[:, :3], "(down, right, backward)", "3 of its 3x5 matrix")
     height, width, focal = matrix[:, 4]
     w2c = inverse_pose(where, c2w_from_llff(matrix))
-    try:
+    with said_of(where):
         K = intrinsics(focal, focal, width / 2, height / 2)
         return Camera(K=K, w2c=w2c, width=width, height=height, name=name)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None

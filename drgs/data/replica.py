@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from drgs.cameras import Camera, intrinsics
-from drgs.data.checks import inverse_pose, read_text, repaired_pose
+from drgs.data.checks import inverse_pose, read_text, repaired_pose, said_of
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
 from drgs.data.images import IMAGE_SUFFIXES, image_size
@@ -80,10 +80,8 @@ def load_replica(
         focal = 0.5 * width / math.tan(math.radians(_FIELD_OF_VIEW / 2))
         K = intrinsics(focal, focal, width / 2, height / 2)
         w2c = inverse_pose(where, repaired_pose(poses[number]))
-        try:
+        with said_of(where):
             view.camera = Camera(K, w2c, width, height, name=view.name)
-        except ValueError as error:
-            raise ValueError(f"{where}: {error}") from None
         depth = path / "depth" / f"depth_{_FRAME.fullmatch(view.image_path.stem)[1]}.png"
         view.depth_path = depth if depth.is_file() else None
         view.depth_scale = _MILLIMETER

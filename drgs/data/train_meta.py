@@ -16,7 +16,7 @@ import numpy as np
 from drgs.cameras import Camera
 from drgs.cameras.checks import check_distance
 from drgs.data.camera_layout import Focus, scene_origin
-from drgs.data.checks import file_inside, read_npz, repaired_pose
+from drgs.data.checks import file_inside, read_npz, repaired_pose, said_of
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
 from drgs.data.synchronous import Recording, evenly_spaced, synchronous
@@ -128,10 +128,8 @@ def _camera(where: str, data: dict, k: Any, w2c: Any) -> Camera:
             raise ValueError(f"{where}: {key} must be {side}x{side} finite numbers, is not; correct it")
         matrices.append(matrix)
     check_distance(where, matrices[1])
-    try:
+    with said_of(where):
         return Camera(matrices[0], repaired_pose(matrices[1]), data["w"], data["h"])
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
 
 
 def _points(file: Path) -> tuple[np.ndarray, np.ndarray]:

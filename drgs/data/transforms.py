@@ -13,7 +13,7 @@ import numpy as np
 
 from drgs.cameras import Camera, c2w_from_opengl, intrinsics
 from drgs.cameras.checks import check_handedness
-from drgs.data.checks import check_last_row, file_inside, inverse_pose, local_names, repaired_pose
+from drgs.data.checks import check_last_row, file_inside, inverse_pose, local_names, repaired_pose, said_of
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
 from drgs.data.images import IMAGE_SUFFIXES, image_size, is_damaged
@@ -319,21 +319,17 @@ def _camera(where: str, values: dict, w2c: np.ndarray, image: Path, first: _Firs
         if not any(distortion):
             model = "pinhole"
             distortion = ()
-    try:
+    with said_of(where):
         return Camera(
             K=K, w2c=w2c, width=width, height=height, model=model, distortion=distortion, time=values.get("time")
         )
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
 
 
 def _panorama(where: str, values: dict, w2c: np.ndarray, width: float, height: float) -> Camera:
     """The camera of a panorama of all directions, whatever focal lengths its file states."""
     K = intrinsics(width / (2 * np.pi), height / np.pi, width / 2, height / 2)
-    try:
+    with said_of(where):
         return Camera(K, w2c, width, height, "equirectangular", time=values.get("time"))
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
 
 
 def _pose(where: str, matrix: Any) -> np.ndarray:
