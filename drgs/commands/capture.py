@@ -5,7 +5,6 @@ The work is done by `drgs.capturing`: `steps` has the steps, `next_views` the pl
 
 from __future__ import annotations
 
-import functools
 import shlex
 
 from drgs.capturing.budget import seconds_of_budget
@@ -47,12 +46,7 @@ def capture_photographs(args: Capture, config: FitConfig) -> None:
         add=args.add,
         progress=not args.quiet,
     )
-    say = _no_output if args.quiet else functools.partial(print, flush=True)
-    run_capture(options, config, say, report_of)
-
-
-def _no_output(_: str) -> None:
-    """With --quiet."""
+    run_capture(options, config, args.say, report_of)
 
 
 def _print_next(args: Capture) -> None:

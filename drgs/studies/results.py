@@ -12,7 +12,7 @@ from drgs.studies.cells import Metric, Study, out_of_race
 from drgs.studies.experiments import Experiment
 from drgs.studies.protocols import PROTOCOLS
 from drgs.studies.statistics import Unit, estimate, unit_of, values_of, view_counts
-from drgs.studies.tables import comparison_table, curves, explained, markdown_table, paragraph, unlike_units
+from drgs.studies.tables import comparison_table, curves, explained, markdown_table, paragraph, title_of, unlike_units
 
 ResultRows = Sequence[Mapping[str, Any]]
 _COSTS = {"minutes": "minutes (steps and picks)", "peak_memory": "peak memory, GB", "pick_seconds": "seconds a pick"}
@@ -20,23 +20,20 @@ _BEST_BY = "psnr"  # the metric by which a unit has a best policy
 _UPPER = "all views"  # is given what the others choose from: it wins nothing
 
 
-def results_page(
-    study: Study, experiment: Experiment, rows: ResultRows, level: int = 2, remarks: Sequence[str] = ()
-) -> str:
+def results_page(study: Study, experiment: Experiment, rows: ResultRows, remarks: Sequence[str] = ()) -> str:
     """The section of one experiment as Markdown.
 
     Args:
         study: Study of the cells.
         experiment: The table.
         rows: ResultRows of the study; those of other policies are left out.
-        level: Level of its heading.
         remarks: More sentences, e.g. of what is not there and why.
     """
     labels = [label for label in experiment.policies if any(row["policy"] == label for row in rows)]
     rows = [row for row in rows if row["study"] == study.name and row["policy"] in experiment.policies]
     renamed = [f"`{label}` ({name})" for label, name in experiment.policies.items() if label != name]
     labels_of = [f"Labels, as `--policy` takes them: {', '.join(renamed)}."] if renamed else []
-    parts = [f"{'#' * level} {experiment.title}", paragraph(" ".join([experiment.description, *remarks, *labels_of]))]
+    parts = [f"## {experiment.title}", paragraph(" ".join([experiment.description, *remarks, *labels_of]))]
     if not rows:
         return "\n\n".join([*parts, "No cell is finished."])
     for protocol in (name for name in PROTOCOLS if any(row["protocol"] == name for row in rows)):
@@ -87,15 +84,10 @@ def results_rows(study: Study, experiment: Experiment, rows: ResultRows) -> list
     return lines
 
 
-def best_of_units(rows: ResultRows, metric: str = _BEST_BY) -> tuple[dict[str, int], int]:
-    """In how many units each policy has the largest number, and how many units have all policies.
-
-    Args:
-        rows: Rows of one protocol.
-        metric: Larger is better.
-    """
+def best_of_units(rows: ResultRows) -> tuple[dict[str, int], int]:
+    """In how many units each policy has the largest PSNR, and how many units have all; rows of one protocol."""
     labels = [label for label in dict.fromkeys(row["policy"] for row in rows) if label != _UPPER]
-    values = {label: values_of(rows, metric, label) for label in labels}
+    values = {label: values_of(rows, _BEST_BY, label) for label in labels}
     units: set[Unit] = set.intersection(*(set(x) for x in values.values())) if values else set()
     wins = dict.fromkeys(labels, 0)
     for unit in units:
@@ -128,7 +120,7 @@ def _table(study: Study, experiment: Experiment, labels: Sequence[str], rows: Re
     costs = {key: title for key, title in _COSTS.items() if _cost(rows, key) is not None}
     heads = [
         "policy",
-        *(m.title if m.larger else f"{m.title} (lower is better)" for m in study.metrics),
+        *map(title_of, study.metrics),
         "units",
         f"best PSNR (of {units})",
         *costs.values(),

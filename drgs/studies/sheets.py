@@ -34,8 +34,9 @@ class _Picture:
     labels: np.ndarray | None = None
 
 
-def comparison_sheet(runs: Mapping[str, Path], path: Path, view: str | None = None) -> str:
-    """Write the figure: policies by row, the truth last; the view, and of a part of it color, features and labels.
+def comparison_sheet(runs: Mapping[str, Path], path: Path) -> str:
+    """Write the figure: policies by row, the truth last; the middle one of the test views, and of a part of it color,
+    features and labels.
 
     The part is where the fits differ most from each other, of half the width and height. Features are shown by the
     three principal components of the teacher's map of this view; where it has none, of the first fit's.
@@ -43,16 +44,15 @@ def comparison_sheet(runs: Mapping[str, Path], path: Path, view: str | None = No
     Args:
         runs: What a row is called -> run folder, all of one data set and one split.
         path: The PNG.
-        view: Name of a test view; default the one in the middle.
     Returns:
-        Its name.
+        The name of the view.
     Raises:
-        ValueError: If there is no run or no such view.
+        ValueError: If there is no run.
     """
     if not runs:
         raise ValueError("comparison_sheet: there must be a run, got none")
     loaded = {name: load_run(Run(folder)) for name, folder in runs.items()}
-    frame, count = _frame(next(iter(loaded.values())), view)
+    frame, count = _frame(next(iter(loaded.values())))
     rows = [_rendered(name, run, frame) for name, run in loaded.items()]
     truth = _Picture("truth", frame.target().numpy())
     truth.features = None if frame.teacher is None else frame.teacher().permute(1, 2, 0).float()
@@ -66,14 +66,11 @@ def comparison_sheet(runs: Mapping[str, Path], path: Path, view: str | None = No
     return frame.name
 
 
-def _frame(run: LoadedRun, name: str | None) -> tuple[Frame, int]:
+def _frame(run: LoadedRun) -> tuple[Frame, int]:
     """The test view, and how many classes there are."""
     record, config = run.record, run.record.config
     test = load_dataset(record.data, config, lazy=True, points=False).split()[1]
-    views = [view for view in test if name is None or view.name == name]
-    if not views:
-        raise ValueError(f"comparison_sheet: view must be one of {', '.join(v.name for v in test)}, got {name!r}")
-    frame = frames_for([views[len(views) // 2].checked()], config.data)[0]
+    frame = frames_for([test[len(test) // 2].checked()], config.data)[0]
     return frame, len(run.classes) if run.classes is not None else 0
 
 
