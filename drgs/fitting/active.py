@@ -28,10 +28,11 @@ import torch
 from drgs.cameras.sizes import at_most, resized_alike
 from drgs.data.camera_lists import camera_to_json
 from drgs.display.progress import Bar
-from drgs.ellipsoids import Scene, colors_only
+from drgs.ellipsoids import Scene
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import Frame, frames_for
 from drgs.fitting.timetable import Timetable
+from drgs.information.quantity import opacity_of
 from drgs.information.region import NothingOfRegion, RegionText, check_masks, masked_photographs
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import write_json
@@ -167,7 +168,7 @@ class ActiveViews:
     @property
     def scoring(self) -> Scoring:
         """How candidates are scored, by the selection alone."""
-        return self.active.scoring_of(self._config.settings)
+        return dataclasses.replace(self.active.scoring, settings=self._config.settings)
 
     @property
     def names(self) -> list[str]:
@@ -196,16 +197,12 @@ class ActiveViews:
         Returns:
             (P, 3) points and (P, 3) colors, at most an even share of the budget, and whether they are of a depth map.
         """
-        from drgs.integrator import render
         from drgs.sfm.points import added_points, initial_points
 
         nothing = torch.empty(0, 3), torch.empty(0, 3), False
         if not self._share:
             return nothing
-        with torch.no_grad():  # the Gaussians are fitted elsewhere
-            plain = colors_only(scene, frame.camera.time)
-            alpha = render(plain, frame.camera, self._config.settings, outputs=()).alpha.cpu().numpy()
-        is_open = alpha < _COVERED
+        is_open = opacity_of(scene, frame.camera, self._config.settings).numpy() < _COVERED
         if frame.mask is not None:
             is_open &= frame.mask.numpy() > _COVERED
         if (empty := frame.empty()) is not None:

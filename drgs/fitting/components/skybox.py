@@ -38,7 +38,7 @@ from drgs.data import scene_extent
 from drgs.display.progress import Bar
 from drgs.ellipsoids import Y_00, Gaussians
 from drgs.fitting.components.base import Component, Conflict, Fit, Setup
-from drgs.integrator import render
+from drgs.information.quantity import opacity_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -227,11 +227,11 @@ def visible_share(gaussians: Gaussians, far: int, frames: list[Frame], settings:
         frames: Photographs; nothing outside of their masks is counted.
         settings: What the others are rendered with.
     """
-    others = gaussians.detach().take(slice(far, None)).replace(features=None)
+    others = gaussians.detach().take(slice(far, None))
     shown = total = 0.0
-    with torch.no_grad(), Bar("what shows of the skybox", len(frames)) as bar:  # measured, not optimized
+    with Bar("what shows of the skybox", len(frames)) as bar:
         for frame in frames:
-            alpha = render(others, frame.camera, settings, outputs=()).alpha.cpu()
+            alpha = opacity_of(others, frame.camera, settings)
             mask = torch.ones_like(alpha) if frame.mask is None else frame.mask
             shown += float(((1 - alpha > _OPEN_TRANSMITTANCE) * mask).sum())
             total += float(mask.sum())

@@ -16,6 +16,7 @@ from drgs.display import pictures
 from drgs.display.progress import Bar
 from drgs.ellipsoids import Scene, colors_only
 from drgs.information.expected_error import ErrorRecord, expected_error
+from drgs.information.quantity import opacity_of
 from drgs.integrator import render
 
 if TYPE_CHECKING:
@@ -105,9 +106,7 @@ def maps(scene: Scene, shown: Mapping[str, Camera], record: ErrorRecord) -> dict
     with Bar("maps of the expected error", len(shown)) as bar:
         for name, camera in shown.items():
             error = expected_error(scene, camera, record).sqrt().numpy()
-            with torch.no_grad():  # a picture
-                alpha = render(colors_only(scene, camera.time), camera, record.settings, outputs=()).alpha.cpu().numpy()
-            bare = 1 - np.clip(alpha, 0, 1)
+            bare = 1 - np.clip(opacity_of(scene, camera, record.settings).numpy(), 0, 1)
             found[name] = (
                 jpeg(pictures.map_picture(_enlarged(error)), "expected error"),
                 jpeg(_enlarged(np.repeat(bare[..., None], 3, 2)), "not covered: 1 - alpha"),
