@@ -68,11 +68,11 @@ def of_photographs(
             bar.advance()
     findings = []
     if blurred := [name for name, share in zip(names, _over_neighbors(sharp), strict=True) if share < _BLURRED]:
-        one = "is" if len(blurred) == 1 else "are"
+        one, them = ("is", "it") if len(blurred) == 1 else ("are", "them")
         findings.append(
             Finding(
                 "blur",
-                f"{_few_names(blurred)} {one} blurred, compared with the photographs next to {_pronoun(blurred)}",
+                f"{_few_names(blurred)} {one} blurred, compared with the photographs next to {them}",
                 "take these again: hold the phone still, with more light or a shorter exposure",
             )
         )
@@ -298,7 +298,3 @@ def _few_names(names: Sequence[str]) -> str:
     """A few names, and how many more there are."""
     more = len(names) - _SHOWN
     return ", ".join(names[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
-
-
-def _pronoun(names: Sequence[str]) -> str:
-    return "it" if len(names) == 1 else "them"

@@ -91,7 +91,10 @@ def run(args: Prune) -> None:
             stages = {"before": given.scene, "pruned": pruned.gaussians}
             if args.refit and views.train is not None and isinstance(pruned.gaussians, Gaussians):
                 far = int(pruned.kept[: given.far].sum())
-                config = given.record.config if given.record else _config_over(given)
+                # A file's Gaussians are fitted on as any fit, over the background that --set says.
+                config = given.record.config if given.record else FitConfig()
+                if given.record is None:
+                    config = config.replace(settings=config.settings.replace(background=given.background))
                 frames = _shown(views.train, region, given, settings)
                 stages["refitted"] = fit_on(pruned.gaussians, frames, config, args.refit, far, held)
             costs = views.measured(stages, given, settings, lenses, region, as_photograph)
@@ -329,12 +332,6 @@ def _shown(frames: list[Frame], region: Region | None, given: SceneInput, settin
         dataclasses.replace(frame, mask=x, is_object=False, alpha=None) for frame, x in zip(frames, masks, strict=True)
     )
     return [frame for frame in shown if frame.mask is not None and bool((frame.mask > 0).any())]
-
-
-def _config_over(given: SceneInput) -> FitConfig:
-    """How a file's Gaussians are fitted on: as any fit, over the background that --set says."""
-    config = FitConfig()
-    return config.replace(settings=config.settings.replace(background=given.background))
 
 
 def _record(

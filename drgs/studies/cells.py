@@ -300,12 +300,9 @@ def out_of_race(study: Study, rows: Iterable[Mapping[str, Any]], protocol: str) 
 
 def result_line(study: Study, cell: Cell, row: Mapping[str, Any]) -> str:
     """The metrics of a finished cell, in a line."""
-    numbers = ", ".join(_shown_metric(m, row["metrics"][m.key]) for m in study.metrics)
+    values = [(metric, row["metrics"][metric.key]) for metric in study.metrics]
+    numbers = ", ".join(f"{m.title} {'none' if x is None else f'{x:.{m.digits}f}'}" for m, x in values)
     return f"{cell.name}: {numbers}" + (f", {row['seconds']:.0f} s" if row["seconds"] is not None else "")
-
-
-def _shown_metric(metric: Metric, value: float | None) -> str:
-    return f"{metric.title} {'none' if value is None else f'{value:.{metric.digits}f}'}"
 
 
 def _check_same(run: Run, config: FitConfig) -> None:

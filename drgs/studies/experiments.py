@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -57,13 +57,6 @@ class Sizes:
     cameras: int = 0
     info_pixels: int | None = None
     of_one_camera: tuple[int, int] | None = None
-
-
-def made_folder(
-    study: StudyName, sizes: Sizes, made: Path, given: Mapping[str, Path]
-) -> Callable[[str, tuple[int, int]], Path]:
-    """Scene and split -> folder of the data set, as `Study.folder`; other processes can be sent it."""
-    return functools.partial(_made, study, sizes, made, dict(given))
 
 
 def _made(
@@ -366,7 +359,9 @@ def study_of(
     one = None if sizes.of_one_camera is None else dict(zip(("initial", "add"), sizes.of_one_camera, strict=True))
     return Study(
         name=f"{study}-{scale}",
-        folder=made_folder(study, sizes, made / scale, given or {}),
+        folder=functools.partial(
+            _made, study, sizes, made / scale, dict(given or {})
+        ),  # other processes can be sent it
         policies=policies or {label: _POLICIES[label] for label in dict.fromkeys(own)},
         fit=sizes.fit.replace(selection=selection),
         metrics=metrics_of(study, lpips is not None),

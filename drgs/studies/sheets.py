@@ -57,7 +57,8 @@ def comparison_sheet(runs: Mapping[str, Path], path: Path) -> str:
     truth = _Picture("truth", frame.target().numpy())
     truth.features = None if frame.teacher is None else frame.teacher().permute(1, 2, 0).float()
     truth.labels = None if frame.labels is None else np.asarray(frame.labels())
-    colors = _feature_colors(truth, rows)
+    maps = [x.features for x in (truth, *rows) if x.features is not None]
+    colors = FeatureColors.of(maps[:1]) if maps else None  # one basis for all rows
     box = _differing([row.color for row in rows])
     shown = [_row(row, box, colors, count) for row in (*rows, truth)]
     width = max(line.shape[1] for line in shown)
@@ -84,12 +85,6 @@ def _rendered(name: str, run: LoadedRun, frame: Frame) -> _Picture:
         if run.classes is not None:
             shown.labels = classify(out.features, run.classes, run.decoder).numpy()
     return shown
-
-
-def _feature_colors(truth: _Picture, rows: Sequence[_Picture]) -> FeatureColors | None:
-    """One basis for all rows."""
-    maps = [x.features for x in (truth, *rows) if x.features is not None]
-    return FeatureColors.of(maps[:1]) if maps else None
 
 
 def _differing(images: Sequence[np.ndarray]) -> tuple[int, int, int, int]:
