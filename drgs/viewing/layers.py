@@ -246,9 +246,8 @@ def _tint_of(colors_of: Callable[[Output], np.ndarray]) -> Callable[[Gaussians],
     def tint(g: Gaussians) -> np.ndarray:
         assert g.features is not None  # else there is no such layer
         rows = []
-        for features in g.features.detach().split(
-            _GAUSSIANS_AT_ONCE
-        ):  # colors for a browser: NumPy takes no tensor with a gradient
+        # Colors for a browser: NumPy takes no tensor with a gradient.
+        for features in g.features.detach().split(_GAUSSIANS_AT_ONCE):
             rgb = torch.zeros(1, len(features), 3)
             alpha = torch.ones(1, len(features))
             rows.append(colors_of(Output(rgb=rgb, alpha=alpha, features=features[None]))[0])
@@ -283,6 +282,7 @@ class PhotographMap(Protocol):
     @property
     def is_complete(self) -> bool:
         """Whether all have been looked at."""
+        return self.done == self.count
 
     @property
     def has_map(self) -> bool:
@@ -304,7 +304,7 @@ class PhotographMap(Protocol):
         """
 
 
-class ExpectedError:
+class ExpectedError(PhotographMap):
     """Maps of the expected error (`drgs.expected_error`), in units of color.
 
     Args:
@@ -333,11 +333,6 @@ class ExpectedError:
         self._record: ErrorRecord | None = None
 
     @property
-    def is_complete(self) -> bool:
-        """See `PhotographMap`."""
-        return self.done == self.count
-
-    @property
     def has_map(self) -> bool:
         """See `PhotographMap`."""
         return self._record is not None
@@ -362,7 +357,7 @@ class ExpectedError:
         return expected_error(self._scene, camera, self._record).sqrt().numpy()
 
 
-class Uncertainty:
+class Uncertainty(PhotographMap):
     """Maps of the predictive variance, given the views that a scene was fitted to.
 
     Args:
@@ -391,11 +386,6 @@ class Uncertainty:
         self.done = 0
         self._sum: dict[str, torch.Tensor] = {}
         self._weights: Information | None = None
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether all views have been added."""
-        return self.done == self.count
 
     @property
     def has_map(self) -> bool:
