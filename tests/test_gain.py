@@ -437,7 +437,7 @@ def test_lambda_is_of_the_criterion():
     assert Scoring().prior_of() == Scoring("v_opt").prior_of("fisher") == Prior(1e-2)
     assert all(Scoring(x).prior_of() == Prior(1e-6) == Scoring().prior_of("fisherrf") for x in list(CRITERIA)[1:])
     assert Scoring(prior=Prior(0.5)).prior_of() == Scoring(prior=Prior(0.5)).prior_of("coverage") == Prior(0.5)
-    of = lambda **fields: SelectionConfig().replace(**fields).scoring_of(RenderSettings.preset("fast")).prior_of()  # noqa: E731
+    of = lambda **fields: SelectionConfig().replace(**fields).scoring.prior_of()  # noqa: E731
     assert of() == Prior(1e-2)
     assert of(prior=Prior(1e-4)) == Prior(1e-4)
     assert of(relative=True) == Prior(1e-6, relative=True)

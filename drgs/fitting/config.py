@@ -7,7 +7,7 @@ longer to say stands in the docstring of its record.
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from drgs.checks.records import Record, first_difference, one_of, option, part
 from drgs.fitting.renderers import AUTO, check_renderers, named_renderers, planar_of
@@ -15,9 +15,6 @@ from drgs.information.choices import POLICIES, POLICY_NAMES, check_named
 from drgs.information.region import REGION_FORMS, RegionText
 from drgs.information.scoring import Scoring
 from drgs.settings import RenderSettings
-
-if TYPE_CHECKING:
-    from drgs.information.semantics import SemanticMetric
 
 InitPoints = Literal["auto", "views", "all"]
 Filter3DUse = Literal["off", "on"]
@@ -540,10 +537,6 @@ class SelectionConfig(Record):
         super().__post_init__()
         if self.scoring.settings != Scoring.settings or self.scoring.semantics is not None:
             raise ValueError("active: scoring must leave settings and semantics to the fit, got others; drop them")
-
-    def scoring_of(self, settings: RenderSettings, semantics: SemanticMetric | None = None) -> Scoring:
-        """A `Scoring` for views that are rendered with these settings."""
-        return dataclasses.replace(self.scoring, settings=settings, semantics=semantics)
 
     def flat(self) -> dict[str, Any]:
         """All fields beside each other, as selection.json has them."""
