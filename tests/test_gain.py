@@ -432,7 +432,6 @@ def test_lambda_is_of_the_criterion():
     """1e-2 of `v_opt`, 1e-6 of the others and of other policies; what is given goes before."""
     from drgs.fitting.config import SelectionConfig
     from drgs.select import Scoring
-    from drgs.settings import RenderSettings
 
     assert Scoring().prior_of() == Scoring("v_opt").prior_of("fisher") == Prior(1e-2)
     assert all(Scoring(x).prior_of() == Prior(1e-6) == Scoring().prior_of("fisherrf") for x in list(CRITERIA)[1:])

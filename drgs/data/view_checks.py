@@ -158,7 +158,7 @@ def check_times(dataset: Dataset) -> None:
 
 
 def make_names_unique(views: list[View]) -> None:
-    """Views are problem apart by their names, in splits, picks and file names: a repeated one gets a number."""
+    """Views are told apart by their names, in splits, picks and file names: a repeated one gets a number."""
     taken = {view.name for view in views}
     seen: set[str] = set()
     for view in views:

@@ -194,7 +194,6 @@ _MIN_BACKGROUND_SHARE = 0.2
 _BACKGROUND_TOLERANCE = 0.06
 _BACKGROUND_PROBES = 8  # photographs that decide whether there is a background at all
 _SILHOUETTE_WIDTH = 400  # pixels across a silhouette: means of several pixels have less noise
-# share of the photographs whose silhouette may exclude a point that is kept: edges are soft. Chosen
 # share of the photographs showing a point whose silhouettes may exclude it: edges are soft. Chosen
 _MAX_CONTRADICTING = 0.1
 _POINTS_PER_ROUND = 50_000  # random points a round: bounds memory
