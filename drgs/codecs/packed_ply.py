@@ -17,7 +17,14 @@ from drgs.codecs.clustering import morton_order
 from drgs.codecs.codec import Codec
 from drgs.codecs.ply import note_antialiased
 from drgs.codecs.ply_headers import PlyElement, is_antialiased, offset_line, ply_offset, ply_source, read_ply_header
-from drgs.codecs.values import assembled, check_count, dc_of_colors, logits_of_bytes, quats_of_smallest
+from drgs.codecs.values import (
+    assembled,
+    check_count,
+    dc_of_colors,
+    logits_of_bytes,
+    quats_of_smallest,
+    smallest_of_quats,
+)
 from drgs.ellipsoids import Y_00, Gaussians
 
 _log = logging.getLogger(__name__)
@@ -209,11 +216,7 @@ def _packed(part: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
 
 def _packed_quats(quats: np.ndarray) -> np.ndarray:
     """(N,) uint32: 2 bits for the place of the largest component, 10 for each of the others."""
-    q = quats / np.abs(quats).max(axis=1, keepdims=True, initial=0.0)  # first, so that no square under- or overflows
-    q /= np.linalg.norm(q, axis=1, keepdims=True)
-    largest = np.abs(q).argmax(1)
-    q *= np.where(np.take_along_axis(q, largest[:, None], 1) < 0, -1, 1)
-    others = q[np.arange(4)[None, :] != largest[:, None]].reshape(-1, 3)
+    largest, others = smallest_of_quats(quats)
     return _packed(np.clip(others / 2**0.5 + 0.5, 0, 1), (10, 10, 10)) | largest.astype(np.uint32) << np.uint32(30)
 
 

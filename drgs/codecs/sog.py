@@ -31,7 +31,7 @@ from drgs.codecs.bounded import Archive, pixels_of_webp, webp_of_pixels
 from drgs.codecs.clustering import codebook, morton_order, palette
 from drgs.codecs.codec import Codec
 from drgs.codecs.folders import is_checkpoint, names_in_archive
-from drgs.codecs.values import SH_COUNTS, assembled, check_count, logits_of_bytes, quats_of_smallest
+from drgs.codecs.values import SH_COUNTS, assembled, check_count, logits_of_bytes, quats_of_smallest, smallest_of_quats
 from drgs.ellipsoids import Gaussians
 from drgs.io.json_files import check_json, parse_json
 
@@ -309,11 +309,7 @@ def _weights(g: Gaussians) -> np.ndarray:
 
 def _bytes_of_quats(quats: np.ndarray) -> np.ndarray:
     """(N, 4) bytes that `_Reader._quats` reads: the three smaller components, and the place of the largest."""
-    q = quats / np.abs(quats).max(axis=1, keepdims=True)  # first, so that no square under- or overflows
-    q /= np.linalg.norm(q, axis=1, keepdims=True)
-    largest = np.abs(q).argmax(1)
-    q *= np.where(np.take_along_axis(q, largest[:, None], 1) < 0, -1, 1)
-    others = q[np.arange(4)[None, :] != largest[:, None]].reshape(-1, 3)
+    largest, others = smallest_of_quats(quats)
     codes = np.clip(np.rint((others * 2**0.5 + 1) * 127.5), 0, 255)
     return np.concatenate([codes, 252 + largest[:, None]], axis=1)
 

@@ -117,6 +117,15 @@ def quats_of_smallest(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
     return quats
 
 
+def smallest_of_quats(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The arguments of `quats_of_smallest` of (N, 4) quaternions of any length but 0."""
+    q = quats / np.abs(quats).max(axis=1, keepdims=True, initial=0.0)  # first, so that no square under- or overflows
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    largest = np.abs(q).argmax(1)
+    q *= np.where(np.take_along_axis(q, largest[:, None], 1) < 0, -1, 1)
+    return largest, q[np.arange(4)[None, :] != largest[:, None]].reshape(-1, 3)
+
+
 def spread(g: Gaussians) -> tuple[np.ndarray, float]:
     """Middle (3,) of the means, and their median distance from it, of which floaters change nothing; N >= 1.
 
