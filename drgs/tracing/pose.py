@@ -48,7 +48,7 @@ def twisted(pose: torch.Tensor, twist: torch.Tensor) -> torch.Tensor:
     c2w <- exp(xi) c2w is w2c <- w2c exp(-xi).
     """
     generator = torch.zeros(4, 4, dtype=torch.float64)
-    generator[:3, :3] = _cross_matrix(twist[:3])
+    generator[:3, :3] = cross_matrix(twist[:3])
     generator[:3, 3] = twist[3:]
     return -pose @ generator
 
@@ -75,7 +75,8 @@ def quaternion_product(w: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
     return torch.cat([-(w * v).sum(1, keepdim=True), s * w + torch.cross(w, v, dim=1)], 1)
 
 
-def _cross_matrix(w: torch.Tensor) -> torch.Tensor:
+def cross_matrix(w: torch.Tensor) -> torch.Tensor:
+    """(3, 3) of x -> w x x."""
     zero = w.new_zeros(())
     return torch.stack(
         [torch.stack([zero, -w[2], w[1]]), torch.stack([w[2], zero, -w[0]]), torch.stack([-w[1], w[0], zero])]

@@ -37,6 +37,7 @@ from drgs.fitting.components.base import Checkpoint, Component, Conflict, Fit, R
 from drgs.fitting.losses import psnr
 from drgs.fitting.networks import Network
 from drgs.integrator import render, render_jvp
+from drgs.tracing.pose import cross_matrix
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -354,7 +355,7 @@ def _inside(values: torch.Tensor, frame: Frame) -> torch.Tensor:
 def _twist_of_u(center: torch.Tensor, extent: float) -> torch.Tensor:
     """(6, 6) of u -> xi for a camera at `center`: a twist (w, v) moves the center by w x c + v."""
     out = torch.eye(6, dtype=torch.float64)
-    out[3:, :3] = _cross(center)  # v = extent u_move + c x w
+    out[3:, :3] = cross_matrix(center)  # v = extent u_move + c x w
     out[3:, 3:] *= extent
     return out
 
@@ -410,14 +411,6 @@ def _common_motions(centers: torch.Tensor, extent: float) -> torch.Tensor:
     return torch.linalg.qr(torch.stack([x.reshape(-1) for x in columns], 1))[0]
 
 
-def _cross(w: torch.Tensor) -> torch.Tensor:
-    """(3, 3) of x -> w x x."""
-    zero = w.new_zeros(())
-    return torch.stack(
-        [torch.stack([zero, -w[2], w[1]]), torch.stack([w[2], zero, -w[0]]), torch.stack([-w[1], w[0], zero])]
-    )
-
-
 def motion(twist: torch.Tensor) -> torch.Tensor:
     """(4, 4) exp of a twist (6,), rotation first; differentiated.
 
@@ -429,7 +422,7 @@ def motion(twist: torch.Tensor) -> torch.Tensor:
     for first in (1, 2, 3):  # 1 / first! - a^2 / (first + 2)! + ...
         terms = [(-1) ** k / math.factorial(first + 2 * k) * square**k for k in range(8)]
         factors.append(torch.stack(terms).sum())
-    w = _cross(twist[:3])
+    w = cross_matrix(twist[:3])
     eye = torch.eye(3, dtype=twist.dtype)
     rotation = eye + factors[0] * w + factors[1] * (w @ w)
     along = eye + factors[1] * w + factors[2] * (w @ w)
