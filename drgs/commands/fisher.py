@@ -331,9 +331,9 @@ class MappedView:
         gain: What it would add to the known views, by criterion.
         variance, share: Its maps, of all blocks together.
         blocks: Block of the image -> kind -> the map of that block alone.
-        pose: What it says about its own pose, with --pose; else None.
         error: The error that is expected of it; None where there are no photographs of the known views.
         region: What it says of the region; None without one.
+        pose: What it says about its own pose, with --pose; else None.
     """
 
     name: str
@@ -343,20 +343,14 @@ class MappedView:
     variance: MapSummary
     share: MapSummary
     blocks: dict[str, dict[str, MapSummary]]
-    pose: PoseSummary | None
     error: ErrorSummary | None = None
     region: RegionSummary | None = None
+    pose: PoseSummary | None = None
 
     def to_json(self) -> dict[str, Any]:
         """As fisher.json holds it."""
-        fields = {name: getattr(self, name) for name in ("name", "camera", "files", "gain")}
-        fields |= {"camera": camera_to_json(self.camera)}
-        fields |= {name: dataclasses.asdict(getattr(self, name)) for name in KINDS}
-        blocks = self.blocks.items()
-        fields |= {"blocks": {b: {kind: dataclasses.asdict(x) for kind, x in maps.items()} for b, maps in blocks}}
-        fields |= {} if self.error is None else {"error": dataclasses.asdict(self.error)}
-        fields |= {} if self.region is None else {"region": dataclasses.asdict(self.region)}
-        return fields | ({} if self.pose is None else {"pose": dataclasses.asdict(self.pose)})
+        fields = dataclasses.asdict(self) | {"camera": camera_to_json(self.camera)}
+        return {name: value for name, value in fields.items() if value is not None}
 
 
 def map_weights(
@@ -427,7 +421,7 @@ def _view(
     gain = {criterion: information_gain(Hc, H, criterion, prior).total for criterion in ("logdet", "eig")}
     blocks = {block: {kind: MapSummary.of(maps[kind][block]) for kind in KINDS} for block in scene_blocks.names}
     summaries = (MapSummary.of(totals[kind]) for kind in KINDS)
-    return MappedView(camera.name, camera, files, gain, *summaries, blocks, pose, region=of_region)
+    return MappedView(camera.name, camera, files, gain, *summaries, blocks, region=of_region, pose=pose)
 
 
 def _print(args: Fisher, known: Known, groups: dict[str, GroupSummary], views: list[MappedView], source: str) -> None:
