@@ -66,17 +66,18 @@ def attach(dataset: Dataset, lazy: bool) -> None:
             _report_unmatched(kind, folder, files, dataset.views)
     if not folder_of:
         return
-    classes = [base / name for name in CLASS_FILES for base in bases if (base / name).is_file()]
-    embeddings = [base / _EMBEDDINGS for base in bases if (base / _EMBEDDINGS).is_file()]
-    moving = [base / _MOVING for base in bases if (base / _MOVING).is_file()]
+    class_file, embedding_file, moving_file = (
+        next((base / name for name in names for base in bases if (base / name).is_file()), None)
+        for names in (CLASS_FILES, [_EMBEDDINGS], [_MOVING])
+    )
     semantics = Semantics(
         teacher=folder_of["teacher"].name if "teacher" in folder_of else "",
         labels=folder_of["labels"].name if "labels" in folder_of else "",
         maps=tuple(view.teacher_path for view in dataset.views if view.teacher_path),
         label_images=tuple(view.label_path for view in dataset.views if view.label_path),
-        class_file=classes[0] if classes else None,
-        embedding_file=embeddings[0] if embeddings else None,
-        moving_file=moving[0] if moving else None,
+        class_file=class_file,
+        embedding_file=embedding_file,
+        moving_file=moving_file,
     )
     if "teacher" in folder_of:
         train = dataset.split()[0]

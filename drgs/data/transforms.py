@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
 from pathlib import Path, PurePosixPath
@@ -215,17 +216,13 @@ class _FirstImage:
         """`held_out`: arguments of `Dataset.split`."""
         self.dataset = dataset
         self._held_out = held_out
-        self._size = None
 
+    @functools.cached_property
     def size(self) -> tuple[int, int]:
-        if self._size is None:
-            train = self.dataset.split(*self._held_out)[0]
-            if not train:
-                raise FileNotFoundError(
-                    f"{self.dataset.path}: the first training image must exist, found none; restore it"
-                )
-            self._size = image_size(train[0].image_path)
-        return self._size
+        train = self.dataset.split(*self._held_out)[0]
+        if not train:
+            raise FileNotFoundError(f"{self.dataset.path}: the first training image must exist, found none; restore it")
+        return image_size(train[0].image_path)
 
 
 def _fill(
@@ -290,7 +287,7 @@ def _camera(where: str, values: dict, w2c: np.ndarray, image: Path, first: _Firs
             f"{where}: must state w and h beside intrinsics in pixels where no image may be opened, got none; add them"
         )
     else:
-        width, height = first.size()
+        width, height = first.size
     kind = values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
     if not isinstance(kind, str) or kind not in _LENSES:
         raise ValueError(
