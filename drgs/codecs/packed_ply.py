@@ -166,17 +166,10 @@ def encode_packed_ply(g: Gaussians) -> bytes:
         "scale": np.clip(log_scales, -_MAX_LOG_SCALE, _MAX_LOG_SCALE),
         "rgb": sh[:, 0] * Y_00 + 0.5,
     }
-    starts = np.arange(0, len(g), _CHUNK_GAUSSIANS)
     ranges, parts = list[np.ndarray](), dict[str, np.ndarray]()
     for name, values in fields.items():
-        if not len(g):
-            ranges += [np.zeros((0, 3), np.float32)] * 2
-            parts[name] = values
-            continue
-        low, high = (how.reduceat(values, starts, axis=0).astype(np.float32) for how in (np.minimum, np.maximum))
+        low, high, parts[name] = _in_chunks(values)
         ranges += [low, high]
-        first, last = (np.repeat(x, _CHUNK_GAUSSIANS, axis=0)[: len(g)].astype(np.float64) for x in (low, high))
-        parts[name] = np.clip((values - first) / np.where(last > first, last - first, 1), 0, 1)
     # float64: a logit that was read from a byte must go back to that byte.
     opacities = g.logit_opacities.double().sigmoid().numpy()[order]
     colors = np.concatenate([parts["rgb"], opacities[:, None]], axis=1)
@@ -191,7 +184,7 @@ def encode_packed_ply(g: Gaussians) -> bytes:
     names += [f"{end}_{axis}" for end in ("min", "max") for axis in ("r", "g", "b")]
     lines = ["ply", "format binary_little_endian 1.0"]
     lines += [f"comment {offset_line(g.origin)}"] if g.origin.any() else []
-    lines += [f"element chunk {len(starts)}"]
+    lines += [f"element chunk {len(ranges[0])}"]
     lines += [f"property float {name}" for name in names]
     lines += [f"element vertex {len(g)}", *(f"property uint {name}" for name in _PACKED)]
     body = [
@@ -204,6 +197,16 @@ def encode_packed_ply(g: Gaussians) -> bytes:
         lines += [f"element sh {len(g)}", *(f"property uchar f_rest_{i}" for i in range(rest.shape[1]))]
         body.append(np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8).tobytes())
     return "\n".join([*lines, "end_header", ""]).encode() + b"".join(body)
+
+
+def _in_chunks(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lowest and highest of (N, 3) values of each chunk, and where between them each value is, 0 to 1."""
+    if not len(values):
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), values
+    starts = np.arange(0, len(values), _CHUNK_GAUSSIANS)
+    low, high = (how.reduceat(values, starts, axis=0).astype(np.float32) for how in (np.minimum, np.maximum))
+    first, last = (np.repeat(x, _CHUNK_GAUSSIANS, axis=0)[: len(values)].astype(np.float64) for x in (low, high))
+    return low, high, np.clip((values - first) / np.where(last > first, last - first, 1), 0, 1)
 
 
 def _packed(part: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:

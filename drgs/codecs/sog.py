@@ -274,17 +274,11 @@ def encode_sog(g: Gaussians) -> bytes:
         "sh0": {"codebook": color_book.tolist(), "files": ["sh0.webp"]},
     }
     if g.sh_degree:
-        size = min(_MOST_ROWS, max(_FEWEST_ROWS, len(g) // _GAUSSIANS_PER_ROW))
-        rows, labels = palette(sh[:, 1:].reshape(len(g), -1), weights, size)
-        book, entries = codebook(rows)
-        each = sh.shape[1] - 1
-        pixels = np.full((-(-len(rows) // _PALETTE) * _PALETTE, each, 4), 255, np.uint8)
-        pixels[..., :3] = 0
-        pixels[: len(rows), :, :3] = entries.reshape(-1, each, 3)
-        files["shN_centroids.webp"] = webp_of_pixels(pixels.reshape(-1, _PALETTE * each, 4))
+        count, book, centroids, labels = _higher_sh(sh[:, 1:], weights)
+        files["shN_centroids.webp"] = centroids
         files["shN_labels.webp"] = image(np.stack([labels & 255, labels >> 8, 0 * labels], axis=1))
         meta["shN"] = {
-            "count": len(rows),
+            "count": count,
             "bands": g.sh_degree,
             "codebook": book.tolist(),
             "files": ["shN_centroids.webp", "shN_labels.webp"],
@@ -294,6 +288,17 @@ def encode_sog(g: Gaussians) -> bytes:
         for name, data in {"meta.json": json.dumps(meta).encode(), **files}.items():
             archive.writestr(zipfile.ZipInfo(name), data)  # without a time: same Gaussians, same bytes
     return packed.getvalue()
+
+
+def _higher_sh(sh: np.ndarray, weights: np.ndarray) -> tuple[int, np.ndarray, bytes, np.ndarray]:
+    """A palette of (N, C, 3) coefficients above degree 0: its length, codebook and image, and (N,) rows of it."""
+    n, each, _ = sh.shape
+    rows, labels = palette(sh.reshape(n, -1), weights, min(_MOST_ROWS, max(_FEWEST_ROWS, n // _GAUSSIANS_PER_ROW)))
+    book, entries = codebook(rows)
+    pixels = np.full((-(-len(rows) // _PALETTE) * _PALETTE, each, 4), 255, np.uint8)
+    pixels[..., :3] = 0
+    pixels[: len(rows), :, :3] = entries.reshape(-1, each, 3)
+    return len(rows), book, webp_of_pixels(pixels.reshape(-1, _PALETTE * each, 4)), labels
 
 
 def _weights(g: Gaussians) -> np.ndarray:
