@@ -80,16 +80,7 @@ def attach(dataset: Dataset, lazy: bool) -> None:
         moving_file=moving_file,
     )
     if "teacher" in folder_of:
-        train = dataset.split()[0]
-        without = [view.name for view in train if view.teacher_path is None]
-        if without:
-            _log.warning(
-                "%s: %d of the %d training views have no map (%s); of these, only colors can be fitted",
-                folder_of["teacher"],
-                len(without),
-                len(train),
-                ", ".join(without[:_SHOWN]) + (", ..." if len(without) > _SHOWN else ""),
-            )
+        _warn_of_views_without_maps(folder_of["teacher"], dataset.split()[0])
     for view in dataset.views:
         view.semantics = semantics
     dataset.semantics = (
@@ -97,6 +88,18 @@ def attach(dataset: Dataset, lazy: bool) -> None:
         if lazy
         else semantics.checked((view.teacher_path, view.camera) for view in dataset.views if view.teacher_path)
     )
+
+
+def _warn_of_views_without_maps(folder: Path, train: list[View]) -> None:
+    without = [view.name for view in train if view.teacher_path is None]
+    if without:
+        _log.warning(
+            "%s: %d of the %d training views have no map (%s); of these, only colors can be fitted",
+            folder,
+            len(without),
+            len(train),
+            ", ".join(without[:_SHOWN]) + (", ..." if len(without) > _SHOWN else ""),
+        )
 
 
 def _search_folders(dataset: Dataset) -> list[Path]:
