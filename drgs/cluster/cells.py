@@ -21,7 +21,7 @@ from drgs.cluster.agreement import check_agreement, statement, this_worker
 from drgs.cluster.payloads import Missing, opened_payload
 from drgs.io.atomic import is_full
 from drgs.io.locks import InUse, host_of
-from drgs.io.outputs import atomic_write
+from drgs.io.outputs import write_whole
 from drgs.studies.cells import FAILURES, Study, out_of_race, result_line, run_cell
 from drgs.studies.rows import Cell, append_row, is_done, read_study
 
@@ -91,8 +91,7 @@ def run_cells_on(
 def _token(runs: Path) -> Any:
     """A small file in the folder of all runs, for the length of a block."""
     path = runs / f".drgs.cluster.{uuid.uuid4().hex}"
-    with atomic_write(path) as file:
-        file.write(path.name.encode())
+    write_whole(path, path.name.encode())
     try:
         yield path
     finally:

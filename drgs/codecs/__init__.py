@@ -30,7 +30,7 @@ from drgs.codecs.codec import Codec
 from drgs.codecs.folders import file_of_folder
 from drgs.codecs.ply import load_ply, note_offset, save_ply
 from drgs.io.foreign import refuse_foreign
-from drgs.io.outputs import atomic_write
+from drgs.io.outputs import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -171,12 +171,10 @@ def save_gaussians(
         _offset_in(beside)  # what holds no offset is a file of somebody else, and is not overwritten
     plain = _plain(g)
     data = codec.encode(plain if codec.keeps_origin else plain.replace(origin=np.zeros(3)))
-    with atomic_write(path) as file:
-        file.write(data)
+    write_whole(path, data)
     # One that is there already must not go on saying where an older file was.
     if not codec.keeps_origin and (plain.origin.any() or beside.is_file()):
-        with atomic_write(beside) as file:
-            file.write(f"{origin_text(plain.origin)}\n".encode())
+        write_whole(beside, f"{origin_text(plain.origin)}\n".encode())
     where = "which it states" if codec.keeps_origin else f"which {suffix} has no room for: {beside.name} states it"
     note_offset(path, plain.origin, where)
 

@@ -14,7 +14,7 @@ from drgs.commands.viewpoints import views_to_sample
 from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.io.journal import SCHEMA
-from drgs.io.outputs import atomic_write, check_file, lock_folder, write_json
+from drgs.io.outputs import check_file, lock_folder, write_json, write_whole
 from drgs.lab import ladder, rasterizers
 from drgs.lab.crossval import Result, crossval
 from drgs.lab.report import html
@@ -68,8 +68,7 @@ def run(args: Crossval) -> int:
             report["ladder"] = ladder.ladder(result.gaussians, result.cameras, result.model.settings, seed=args.seed)
             table = ladder.table(report["ladder"])
     report["env"] = runtime.info()
-    with atomic_write(args.output / "report.html") as file:
-        file.write(html(report, result.images, table).encode())
+    write_whole(args.output / "report.html", html(report, result.images, table).encode())
     write_json(args.output / "crossval.json", report)
     if not args.quiet:
         _print(result, args)

@@ -34,7 +34,7 @@ from drgs.information.region import Region, RegionText
 from drgs.integrator import Output
 from drgs.io.checkpoint import load_state, save_state
 from drgs.io.journal import SCHEMA
-from drgs.io.outputs import atomic_write, lock_folder, write_json
+from drgs.io.outputs import lock_folder, write_json, write_whole
 from drgs.io.run import Run
 from drgs.pruning import ROUNDS, Pruned, check_amount, fit_on, prune
 from drgs.settings import RenderSettings
@@ -160,8 +160,7 @@ class _Output:
         run, fewer = Run(self.scene), of_some(checkpoint, kept)
         for name in _COPIED:
             if (given.run.path / name).is_file():
-                with atomic_write(run.path / name) as file:
-                    file.write((given.run.path / name).read_bytes())
+                write_whole(run.path / name, (given.run.path / name).read_bytes())
         save_state(run.state, dict(fewer.tensors), dict(fewer.header))
         save_gaussians(given.gaussians.take(kept).replace(features=None), run.point_cloud)
 

@@ -20,7 +20,7 @@ from drgs.information.blocks import MAP_PRIOR
 from drgs.information.scoring import Scoring
 from drgs.io.journal import SCHEMA
 from drgs.io.json_files import check_json, read_json
-from drgs.io.outputs import atomic_write, lock_folder, write_json
+from drgs.io.outputs import lock_folder, write_json, write_whole
 from drgs.runtime.machine import commit, cpu_model
 from drgs.settings import RenderSettings
 from drgs.studies.cells import run_cells
@@ -150,8 +150,7 @@ def _write(plan: StudyPlan, rows: list[dict], out: Path, args: Reproduce, pictur
     )
     text = ["# Policies, compared", where, results_page(plan.study, plan.experiment, rows, remarks=plan.notes)]
     text += [f"![{caption}]({name})\n\n{caption}." for name, caption in pictures]
-    with atomic_write(out / f"{args.what}.md") as file:
-        file.write(("\n\n".join(text) + "\n").encode())
+    write_whole(out / f"{args.what}.md", ("\n\n".join(text) + "\n").encode())
     write_json(
         out / f"{args.what}.json",
         {

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from drgs import runtime
 from drgs.display.progress import Bar
 from drgs.io.journal import SCHEMA
-from drgs.io.outputs import atomic_write, lock_folder, write_json
+from drgs.io.outputs import lock_folder, write_json, write_whole
 from drgs.lab import extremes
 from drgs.lab.stress import BOUNDS, StressRow, rows
 
@@ -116,8 +116,7 @@ def _write(args: Stress, found: list[StressRow], seconds: float) -> None:
     }
     write_json(args.output / "stress.json", report)
     text = "\n".join([f"drgs {env['drgs']}, {env['cpu']}, {env['backend']['variant']}.", "", *markdown(found), ""])
-    with atomic_write(args.output / "stress.md") as file:
-        file.write(text.encode())
+    write_whole(args.output / "stress.md", text.encode())
 
 
 def _finite_numbers(row: dict) -> dict:

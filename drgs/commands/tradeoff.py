@@ -40,7 +40,7 @@ from drgs.data.camera_lists import camera_to_json
 from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.io.journal import SCHEMA
-from drgs.io.outputs import atomic_write, lock_folder, write_json
+from drgs.io.outputs import lock_folder, write_json, write_whole
 from drgs.lab.tradeoff import FullSize, measure, measure_full
 from drgs.lab.tradeoff_advice import USES, Advice, recommend
 from drgs.lab.tradeoff_plot import plot
@@ -95,8 +95,7 @@ def run(args: Tradeoff) -> None:
     )
     title = f"{args.scene}: {len(gaussians):,} Gaussians"
     drawn = plot(measured, args.max_error, title, args.output / "tradeoff.png")
-    with atomic_write(args.output / "tradeoff.md") as file:
-        file.write(_page(report, drawn).encode())
+    write_whole(args.output / "tradeoff.md", _page(report, drawn).encode())
     write_json(args.output / "tradeoff.json", report.to_json())
     if not args.quiet:
         _print(report)

@@ -19,7 +19,7 @@ from drgs.cameras import Camera, intrinsics
 from drgs.checks.arguments import kind_of
 from drgs.data.checks import inverse_pose, said_of
 from drgs.io.json_files import check_json, read_json
-from drgs.io.outputs import atomic_write
+from drgs.io.outputs import write_whole
 
 _CAMERA_JSON = {
     "name": str,
@@ -66,8 +66,7 @@ def save_cameras_json(path: str | os.PathLike, cameras: list[Camera]) -> None:
                 **({} if camera.time is None else {"time": camera.time}),
             }
         )
-    with atomic_write(path) as file:
-        file.write(json.dumps(entries, indent=1).encode())
+    write_whole(path, json.dumps(entries, indent=1).encode())
 
 
 def load_cameras_json(path: str | os.PathLike) -> list[Camera]:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from drgs.io import outputs
-from drgs.io.outputs import atomic_write
+from drgs.io.outputs import write_whole
 
 _INK = (235, 235, 235)  # RGB of text on pictures; chosen by eye
 _NO_DEPTH_GRAY = 0.25  # gray of depth where nothing is
@@ -79,8 +79,7 @@ def file_names(names: list[str]) -> list[str]:
 
 def write_png(path: str | os.PathLike, image: np.ndarray) -> None:
     """Write an (H, W, 3) RGB image, uint8 or float in [0, 1], as 8-bit PNG."""
-    with atomic_write(path) as file:
-        file.write(png_bytes(image))
+    write_whole(path, png_bytes(image))
 
 
 def png_bytes(image: np.ndarray) -> bytes:
@@ -112,8 +111,7 @@ def write_jpg(path: str | os.PathLike, image: np.ndarray, is_panorama: bool = Fa
         xmp = _XMP + _PANORAMA.format(width=width, height=height).encode()
         # A segment APP1 behind the mark that begins the file; its length counts itself.
         data = data[:2] + b"\xff\xe1" + (len(xmp) + 2).to_bytes(2, "big") + xmp + data[2:]
-    with atomic_write(path) as file:
-        file.write(data)
+    write_whole(path, data)
 
 
 def write_exr(path: str | os.PathLike, rgb: np.ndarray, **channels: np.ndarray) -> None:

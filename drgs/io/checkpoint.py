@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from drgs.io.foreign import refuse_foreign
 from drgs.io.journal import SCHEMA, check_schema
 from drgs.io.json_files import parse_json
-from drgs.io.outputs import atomic_write, json_form
+from drgs.io.outputs import json_form, write_whole
 
 if TYPE_CHECKING:
     import torch
@@ -26,8 +26,7 @@ def save_state(path: str | os.PathLike, tensors: dict[str, torch.Tensor], header
     metadata = {"drgs": json.dumps({"schema": SCHEMA, **header}, default=json_form)}
     # A file holds values, in the order of their shapes.
     data = save({name: x.detach().cpu().contiguous() for name, x in tensors.items()}, metadata)
-    with atomic_write(path) as file:
-        file.write(data)
+    write_whole(path, data)
 
 
 def load_state(path: str | os.PathLike) -> tuple[dict[str, torch.Tensor], dict]:

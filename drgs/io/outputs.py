@@ -332,11 +332,16 @@ def atomic_write(path: str | os.PathLike) -> Iterator[BinaryIO]:
         os.fsync(file.fileno())
 
 
+def write_whole(path: str | os.PathLike, data: bytes) -> None:
+    """Write a file atomically, as `atomic_write`."""
+    with atomic_write(path) as file:
+        file.write(data)
+
+
 def write_json(path: str | os.PathLike, value: Any) -> None:
     """Write JSON atomically, with settings dataclasses as objects and paths as text; NaN is refused."""
     text = json.dumps(value, indent=2, default=json_form, allow_nan=False)
-    with atomic_write(path) as file:
-        file.write(text.encode() + b"\n")
+    write_whole(path, text.encode() + b"\n")
 
 
 def json_form(value: Any) -> Any:

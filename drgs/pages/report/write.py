@@ -14,7 +14,7 @@ from drgs.data.camera_lists import camera_from_json
 from drgs.display.progress import Bar
 from drgs.fitting.errors import run_error_record
 from drgs.fitting.records import LoadedRun, load_run
-from drgs.io.outputs import atomic_write
+from drgs.io.outputs import write_whole
 from drgs.io.run import Run
 from drgs.pages.report import charts, pictures
 from drgs.pages.report.account import Account, account_of
@@ -42,8 +42,7 @@ def write_report(run: Run, path: Path, command: str, command_text: str, dataset:
     with Bar("report"):
         account = account_of(run)
         page = page_html(account, _pictures_and_charts(account, dataset), command, command_text)
-        with atomic_write(path) as file:
-            file.write(page.encode())
+        write_whole(path, page.encode())
 
 
 def _pictures_and_charts(account: Account, dataset: Dataset | None) -> Drawings:

@@ -17,7 +17,7 @@ from drgs.codecs.clustering import morton_order
 from drgs.codecs.sog import encode_sog
 from drgs.data.camera_layout import middle_camera
 from drgs.display.progress import Bar
-from drgs.io.outputs import atomic_write
+from drgs.io.outputs import write_whole
 from drgs.pages.sharing.layers import GaussianScale, motion_layer, scale_layer
 from drgs.pages.sharing.npm import viewer_files
 from drgs.pages.sharing.page import scene_html
@@ -109,8 +109,7 @@ def write_page(shared: Shared, path: str | os.PathLike) -> dict[str, int]:
             shared.moving, shared.times, shared.gaussians, order
         )
     page, sizes = scene_html(shared.title, shared.lines, scene, parts, viewer)
-    with atomic_write(path) as file:
-        file.write(page.encode())
+    write_whole(path, page.encode())
     return sizes
 
 
