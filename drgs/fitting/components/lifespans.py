@@ -40,6 +40,7 @@ from drgs.display.progress import Bar
 from drgs.ellipsoids import Gaussians, Scene, colors_only
 from drgs.fitting.components.base import Checkpoint, Component, Fit, Setup
 from drgs.fitting.components.motion import WARM_UP, MotionComponent, limited_lifespans
+from drgs.fitting.depths import renders_z
 from drgs.fitting.rates import means_rate
 from drgs.fitting.stages import dynamic_stage, shows_first_time, spacing
 from drgs.integrator import Output, render
@@ -583,7 +584,7 @@ def _compared(
     assert camera.time is not None  # a fit to what moves
     distance = torch.where(out.alpha.cpu() > _SOLID, out.depth.cpu(), torch.inf)
     rays = torch.from_numpy(camera.pixel_directions()).reshape(height, width, 3).float()
-    if settings.planar and settings.depth_key == "z":
+    if renders_z(settings):
         distance = distance / (rays @ torch.from_numpy(camera.c2w[:3, 2]).float())
     residual = avg_pool2d((image - rgb).abs().mean(0)[None], 3, 1, 1)[0]
     other = residual > _DIFFERENCE
