@@ -22,7 +22,7 @@ import torch
 from drgs import data
 from drgs.commands.values import parsed_size
 from drgs.data.semantics import CLASS_FILES, read_class_names
-from drgs.data.sidecars import LABEL_FOLDERS, TEACHER_FOLDERS
+from drgs.data.sidecars import EMBEDDINGS, LABEL_FOLDERS, TEACHER_FOLDERS
 from drgs.display.progress import Bar
 from drgs.features.encoders import TEMPLATES, ClipEncoder
 from drgs.fitting.config import DataConfig
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
 _FOLDER = TEACHER_FOLDERS[0]
 _RECORD = f"{_FOLDER}/teach.json"
-_EMBEDDINGS = "text_embeddings.npy"
 _CLASSES = CLASS_FILES[0]
 _LONGER_SIDE = 80  # cells of the longer side of a map, by default; chosen
 _MOST_CELLS = 4096  # cells of a side, at most: more is a typing error
@@ -106,7 +105,7 @@ def _check_no_other_files(output: LockedFolder) -> None:
     folder = output.path / _FOLDER
     if not folder.is_dir() or folder.is_symlink():
         output.check([_FOLDER])
-    paths = [*sorted(folder.rglob("*")), output.path / _EMBEDDINGS]
+    paths = [*sorted(folder.rglob("*")), output.path / EMBEDDINGS]
     other = next((path for path in paths if path.is_file() and not output.is_ours(path, ("teach",))), None)
     if other is not None:
         raise ValueError(
@@ -178,7 +177,7 @@ def _write_record(output: LockedFolder, record: dict) -> None:
     if any(held.get(key) != value for key, value in maps.items()):
         if (output.path / _FOLDER).is_dir():
             output.remove(output.path / _FOLDER)
-        output.remove(output.path / _EMBEDDINGS)
+        output.remove(output.path / EMBEDDINGS)
     if held != wanted:
         write_json(path, record)
 
@@ -189,7 +188,7 @@ def _write_texts(output: LockedFolder, texts: torch.Tensor, names: list[str]) ->
     if held is None or output.is_ours(held, ("teach",)):
         classes = [{"id": number, "name": name} for number, name in enumerate(names, 1)]
         write_json(output.path / _CLASSES, {"schema": SCHEMA, "command": "teach", "unlabelled": 0, "classes": classes})
-    with atomic_write(output.path / _EMBEDDINGS) as file:
+    with atomic_write(output.path / EMBEDDINGS) as file:
         np.save(file, texts.numpy())
 
 

@@ -29,7 +29,7 @@ from drgs.data.views import View
 
 TEACHER_FOLDERS = ("rgb_feature_langseg", "sam_embeddings")
 LABEL_FOLDERS = ("semantic_class", "semantic", "labels")
-_EMBEDDINGS = "text_embeddings.npy"
+EMBEDDINGS = "text_embeddings.npy"
 _MOVING = "moving_classes.json"
 _LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
 _IMAGE_FOLDERS = ("images", "rgb")
@@ -68,7 +68,7 @@ def attach(dataset: Dataset, lazy: bool) -> None:
         return
     class_file, embedding_file, moving_file = (
         next((base / name for name in names for base in bases if (base / name).is_file()), None)
-        for names in (CLASS_FILES, [_EMBEDDINGS], [_MOVING])
+        for names in (CLASS_FILES, [EMBEDDINGS], [_MOVING])
     )
     semantics = Semantics(
         teacher=folder_of["teacher"].name if "teacher" in folder_of else "",
