@@ -114,7 +114,7 @@ def prune(
             they are not changed.
         cameras: The views, which should show all that matters.
         settings: Default `RenderSettings.preset("fast")`: what it removes costs no more in other renderers than what
-            `exact` does, which takes six times as long (docs/prune.md).
+            `exact` does, which takes six to seven times as long (docs/prune.md).
         keep: Share of the Gaussians that is left, in (0, 1), of those that change a view. Either this or `loss`.
         loss: By how much the mean PSNR of the views may fall, in dB, > 0; needs `images`. As many are removed as that
             allows, to within some percent of it.
