@@ -70,6 +70,7 @@ Rows = Sequence[dict[str, Any]]
 PAGE = ROOT / "docs" / "next-views.md"
 ROWS = ROOT / "benchmarks" / "captures.jsonl"
 FREE_ROWS = ROOT / "benchmarks" / "free_poses.jsonl"
+POOL_ROWS = ROOT / "benchmarks" / "pools.jsonl"
 DEFAULT = "geometry+backdrop, v_opt"
 OTHERS = ("farthest", "fisherrf", "uniform")
 LEFT = "blur"
@@ -109,40 +110,43 @@ def section(rows: Rows) -> str:
         f"{each}. {coverage(len(counts), len(units)):.0%} of such intervals hold the true mean; "
         f"{min(detectable):.1f} to {max(detectable):.1f} dB could be seen."
     )
-    lines = [
-        [
-            f"`{other}`",
-            str(one.units),
-            compared(over, other),
-            *(compared(at_views(rows, count), other) for count in SHOWN),
-        ]
-        for other, one in zip(OTHERS, whole, strict=True)
-    ]
-    heads = ["against", "starts", "3 to 20 views", *(f"{count} views" for count in SHOWN)]
     tail = (
         f"`{LEFT}`, least sharp rendering, left the race {left.mean:.2f} dB behind [{left.low:.2f}, {left.high:.2f}]. "
         "Fits are for `fast` alone; `gsplat` shows those of `watch` 7 to 9 dB worse. What POp-GS and FisherRF report "
         "for ten views is of other steps, sizes and scenes ([beside ours](data/captures-outside.csv))."
     )
-    return "\n\n".join([textwrap.fill(head, 120), markdown_table(heads, lines), textwrap.fill(tail, 120)])
+    return "\n\n".join([textwrap.fill(head, 120), compared_with(rows, OTHERS), textwrap.fill(tail, 120)])
 
 
 def free_section(rows: Rows) -> str:
     """The text and the table of free poses."""
-    over = [over_views(row, "psnr") for row in rows]
-    units = sorted({unit_of(row) for row in rows})
     rooms, commits = (", ".join(sorted({row[key] for row in rows})) for key in ("scene", "commit"))
     head = (
-        f"Three rooms ({rooms}) with two starts each, named before any fit ran; {len(rows)} fits, {len(units)} starts, "
-        f"commit {commits} ([rows](../benchmarks/free_poses.jsonl)), measured and compared as on captures."
+        f"Three rooms ({rooms}) with two starts each, named before any fit ran; {len(rows)} fits, "
+        f"{len({unit_of(row) for row in rows})} starts, commit {commits} ([rows](../benchmarks/free_poses.jsonl)), "
+        "measured and compared as on captures."
     )
+    return textwrap.fill(head, 120) + "\n\n" + compared_with(rows, ("random", "farthest", "fisherrf"))
+
+
+def pool_section(rows: Rows) -> str:
+    """The text and the table of pools as people leave them."""
+    units = {unit_of(row) for row in rows}
+    scenes = ", ".join(f"`{name}` {sum(unit[0] == name for unit in units)}" for name in sorted({x[0] for x in units}))
+    commits = ", ".join(sorted({row["commit"] for row in rows}))
+    head = f"{len(rows)} fits, commit {commits} ([rows](../benchmarks/pools.jsonl)); starts: {scenes}."
+    return textwrap.fill(head, 120) + "\n\n" + compared_with(rows, ("random", "uniform", "farthest", "fisherrf"))
+
+
+def compared_with(rows: Rows, others: Sequence[str]) -> str:
+    """The table of the default less others, averaged over numbers of views and at `SHOWN` ones."""
+    over = [over_views(row, "psnr") for row in rows]
     lines = [
         [f"`{other}`", str(len(differences(over, "psnr", DEFAULT, other))), compared(over, other)]
         + [compared(at_views(rows, count), other) for count in SHOWN]
-        for other in ("random", "farthest", "fisherrf")
+        for other in others
     ]
-    heads = ["against", "starts", "3 to 20 views", *(f"{count} views" for count in SHOWN)]
-    return "\n\n".join([textwrap.fill(head, 120), markdown_table(heads, lines)])
+    return markdown_table(["against", "starts", "3 to 20 views", *(f"{count} views" for count in SHOWN)], lines)
 
 
 def by_fit(rows: Rows) -> Iterator[list[str]]:
@@ -178,6 +182,7 @@ def main() -> None:
     write_csv(PAGE_DATA / "captures.csv", by_fit(rows))
     write_csv(PAGE_DATA / "captures-outside.csv", beside(rows))
     fill_between(PAGE, "free", free_section(read_study(FREE_ROWS)))
+    fill_between(PAGE, "pools", pool_section(read_study(POOL_ROWS)))
 
 
 if __name__ == "__main__":

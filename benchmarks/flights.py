@@ -1,6 +1,7 @@
 """Decibels by metre: a robot that plans its flight, against flights that look at poses alone.
 
     python benchmarks/flights.py DATA ...     rows as they come, kept: benchmarks/flights.jsonl
+    python benchmarks/flights.py --page       the table of docs/next-views.md, of rows that are there
 
 DATA has depth; a robot may go to every training view, in a straight line. A flight costs its length and `LOOK` for each
 photograph; what is fitted, `drgs.Planner`'s model, gets `STEPS` steps for each metre of cost, so that flights of one
@@ -24,6 +25,7 @@ import dataclasses
 import math
 import os
 import random
+import statistics
 import sys
 import time
 from pathlib import Path
@@ -34,11 +36,14 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks"), str(ROOT / "examples")]
 
+from pages import fill_between  # noqa: E402
 from plan_views import depth_of, distance, psnr  # noqa: E402
 from where import add_row, ran, read_rows  # noqa: E402
 
 import drgs  # noqa: E402
+from drgs.studies.tables import markdown_table, paragraph  # noqa: E402
 
+PAGE = ROOT / "docs" / "next-views.md"
 ROWS = ROOT / "benchmarks" / "flights.jsonl"
 POLICIES = ("planner", "nearest", "farthest", "farthest by metre")
 STARTS = (0, 1)
@@ -46,6 +51,7 @@ LOOK = 0.5  # metres that a photograph costs: to stop, turn and look; without it
 BUDGETS = (5, 10, 20, 40)  # metres
 STEPS = 20  # of the fit for each metre: 800 of the 1,000 that the planner's schedule has
 PIXELS = 12_000  # of a held-out view
+LEAD_AT = 20  # metres at which the page compares flight by flight
 
 
 def chosen(policy: str, planner: drgs.Planner, left: list[drgs.Camera], taken: list[drgs.Camera]) -> drgs.Camera:
@@ -98,11 +104,54 @@ def fly(dataset: drgs.Dataset, policy: str, seed: int) -> dict:
     return {"psnr": curve, "photographs": counts, "choosing": seconds}
 
 
+def section(rows: list[dict]) -> str:
+    """PSNR and photographs of the policies at each budget, where all of them have flown."""
+    flights = {(row["scene"], row["seed"], row["policy"]): row for row in rows}
+    starts = sorted({key[:2] for key in flights if all((*key[:2], policy) in flights for policy in POLICIES)})
+    lines = []
+    for name, is_office in (("rooms", False), ("`office`", True)):
+        own = [start for start in starts if (start[0] == "office") == is_office]
+        for policy in POLICIES if own else ():
+            flown = [flights[*start, policy] for start in own]
+            line = [name, policy]
+            for budget in map(str, BUDGETS):
+                psnr, photographs = (
+                    statistics.mean(row[key][budget] for row in flown) for key in ("psnr", "photographs")
+                )
+                line.append(f"{psnr:.1f} ({photographs:.0f})")
+            lead = [planned_lead(flights, start, policy) for start in own]
+            is_planner = policy == POLICIES[0]
+            line.append("" if is_planner else f"{statistics.mean(lead):+.1f} [{min(lead):+.1f}, {max(lead):+.1f}]")
+            lines.append(line)
+    counts = {scene: sum(start[0] == scene for start in starts) for scene, _ in starts}
+    machines, days, commits = (
+        ", ".join(dict.fromkeys(row[key] for row in rows)) for key in ("machine", "date", "commit")
+    )
+    text = paragraph(
+        "PSNR of held-out views, and photographs taken, after flights of so many metres; last what the planner gains "
+        f"at {LEAD_AT} m, in brackets the least and the most of the starts. Starts: "
+        + ", ".join(f"`{scene}` {count}" for scene, count in counts.items())
+        + f"; {machines}, {days}, commit {commits} ([rows](../benchmarks/flights.jsonl))."
+    )
+    heads = ["scenes", "policy", *(f"{budget} m" for budget in BUDGETS), "planner less it"]
+    return text + "\n\n" + markdown_table(heads, lines)
+
+
+def planned_lead(flights: dict[tuple, dict], start: tuple, policy: str) -> float:
+    """What the planner is ahead of another policy at `LEAD_AT` metres from the same start, dB."""
+    planned, other = (flights[*start, name]["psnr"][str(LEAD_AT)] for name in (POLICIES[0], policy))
+    return planned - other
+
+
 def main() -> None:
     """The program."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", nargs="*", type=Path)
+    parser.add_argument("--page", action="store_true", help="write the table of what is there")
     args = parser.parse_args()
+    if args.page:
+        fill_between(PAGE, "flights", section(read_rows(ROWS)))
+        return
     there = {(row["scene"], row["seed"], row["policy"]) for row in read_rows(ROWS)}
     for path in args.data:
         dataset = drgs.load_data(path)
