@@ -131,13 +131,13 @@ def test_maps_of_a_report(place, monkeypatch):
     assert len(cameras) >= 9
     assert {camera.distortion for camera in cameras} == {LENS}
     looked = []
-    draw = pictures.render
+    draw = pictures.opacity_of
 
     def looking(g, camera, *rest, **more):
         looked.append(camera)
         return draw(g, camera, *rest, **more)
 
-    monkeypatch.setattr(pictures, "render", looking)
+    monkeypatch.setattr(pictures, "opacity_of", looking)
     assert cli.main(["report", str(place / "run"), "--quiet"]) == 0
     assert looked
     assert all(camera.distortion == LENS for camera in looked)

@@ -80,8 +80,8 @@ def test_python_runs(tmp_path):
 
 
 def test_presets_and_settings_exist():
-    """The table names every preset, and nothing else."""
+    """The list names every preset, and nothing else."""
     from drgs.settings import PRESETS
 
-    table = _COMMANDS.read_text(encoding="utf-8").split("## Presets")[1].split("## ")[0]
-    assert re.findall(r"^\| `(\w+)`", table, flags=re.M) == list(PRESETS)
+    listed = (ROOT / "docs/conventions.md").read_text(encoding="utf-8").split("## Presets")[1].split("## ")[0]
+    assert sorted(re.findall(r"\*\*`(\w+)`\*\*", listed)) == sorted(PRESETS)

@@ -86,14 +86,14 @@ def test_a_broken_renderer_fails(monkeypatch, tmp_path, capsys, what):
 
 def test_what_raises_becomes_a_row(monkeypatch, tmp_path, capsys):
     """The run goes on; the message is in the table, on one line."""
-    true = accuracy.compare
+    true = stress.compare
 
     def broken(g, *args):
         if len(g) == 1:
             raise RuntimeError("a kernel\nwas not compiled")
         return true(g, *args)
 
-    monkeypatch.setattr(accuracy, "compare", broken)
+    monkeypatch.setattr(stress, "compare", broken)
     code, report = run(monkeypatch, tmp_path)
     assert code == 1
     rows = {row["case"]: row for row in report["rows"]}
@@ -120,13 +120,13 @@ def test_warnings_are_part_of_the_verdict(monkeypatch, expected):
     case = next(c for c in extremes.CASES if c.name == "0 Gaussians")
     case = dataclasses.replace(case, bvh="warns" if expected else "holds")
     if not expected:
-        true = accuracy.compare
+        true = stress.compare
 
         def loud(*args):
             warnings.warn("use traversal='tiles'", stacklevel=1)
             return true(*args)
 
-        monkeypatch.setattr(accuracy, "compare", loud)
+        monkeypatch.setattr(stress, "compare", loud)
     row = stress.row_of(case, "bvh", stress.truth_of(case))
     assert row.verdict == "FAILS"
     assert ("no warning" if expected else "a warning without need") in row.remark
