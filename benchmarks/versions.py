@@ -263,25 +263,22 @@ def page() -> None:
     from studies import PAGE_DATA, write_csv
     from where import read_rows
 
-    from drgs.studies.tables import markdown_table, paragraph
+    from drgs.studies.tables import paragraph
 
     rows = read_rows(ROWS)
     last = rows[-1]
-    scenes = list(dict.fromkeys(row["scene"] for row in rows))
-    timed = list(dict.fromkeys(row["timed"] for row in rows))
-    cells = {(row["scene"], row["timed"]): row for row in rows}
-    lines = []
-    for name in timed:
-        line = [name]
-        for scene in scenes:
-            row = cells.get((scene, name))
-            line.append(f"{row['ratio']:.2f} ({1e3 * row['before']:.0f} to {1e3 * row['now']:.0f})" if row else "")
-        lines.append(line)
-    text = paragraph(
-        f"Commit {last['commit']} in multiples of the time of {last['before_commit']}, in brackets milliseconds of "
-        f"processor time: `python benchmarks/versions.py`, {last['machine']}, {last['date']}, other work running."
+    timed: dict[str, list[float]] = {}
+    for row in rows:
+        timed.setdefault(row["timed"], []).append(row["ratio"])
+    ratios = "; ".join(
+        f"{name} {' to '.join(dict.fromkeys(f'{of(found):.2f}' for of in (min, max)))}" for name, found in timed.items()
     )
-    fill_between(PAGE, "versions", text + "\n\n" + markdown_table(["", *scenes], lines))
+    text = paragraph(
+        f"Commit {last['commit']} in multiples of the time of {last['before_commit']}, on the cube and on `office`: "
+        f"{ratios} (`python benchmarks/versions.py`, {last['machine']}, {last['date']}, other work running, "
+        "[rows](../benchmarks/versions.jsonl))."
+    )
+    fill_between(PAGE, "versions", text)
     if FIT_ROWS.exists():
         rows = last_rows()
         commits, machines, days = (
