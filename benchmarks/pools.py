@@ -14,7 +14,7 @@ Named before any fit ran: `moved` of every fourth photograph of `bonsai`, `blurr
     drgs reproduce captures --protocol blind --seeds 2 --data FOLDER --policy random --policy uniform \
         --policy farthest --policy fisherrf --policy "geometry+backdrop, v_opt" -o OUT
 
-Rows: benchmarks/pools.jsonl; the table is made by benchmarks/captures.py.
+Rows: benchmarks/pools.jsonl; the sentences of docs/next-views.md are made by benchmarks/captures.py.
 """
 
 from __future__ import annotations
