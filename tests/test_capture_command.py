@@ -395,6 +395,11 @@ def test_bad_photographs(photographs, tmp_path, capsys):
     assert "IMG_3.jpg" in refused([tmp_path / "damaged", "-o", tmp_path / "b", "--quiet"], capsys)
     assert "must be photographs or a video, found none" in refused([tmp_path / "no", "-o", tmp_path / "c"], capsys)
     assert "must be photographs" in refused(["-o", tmp_path / "d"], capsys)
+    (tmp_path / "run").mkdir()
+    for name in ("config.json", "log.jsonl"):
+        (tmp_path / "run" / name).write_text("{}")
+    assert "is a run; add photographs to it" in refused([tmp_path / "run", "-o", tmp_path / "f"], capsys)
+    assert not (tmp_path / "f").exists()
     assert "--budget must be a time with its unit" in refused([first, "-o", tmp_path / "e", "--budget", "10"], capsys)
 
 

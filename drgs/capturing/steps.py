@@ -69,6 +69,12 @@ def run_capture(options: CaptureOptions, config: FitConfig, say: Callable[[str],
         raise ValueError(
             "there must be photographs, videos or a data set, got none; name them, e.g. drgs capture photos -o RUN"
         )
+    run = next((path for path in options.paths if is_run(path)), None)
+    if run is not None:
+        raise ValueError(
+            f"{run}: must be photographs, videos or a data set, is a run; "
+            f"add photographs to it by drgs capture PHOTOS -o {shlex.quote(str(run))} --add"
+        )
     config = config.replace(seed=options.seed)
     with Bar("capture", show=options.progress, lines_only=True):
         given = _dataset_of(options, config)
