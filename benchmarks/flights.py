@@ -1,10 +1,10 @@
-"""Decibels by metre: a robot that plans its flight, against flights that look at poses alone.
+"""Decibels by meter: a robot that plans its flight, against flights that look at poses alone.
 
     python benchmarks/flights.py DATA ...     rows as they come, kept: benchmarks/flights.jsonl
     python benchmarks/flights.py --page       the table of docs/next-views.md, of rows that are there
 
 DATA has depth; a robot may go to every training view, in a straight line. A flight costs its length and `LOOK` for each
-photograph; what is fitted, `drgs.Planner`'s model, gets `STEPS` steps for each metre of cost, so that flights of one
+photograph; what is fitted, `drgs.Planner`'s model, gets `STEPS` steps for each meter of cost, so that flights of one
 cost have been fitted alike, however many photographs they took. PSNR of all held-out views is measured at `BUDGETS`.
 
 Named before any flight: `drgs scene room --free --views 225 --size 160x120 --spp 16 --seed 31 --test-every 9` (and
@@ -13,7 +13,7 @@ seeds 32 and 33) and `office`, two starts each. The policies:
 - planner: `Planner.next`, the largest score / (LOOK + distance) of all places;
 - nearest: the nearest place that no photograph was taken at;
 - farthest: the place farthest from all photographs, whatever it costs;
-- farthest by metre: the largest distance from all photographs / (LOOK + distance), the planner's trade without a model.
+- farthest by meter: the largest distance from all photographs / (LOOK + distance), the planner's trade without a model.
 
 Six starts in rooms can tell about 1 dB, by how much starts have differed there.
 """
@@ -45,14 +45,14 @@ from drgs.studies.tables import markdown_table, paragraph  # noqa: E402
 
 PAGE = ROOT / "docs" / "next-views.md"
 ROWS = ROOT / "benchmarks" / "flights.jsonl"
-POLICIES = ("planner", "nearest", "farthest", "farthest by metre")
-SHOWN = ("planner", "nearest", "farthest by metre")  # on the page: `farthest` is last everywhere
+POLICIES = ("planner", "nearest", "farthest", "farthest by meter")
+SHOWN = ("planner", "nearest", "farthest by meter")  # on the page: `farthest` is last everywhere
 STARTS = (0, 1)
-LOOK = 0.5  # metres that a photograph costs: to stop, turn and look; without it to turn on the spot would be free
-BUDGETS = (5, 10, 20, 40)  # metres
-STEPS = 20  # of the fit for each metre: 800 of the 1,000 that the planner's schedule has
+LOOK = 0.5  # meters that a photograph costs: to stop, turn and look; without it to turn on the spot would be free
+BUDGETS = (5, 10, 20, 40)  # meters
+STEPS = 20  # of the fit for each meter: 800 of the 1,000 that the planner's schedule has
 PIXELS = 12_000  # of a held-out view
-LEAD_AT = 20  # metres at which the page compares flight by flight
+LEAD_AT = 20  # meters at which the page compares flight by flight
 
 
 def chosen(policy: str, planner: drgs.Planner, left: list[drgs.Camera], taken: list[drgs.Camera]) -> drgs.Camera:
@@ -61,7 +61,7 @@ def chosen(policy: str, planner: drgs.Planner, left: list[drgs.Camera], taken: l
     if policy == "planner" and planner.scene is not None:
         planner.scores(left, cost=distance)
         return left[planner.next().picks[0].index]
-    if policy == "farthest by metre":
+    if policy == "farthest by meter":
         return max(left, key=lambda place: _novelty(place, taken) / (LOOK + distance(here, place)))
     if policy == "farthest":
         return max(left, key=lambda place: _novelty(place, taken))
@@ -129,7 +129,7 @@ def section(rows: list[dict]) -> str:
         ", ".join(dict.fromkeys(row[key] for row in rows)) for key in ("machine", "date", "commit")
     )
     text = paragraph(
-        "PSNR of held-out views, and photographs taken, after flights of so many metres; last what the planner gains "
+        "PSNR of held-out views, and photographs taken, after flights of so many meters; last what the planner gains "
         f"at {LEAD_AT} m, in brackets the least and the most of the starts. Starts: "
         + ", ".join(f"`{scene}` {count}" for scene, count in counts.items())
         + f"; {machines}, {days}, commit {commits} ([rows](../benchmarks/flights.jsonl))."
@@ -139,7 +139,7 @@ def section(rows: list[dict]) -> str:
 
 
 def planned_lead(flights: dict[tuple, dict], start: tuple, policy: str) -> float:
-    """What the planner is ahead of another policy at `LEAD_AT` metres from the same start, dB."""
+    """What the planner is ahead of another policy at `LEAD_AT` meters from the same start, dB."""
     planned, other = (flights[*start, name]["psnr"][str(LEAD_AT)] for name in (POLICIES[0], policy))
     return planned - other
 

@@ -15,7 +15,7 @@ from drgs.cameras import orbit
 from drgs.checks import registry
 from drgs.fitting.config import SelectionConfig
 from drgs.gain import CRITERIA, Prior, ViewCriterion, criterion_named, information_gain, scorer
-from drgs.information.blocks import ImageBlock, SceneBlocks
+from drgs.information.blocks import SceneBlocks
 from drgs.information.choices import BLOCK_NAMES, BLOCKS, CRITERION_NAMES, GAUSSIAN_GROUPS, POLICIES, POLICY_NAMES
 from drgs.information.groups import GROUPS
 from drgs.information.network_groups import NETWORK_GROUPS
@@ -23,6 +23,7 @@ from drgs.information.quantity import Quantity, ViewContext
 from drgs.information.sums import add, together
 from drgs.select import Cache, Scoring, select
 from drgs.settings import RenderSettings
+from examples.brightness_block import BRIGHTNESS
 
 pytestmark = pytest.mark.core
 
@@ -49,18 +50,6 @@ def world():
         torch.randn(20, 1, 3, generator=draw),
     )
     return g, orbit((0, 0, 0), 3.0, 6, width=24, height=18)
-
-
-@dataclasses.dataclass(frozen=True)
-class Brightness(Quantity):
-    """About s in exp(s) S: the derivative of the image by it is the image."""
-
-    def compute(self, view):
-        rgb = drgs.render(view.scene, view.camera, view.settings).rgb
-        return {"brightness": rgb.double().square().sum()[None]}
-
-    def variance_map(self, view, weights):
-        return drgs.render(view.scene, view.camera, view.settings).rgb.square().sum(-1) * weights["brightness"].float()
 
 
 def test_names_are_those_of_the_tables():
@@ -94,7 +83,7 @@ def test_tables_load_nothing_heavy():
 def test_a_block_is_one_row(world):
     """It is scored, beside others or alone, kept in a cache, summed over known views and mapped, by its row alone."""
     g, cams = world
-    BLOCKS["brightness"] = ImageBlock(("brightness",), lambda blocks, names: Brightness())
+    BLOCKS["brightness"] = BRIGHTNESS
     scoring = Scoring("eig", FAST, prior=Prior(1.0), blocks=("geometry", "brightness"))
     cache = Cache()
     found = select(g, cams[2:], cams[:2], 2, scoring=scoring, cache=cache)

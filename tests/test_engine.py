@@ -15,8 +15,8 @@ from drgs import fisher, settings
 from drgs.checks import registry
 from drgs.integrator import render, render_jvp
 from drgs.oracle import reference
-from drgs.tracing.peak import Peak
 from drgs.tracing.responses import RESPONSES, response_of
+from examples.narrow_response import NARROW
 
 
 def test_responses_are_known_by_the_same_names():
@@ -64,21 +64,9 @@ def test_a_response_of_another_package(tmp_path, monkeypatch):
         sys.modules.pop("flat", None)
 
 
-class Narrow(Peak):
-    """a = alpha exp(-rho^2): that of `peak` for Gaussians thinner by sqrt(2)."""
-
-    def along(self, r, ray, world):
-        rho2, key, u = super().along(r, ray, world)
-        return 2 * rho2, key, u
-
-    def slopes(self, r, extra, ray, world):
-        *moves, strength = super().slopes(r, extra, ray, world)
-        return [*(2 * x for x in moves), strength]
-
-
 def test_a_response_is_one_class(rng, monkeypatch):
     """A new one renders, and has gradients, tangents and information, with nothing else told of it."""
-    monkeypatch.setitem(RESPONSES, "narrow", Narrow())
+    monkeypatch.setitem(RESPONSES, "narrow", NARROW)
     plain = settings.RenderSettings(order="ray", extent=5.0)
     narrow = plain.replace(response="narrow")
     g, cam = gaussians(rng, 12, 4).detach(), camera(rng, (17, 13))

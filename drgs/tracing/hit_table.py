@@ -9,6 +9,7 @@ one Gaussian at a time.
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Callable
 from typing import Any
 
@@ -42,7 +43,7 @@ class Table:
         return list(dr.gather(self.lib.ArrayXf, self.array, slot, active, shape=(self.count, dr.width(slot))))
 
 
-class HitReplay:
+class HitReplay(abc.ABC):
     """What derivatives have in common that replay a primal pass hit by hit: a `Kernel`, but for `take`.
 
     A hit needs the transmittance in front of it and the sums behind it. Along the ray's own order both are counted down
@@ -61,19 +62,19 @@ class HitReplay:
         self.finals = finals
         self.table = table
 
+    @abc.abstractmethod
     def rest(self, k: int) -> list[Float]:
         """Float64 sums along shared ray k, of which each hit takes its part."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def terms(self, k: int, values: list[Float], depth: Float, place: list, ok: Mask) -> list[Float]:
         """What a hit's weight is multiplied by in each sum; `values` are the channels of the hit."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def take(
         self, index: UInt32, rays: list[Ray], states: list[dict], places: list[list], active: Mask, record: Any
     ) -> list[dict]:
         """A hit that some ray of the packet has; `record`: of the Gaussian, None where it has not been read."""
-        raise NotImplementedError
 
     def begun(self, k: int, alive: Mask, nowhere: Float | UInt32) -> tuple[dict, Mask]:
         """State of shared ray k in front of its first hit, and whether it has any."""
