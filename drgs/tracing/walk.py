@@ -124,7 +124,7 @@ class Part:
     _: dataclasses.KW_ONLY
     ordered: bool
     center_key: Float | None = None
-    buffer: int = dataclasses.field(default_factory=lambda: BUFFER)  # as it is then: tests shorten it
+    buffer: int = dataclasses.field(default_factory=lambda: BUFFER)  # as it is then, too
     first: bool = True
     slots: Slots | None = None
     in_lists: Callable[[], Part] | None = None
