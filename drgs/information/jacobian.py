@@ -200,8 +200,8 @@ class SquareSums(Sink):
         lib: Lib,
         count: int,
         weights: Sequence[float],
-        entries: Sequence[int],
         mode: dr.ReduceMode,
+        entries: Sequence[int],
         bands: int = 0,
         summed: bool = False,
     ) -> None:
@@ -301,7 +301,7 @@ class RemovalSums(Sink):
 
     needs_color = False
 
-    def __init__(self, lib: Lib, count: int, weights: Sequence[float], power: float, mode: dr.ReduceMode) -> None:
+    def __init__(self, lib: Lib, count: int, weights: Sequence[float], mode: dr.ReduceMode, power: float) -> None:
         self.buffer = dr.zeros(lib.Float, count)
         self.weights = weights
         self.power = power
@@ -317,6 +317,22 @@ class RemovalSums(Sink):
             total += {2: square, 1.5: length * dr.sqrt(length), 1: length}[self.power]
         add_row(lib, self.buffer, [total], index, 1, 0, hits, self.mode)
         return states
+
+
+class SumsOf(NamedTuple):
+    """One of the sums above, to be made for a part of the rays.
+
+    Attributes:
+        kind: The class.
+        options: Its arguments after `mode`, hashable.
+    """
+
+    kind: type[SquareSums | BlockSums | RemovalSums]
+    options: tuple = ()
+
+    def sink(self, lib: Lib, count: int, weights: Sequence[float], mode: dr.ReduceMode) -> Any:
+        """The sums, all 0: of `count` Gaussians, with weights of the channels, added up by `mode`."""
+        return self.kind(lib, count, weights, mode, *self.options)
 
 
 class SeveralSums:

@@ -229,6 +229,8 @@ def sum_over_views(
                     f"of shape {tuple(total[name].shape)} in the first and {tuple(x.shape)} in another; take views of "
                     "one time"
                 )
+        if len(cameras) == 1:  # nothing is added to it, and no copy of it is needed
+            return {name: x.to(torch.float64) for name, x in part.items()}
         add(total, part)
     return total
 

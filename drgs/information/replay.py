@@ -4,65 +4,41 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import drjit as dr
 import torch
 
-from drgs import runtime
 from drgs.information.groups import GROUPS, Information
+from drgs.information.hits import Hits, SummedOver, Walk, light, moved_records, shaped, shapes, summed, tangents_of
 from drgs.information.jacobian import (
     GEOMETRY,
     BlockSums,
     RemovalSums,
-    Rows,
     SeveralSums,
     SquareSums,
+    SumsOf,
     VarianceSums,
-    extras,
 )
 from drgs.tracing.arrays import Float
 from drgs.tracing.bridge import to_drjit
 from drgs.tracing.call import Call
-from drgs.tracing.harmonics import sh_basis
-from drgs.tracing.hit_table import Table, along_lists
-from drgs.tracing.pose import quaternion_product
-from drgs.tracing.primitives import Activated
 from drgs.tracing.protocols import Sink
+from drgs.tracing.recordings import replay
+from drgs.tracing.responses import response_of
 
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.ellipsoids import Gaussians
     from drgs.information.semantics import SemanticMetric
     from drgs.settings import RenderSettings
-    from drgs.tracing.kernels import Channels
-    from drgs.tracing.walk import Part
+    from drgs.tracing.frames import Frame
+    from drgs.tracing.primitives import Projected
 
-_TABLED_CHANNELS = 4  # channels whose tables are worth their memory
+_OF_GAUSSIANS = ("means", "quats", "log_scales", "logit_opacities", "sh")  # inputs that rows are about
 _SEMANTIC_CHANNELS = 16  # semantic channels of one traversal, besides the colors
 _FLOAT_MAX = torch.finfo(torch.float32).max
 _MAX_WEIGHT = 1e-6 * _FLOAT_MAX  # of a weight, so that what few of them add up to is no inf, which times 0 were NaN
-
-
-class Walk(NamedTuple):
-    """Rays of one traversal, to be walked again.
-
-    Attributes:
-        first: It is the traversal whose colors weigh.
-        start: Row of its first semantic channel.
-        weights: Weights of its channels: three colors, then semantic channels.
-        channels: What it composited.
-        part, finals: The rays, and their final states.
-        table: What is known of their hits, where final states are not needed.
-    """
-
-    first: bool
-    start: int
-    weights: list[float]
-    channels: Channels
-    part: Part
-    finals: list[dict]
-    table: Table | None
 
 
 class WalkSink(Sink, Protocol):
@@ -113,87 +89,49 @@ class Replay:
         self.count = len(gaussians)
         lib = self.lib
         self.inputs = {name: to_drjit(lib, x) for name, x in call.inputs.items()}
-        self.compositor, arguments = call.prepare(self.inputs)
-        with dr.suspend_grad():  # nothing is recorded: what is wanted are the hits of this view
-            images = self.compositor.forward(*arguments, keep=True, joint=call.width)
-        self.opacity = images["alpha"].torch().cpu().reshape(call.shape)  # (H, W)
-        self.image = images["rgb"].torch().cpu().reshape(*call.shape, 3)
-        p = {name: x.array for name, x in self.inputs.items()}
         self.mask = None if mask is None else to_drjit(lib, mask.float().reshape(-1).to(call.home)).array
         self.along_ray = settings.sh_direction == "ray"
-        self.color = False
-        self.extras = None
-        self.moved_color: list[list[Float]] | None = None  # (channel, axis) dc/dmu, where colors depend on the mean
         self.light: torch.Tensor | Any = None  # of SH along each ray, once `sums` or `sh_spread` was called
-        if not geometry:
-            return
-        if not self.along_ray:  # there colors do not depend on the mean, but on the pixel
-            self.lit, self.basis, self.moved_color = self._colors(p)
-            dr.eval(self.lit, self.basis)
-        self.color = self.moved_color is not None
-        self.extras = extras(
-            lib,
-            self.compositor.model.response,
-            p["logit_opacities"],
-            self.compositor.traversal.projected,
-            self._moved_records(),
-            self.moved_color,
-        )
-        dr.eval(self.extras)
+        self.color = geometry and not self.along_ray and call.coefficients > 1  # it depends on the mean
+        self.frame: Frame | None = None  # of recorded steps
+        if call.is_recorded:
+            self.frame = call.frame({name: x.array for name, x in self.inputs.items()}, _OF_GAUSSIANS)
+            images = self.frame.images
+            self.shapes = self._recorded_shapes() if geometry else {}
+        else:
+            self.compositor, arguments = call.prepare(self.inputs)
+            with dr.suspend_grad():  # nothing is recorded: what is wanted are the hits of this view
+                images = self.compositor.forward(*arguments, keep=True, joint=call.width)
+            self.shapes = self._shapes(self.compositor.traversal.projected) if geometry else {}
+        self.opacity = images["alpha"].torch().cpu().reshape(call.shape)  # (H, W)
+        self.image = images["rgb"].torch().cpu().reshape(*call.shape, 3)
 
-    @runtime.exactly
-    def _colors(self, p: dict) -> tuple[list[Float], list[Float], list[list[Float]] | None]:
-        """Per channel where the color is not clamped, the SH basis, and dc/dmu (None for degree 0)."""
-        lib, K = self.lib, self.call.coefficients
-        response = self.compositor.model.response
-        g = Activated(lib, p, p["w2c"], self.settings, response.at_most_alpha)
-        d, inverse, basis, rgb = g.color(K)
-        coefficient = lambda k, c: lib.Float(g.column("sh", 3 * k + c, 3 * K))  # noqa: E731
-        lit = [dr.select(x > 0, lib.Float(1), 0) for x in rgb]
-        zero = dr.zeros(lib.Float, self.count)
-        basis_width = [x + zero for x in basis]
-        if K == 1:
-            return lit, basis_width, None
-        turned = []  # per axis, d basis / d direction
-        for axis in range(3):
-            along = [lib.Float(x) + 0 for x in d]
-            dr.enable_grad(along[axis])
-            dr.set_grad(along[axis], 1)
-            values = sh_basis(along, K)
-            dr.forward_to(values[1:], flags=dr.ADFlag.ClearEdges)
-            turned.append([lib.Float(0)] + [dr.grad(x) for x in values[1:]])
-        moved = []
-        for c in range(3):
-            slope = [sum(coefficient(k, c) * turned[axis][k] for k in range(1, K)) for axis in range(3)]
-            radial = slope[0] * d[0] + slope[1] * d[1] + slope[2] * d[2]
-            moved.append([lit[c] * inverse * (slope[j] - radial * d[j]) for j in range(3)])
-        return lit, basis_width, moved
-
-    def _moved_records(self) -> list[list[Float]] | None:
-        """Tangents of the records along means, rotations and log-scales, for a response that needs them."""
-        if not self.compositor.model.response.by_tangents:
-            return None
-        lib = self.lib
+    def _shapes(self, projected: Projected) -> dict:
+        """`hits.shapes` of Gaussians that were projected into the view."""
         call = self.call
-        inputs = self.inputs
-        moved = []
-        axes = [("means", _unit(k)) for k in range(3)] + [("quats", _unit(k)) for k in range(3)]
-        sizes = call.inputs["log_scales"]
-        sphere = (sizes == sizes[:, :1]).all(1)
-        for name, axis in [*axes, *(("log_scales", _unit(k)) for k in range(3))]:
-            x = call.inputs[name]
-            tangent = torch.tensor(axis, dtype=torch.float64, device=x.device).expand(self.count, 3)
-            if name == "quats":
-                # A sphere's rotation changes nothing, not even by rounding.
-                tangent = 0.5 * quaternion_product(tangent, x.double()) * ~sphere[:, None]
-            dr.enable_grad(inputs[name])
-            dr.set_grad(inputs[name], to_drjit(lib, tangent.to(x.dtype)))
-            _, arguments = call.prepare(inputs)
-            record = arguments.record
-            dr.forward_to(record, flags=dr.ADFlag.ClearEdges)
-            moved.append([dr.detach(dr.grad(r)) for r in record])  # numbers, free of this graph
-            dr.disable_grad(inputs[name])
-        return moved
+        response = response_of(self.settings)
+        moved = None
+        if response.by_tangents:
+            tangents = {n: [to_drjit(self.lib, x) for x in xs] for n, xs in tangents_of(call.inputs).items()}
+            moved = moved_records(self.inputs, tangents, lambda inputs: call.prepare(inputs)[1].record)
+        p = {name: x.array for name, x in self.inputs.items()}
+        coefficients = 0 if self.along_ray else call.coefficients
+        found = shapes(self.lib, self.settings, response, p, projected, coefficients, moved)
+        dr.eval(found)
+        return found
+
+    def _recorded_shapes(self) -> dict:
+        """The same of the frame."""
+        assert self.frame is not None
+        tangents = tangents_of(self.call.inputs) if response_of(self.settings).by_tangents else {}
+        arrays = {name: [to_drjit(self.lib, x).array for x in xs] for name, xs in tangents.items()}
+        return replay(shaped, self.frame.view, self.frame.given | {"tangents": arrays})
+
+    @functools.cached_property
+    def hits(self) -> Hits:
+        """The hits of the view."""
+        compositor = self.compositor if self.frame is None else self.frame.compositor()
+        return Hits(compositor, self.shapes.get("extras"), self.color, self.mask)
 
     def walks(self, weights: Sequence[float]) -> Iterator[Walk]:
         """Each part of each traversal.
@@ -201,7 +139,7 @@ class Replay:
         The first has the colors and a slice of the semantic channels. Each other slice has the colors beside it, too,
         for that costs little; there they weigh nothing.
         """
-        compositor = self.compositor
+        compositor = self.hits.compositor
         gamma = self.semantics.weight if self.semantics else 0.0
         for number, features in enumerate(self.slices):
             count = 0 if features is None else features.shape[1]
@@ -209,66 +147,67 @@ class Replay:
             if number:
                 assert features is not None  # only the first slice may be none at all
                 channels, done = compositor.again(to_drjit(self.lib, features.reshape(-1)).array, count)
-            numbers = channels.outputs if self.extras is not None else 0
-            kernel = functools.partial(self._rows, channels)
-            tabled = None if numbers > _TABLED_CHANNELS else numbers
             own = [*(weights if number == 0 else [0.0] * 3), *[gamma] * count]
-            for at in done:
-                known = along_lists(self.lib, *at, tabled, kernel)
-                yield Walk(number == 0, 3 + number * _SEMANTIC_CHANNELS, own, channels, *known)
-
-    def _rows(
-        self, channels: Channels, part: Part, finals: list[dict], sink: Sink | Any = None, table: Table | None = None
-    ) -> Rows:
-        """The kernel for a part."""
-        masks = None
-        if self.mask is not None:
-            masks = [dr.gather(self.lib.Float, self.mask, *at) for at in zip(part.flat, part.inside, strict=True)]
-        return Rows(self.compositor.model, channels, self.extras, sink, finals, self.color, masks, table)
-
-    def run(self, walk: Walk, sink: Sink) -> list[dict]:
-        """Hand the Jacobian's rows of a part to a sink: final states of its shared rays."""
-        return walk.part.run(self._rows(walk.channels, walk.part, walk.finals, sink, walk.table))
+            yield from self.hits.walks(channels, done, own, number == 0, 3 + number * _SEMANTIC_CHANNELS)
 
     def add_up(self, sums: WalkSums) -> None:
         """Add the hits of all walks to sums of them."""
         for walk in self.walks([1.0] * 3):
             sink = sums.sink(self, walk)
-            dr.eval(self.run(walk, sink), sink.buffer)
+            dr.eval(self.hits.run(walk, sink), sink.buffer)
 
     def _summed(
         self,
-        sink_of: Callable[[Walk, dr.ReduceMode], SquareSums | BlockSums | RemovalSums],
+        sums_of: Callable[[bool], SumsOf],
         width: int,
         weights: Sequence[float],
         more_sums: Sequence[WalkSums] = (),
     ) -> torch.Tensor:
-        """(N, width) float64, where kernels run: what `sink_of(walk, reduce mode)` sums up in its `buffer`, over all
-        walks; their hits are added to `more_sums`, too.
+        """(N, width) float64, where kernels run: what `sums_of(first)` sums up over all walks, `first` or not; their
+        hits are added to `more_sums`, too.
         """
         total = torch.zeros(self.count, width, dtype=torch.float64, device=self.call.home)
-        for walk in self.walks(weights):
-            sink = sink_of(walk, walk.part.reduction)
-            others = [sums.sink(self, walk) for sums in more_sums]
+        for buffer in self._buffers(sums_of, weights, more_sums):
             # A buffer is float32, which one traversal fills; what several add up to is float64.
-            dr.eval(self.run(walk, SeveralSums([sink, *others])), sink.buffer, [other.buffer for other in others])
-            sums = sink.buffer.torch().double().reshape(self.count, -1)[:, :width]
+            sums = buffer.torch().double().reshape(self.count, -1)[:, :width]
             total[:, : sums.shape[1]] += sums
         return total
 
+    def _buffers(
+        self, sums_of: Callable[[bool], SumsOf], weights: Sequence[float], more_sums: Sequence[WalkSums]
+    ) -> Iterator[Float]:
+        """The buffer of each walk, as of `_summed`."""
+        frame = self.frame
+        if frame is not None and frame.several is None and not more_sums:
+            what = SummedOver(frame.view, tuple(weights), sums_of(True), self.count, self.color)
+            optional = {"extras": self.shapes.get("extras"), "mask": self.mask}
+            arrays = {name: x for name, x in optional.items() if x is not None}
+            yield replay(summed, what, arrays | {"seen": frame.seen, "finals": frame.finals})
+            return
+        for walk in self.walks(weights):
+            sink = sums_of(walk.first).sink(self.lib, self.count, walk.weights, walk.part.reduction)
+            others = [sums.sink(self, walk) for sums in more_sums]
+            rows = self.hits.run(walk, SeveralSums([sink, *others]))
+            dr.eval(rows, sink.buffer, [other.buffer for other in others])
+            yield sink.buffer
+
     def sums(
-        self, entries: Sequence[int], weights: Sequence[float], summed: bool = False, more_sums: Sequence[WalkSums] = ()
+        self,
+        entries: Sequence[int],
+        weights: Sequence[float],
+        channels_first: bool = False,
+        more_sums: Sequence[WalkSums] = (),
     ) -> torch.Tensor:
         """(N, 11) float64, where kernels run: squares of the geometry, and sum w^2; those of SH along each ray are kept
-        in `light`.
+        in `light`. `channels_first`: channels are summed before they are squared.
         """
-        bands = self.call.coefficients if self.along_ray and self.extras is not None and GEOMETRY in entries else 0
+        bands = self.call.coefficients if self.along_ray and self.shapes and GEOMETRY in entries else 0
 
-        def sink_of(walk: Walk, mode: dr.ReduceMode) -> SquareSums:
-            own = entries if walk.first else [k for k in entries if k < GEOMETRY]
-            return SquareSums(self.lib, self.count, walk.weights, own, mode, bands if walk.first else 0, summed)
+        def sums_of(first: bool) -> SumsOf:
+            own = tuple(k for k in entries if first or k < GEOMETRY)
+            return SumsOf(SquareSums, (own, bands if first else 0, channels_first))
 
-        total = self._summed(sink_of, GEOMETRY + 1 + 3 * bands, weights, more_sums)
+        total = self._summed(sums_of, GEOMETRY + 1 + 3 * bands, weights, more_sums)
         self.light = total[:, GEOMETRY + 1 :].reshape(self.count, bands, 3)
         return total[:, : GEOMETRY + 1]
 
@@ -289,10 +228,9 @@ class Replay:
 
     def blocks(self, weights: Sequence[float]) -> torch.Tensor:
         """`fisher.blocks` of one view, on the CPU."""
-        lib, size = self.lib, BlockSums.SIZE
-        sink_of = lambda walk, mode: BlockSums(lib, self.count, walk.weights, mode)  # noqa: E731
+        size = BlockSums.SIZE
         row, column = torch.tril_indices(size, size, device=self.call.home)
-        total = self._summed(sink_of, len(row), weights)
+        total = self._summed(lambda first: SumsOf(BlockSums), len(row), weights)
         full = torch.zeros(self.count, size, size, dtype=torch.float64, device=self.call.home)
         full[:, row, column] = total
         full[:, column, row] = total
@@ -300,8 +238,7 @@ class Replay:
 
     def removal_errors(self, weights: Sequence[float], power: float) -> torch.Tensor:
         """`fisher.removal_error` of one view, on the CPU."""
-        sink_of = lambda walk, mode: RemovalSums(self.lib, self.count, walk.weights, power, mode)  # noqa: E731
-        return self._summed(sink_of, 1, weights)[:, 0].cpu()
+        return self._summed(lambda first: SumsOf(RemovalSums, (power,)), 1, weights)[:, 0].cpu()
 
     def variance(self, information: Information, weights: Sequence[float]) -> torch.Tensor:
         """`fisher.variance_map` of one view, by weights of the groups (`information`) and of the channels."""
@@ -321,7 +258,7 @@ class Replay:
             sink = VarianceSums(
                 buffer, walk.weights, light if walk.first else None, walk.first and "features" in information
             )
-            for state, at, inside in zip(self.run(walk, sink), walk.part.flat, walk.part.inside, strict=True):
+            for state, at, inside in zip(self.hits.run(walk, sink), walk.part.flat, walk.part.inside, strict=True):
                 dr.scatter_add(image, state["variance"], at, inside)
             dr.eval(image)
         # Sums of weights that lambda = 0 makes huge may be inf, which a picture's scale could not hold.
@@ -337,14 +274,14 @@ class Replay:
         """(N, K, 3) squares of the derivatives by SH, from (N, 1) sum w^2, times (3,) weights; call after `sums`."""
         if self.along_ray:
             return self.light * weights
-        seen = squares[:, 0].nonzero()[:, 0]
-        if 2 * len(seen) > self.count:  # to copy them to where they belong takes longer than zeros of the others
-            seen = torch.arange(self.count, device=squares.device)
-        basis, lit = self._squared_basis(seen)
-        information = basis[:, :, None] * (squares[seen] * lit * weights)[:, None, :]
-        if len(seen) == self.count:
-            return information
-        return information.new_zeros(self.count, *information.shape[1:]).index_copy_(0, seen, information)
+        arrays = {
+            "squares": to_drjit(self.lib, squares).array,
+            "basis": self.shapes["basis"],
+            "lit": self.shapes["lit"],
+        }
+        what = self.call.coefficients, tuple(weights.tolist())
+        found = light(what, arrays) if self.frame is None else replay(light, what, arrays)
+        return found.torch().view(self.count, -1, 3)
 
     @property
     def feature_scale(self) -> float:
@@ -356,15 +293,11 @@ class Replay:
         if self.along_ray:
             self.light = weights
             return weights.new_zeros(self.count, 3)
-        basis, lit = self._squared_basis(torch.arange(self.count, device=weights.device))
+        basis, lit = self._squared_basis
         return (basis[:, :, None] * weights).sum(1) * lit
 
-    def _squared_basis(self, rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Of n Gaussians (n, K) squares of the SH basis towards them, and (n, 3) 1 where a channel is above 0, or 0."""
-        chosen = lambda x: x.torch()[rows]  # noqa: E731
-        basis, lit = (torch.stack([chosen(x) for x in xs], 1).double() for xs in (self.basis, self.lit))
-        return basis.square_(), lit
-
-
-def _unit(k: int) -> list[float]:
-    return [float(j == k) for j in range(3)]
+    @property
+    def _squared_basis(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """(N, K) squares of the SH basis towards each Gaussian, and (N, 3) 1 where a channel is above 0, or 0."""
+        basis, lit = (self.shapes[name].torch().reshape(self.count, -1) for name in ("basis", "lit"))
+        return basis, lit.double()

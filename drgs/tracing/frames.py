@@ -17,6 +17,7 @@ from drgs.tracing import projection, tiles
 from drgs.tracing.arrays import Float, Lib, UInt32, UInt64
 from drgs.tracing.composite import Compositor
 from drgs.tracing.kernels import HitModel, HitNumbers, numbers_of
+from drgs.tracing.primitives import Projected
 from drgs.tracing.recordings import padded, replay
 from drgs.tracing.records import RECORD, pack_records
 from drgs.tracing.rows import MemoryBudget, SortedRows, found_hits, sort_rows
@@ -148,6 +149,10 @@ class Frame:
         self.several = compositor
         return _images(self.view, compositor)
 
+    def compositor(self) -> Compositor:
+        """The compositor after `forward`, with the final states of its rays if gradients are needed."""
+        return self.several or composited(self.view, self.seen, self.finals)
+
     def gradients(self, cotangents: dict) -> dict:
         """Gradients by the inputs that are needed, flat, by name.
 
@@ -182,14 +187,23 @@ def _pinhole(variant: str, pinhole: tuple[float, ...]) -> tuple[list[Float], lis
 # Steps: functions of a view and arrays.
 
 
+def projected(view: View, inputs: dict, pinhole: list[Float]) -> Projected:
+    """The Gaussians on the screen, with the graph of the inputs.
+
+    Args:
+        inputs: Those of a `Frame`.
+        pinhole: Float64, as in its `given`.
+    """
+    given = runtime.dr_types(), inputs, inputs["w2c"], pinhole, view.settings
+    return projection.project_screen(*given, view.width, view.height, view.coefficients)
+
+
 def _projected(view: View, a: dict) -> dict:
     """Records, boxes on the screen, and the words that sort Gaussians by their centers."""
     lib = runtime.dr_types()
-    p = a["inputs"]
-    size = view.width, view.height
-    found = projection.project_screen(lib, p, p["w2c"], a["pinhole"], view.settings, *size, view.coefficients)
+    found = projected(view, a["inputs"], a["pinhole"])
     record = pack_records(lib, found.record)
-    seen, amount, x, y = tiles.screen_boxes(lib, found, *size)
+    seen, amount, x, y = tiles.screen_boxes(lib, found, view.width, view.height)
     seen = dr.select(seen, lib.UInt32(1), lib.UInt32(0))
     out = {"record": record, "amount": amount, "x": list(x), "y": list(y)}
     if view.settings.order != "ray":
@@ -262,6 +276,17 @@ def _whole(view: View, a: dict) -> Compositor:
     return compositor
 
 
+def composited(view: View, seen: dict, finals: list) -> Compositor:
+    """The compositor of a frame: as it is after `forward`.
+
+    Args:
+        view, seen, finals: Those of the `Frame`; no other arrays are read.
+    """
+    compositor = _whole(view, seen)
+    compositor.finals = [[(compositor.parts[0], finals)]]
+    return compositor
+
+
 def _hits(view: View, a: dict) -> tuple[Float, UInt32, UInt32]:
     """Words of all hits, and where the row of each pixel starts and how many it has."""
     seen: Any = _compositor(view, a).traversal
@@ -285,21 +310,18 @@ def _composited(view: View, a: dict) -> tuple[dict, list]:
 
 def _gradients(view: View, a: dict) -> dict:
     """Gradients by inputs."""
-    compositor = _whole(view, a["seen"])
-    compositor.finals = [[(compositor.parts[0], a["finals"])]]
-    return _unprojected(view, a | {"slopes": compositor.adjoint(a["g"])["record"]})
+    slopes = composited(view, a["seen"], a["finals"]).adjoint(a["g"])["record"]
+    return _unprojected(view, a | {"slopes": slopes})
 
 
 def _unprojected(view: View, a: dict) -> dict:
     """Gradients by inputs from those by the columns of the records."""
-    lib = runtime.dr_types()
-    size = view.width, view.height
     with dr.resume_grad():
         p = dict(a["inputs"])
         ends = {name: type(p[name])(p[name]) for name in view.needed}
         dr.enable_grad(ends)
         p |= ends
-        found = projection.project_screen(lib, p, p["w2c"], a["pinhole"], view.settings, *size, view.coefficients)
+        found = projected(view, p, a["pinhole"])
         reached = [(x, slope) for x, slope in zip(found.record, a["slopes"], strict=False) if dr.grad_enabled(x)]
         for x, slope in reached:
             dr.set_grad(x, slope)
