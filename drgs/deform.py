@@ -185,14 +185,17 @@ class DeformationField(torch.nn.Module):
         leaves = [*mlp.values(), *(x.requires_grad_() for x in found)]
         with torch.enable_grad():
             deltas = _deltas(mlp, product(found))
-        total = {name: torch.zeros_like(x, requires_grad=False) for name, x in weights.items()}
+        squared = [torch.zeros_like(x, requires_grad=False) for x in mlp.values()]
+        by_nodes = [own.squares(torch.zeros_like(x)) for own, x in zip(corners, found, strict=True)]
         for some in zip(*slopes, strict=True):  # one after another: together, copies would cost more than they spare
             by_leaf = torch.autograd.grad(deltas, leaves, some, retain_graph=True)
-            for name, x in zip(mlp, by_leaf, strict=False):
-                total[name] += x.square()
-            for name, own, x in zip(planes, corners, by_leaf[len(mlp) :], strict=True):
-                own.add_squares(total[name], x)
-        return total
+            squared = [x.add_(slope.square()) for x, slope in zip(squared, by_leaf, strict=False)]
+            for k, own in enumerate(corners):
+                by_nodes[k] += own.squares(by_leaf[len(mlp) + k])
+        total = dict(zip(mlp, squared, strict=True))
+        for (name, plane), own, x in zip(planes.items(), corners, by_nodes, strict=True):
+            total[name] = own.spread(x, plane)
+        return {name: total[name] for name in weights}
 
     def _places(self, means: torch.Tensor, origin: ArrayLike | None) -> torch.Tensor:
         """Means as parts of the way from the lower to the upper bound: float64 differences of what is far from 0."""

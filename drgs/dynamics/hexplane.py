@@ -128,16 +128,19 @@ class Corners:
         places = order // self.nodes.shape[1]
         return used, places, counts.cumsum(0) - counts, self.weights.flatten()[order]
 
-    def add_squares(self, total: torch.Tensor, slopes: torch.Tensor) -> None:
-        """Add squares of slopes by the plane to a total of its shape.
+    def squares(self, slopes: torch.Tensor) -> torch.Tensor:
+        """(U, C) squares of slopes by the U nodes that are read; by all others they are 0.
 
         Args:
             slopes: (N, C) by what was read.
         """
-        # Places read few of the nodes: the others' slopes are 0.
-        used, places, starts, weights = self._readers
-        by_node = torch.nn.functional.embedding_bag(places, slopes, starts, mode="sum", per_sample_weights=weights)
-        total.flatten(0, 1).index_add_(0, used, by_node.square_())
+        _, places, starts, weights = self._readers
+        bag = torch.nn.functional.embedding_bag
+        return bag(places, slopes, starts, mode="sum", per_sample_weights=weights).square_()
+
+    def spread(self, squares: torch.Tensor, plane: torch.Tensor) -> torch.Tensor:
+        """Squares by the nodes that are read, (U, C), in a tensor of the shape of the plane, 0 elsewhere."""
+        return torch.zeros_like(plane).flatten(0, 1).index_copy_(0, self._readers[0], squares).view_as(plane)
 
 
 def corners_of(planes: Sequence[torch.Tensor], places: torch.Tensor, time: torch.Tensor) -> list[Corners]:
