@@ -253,7 +253,7 @@ def summed(what: SummedOver, a: dict) -> Float:
     return sink.buffer
 
 
-def light(what: tuple[int, tuple[float, ...]], a: dict) -> Float:
+def sh_squares(what: tuple[int, tuple[float, ...]], a: dict) -> Float:
     """(N K 3) float64 squares of the derivatives by SH: those of the basis, times sum w^2 and weights of the channels.
 
     Args:

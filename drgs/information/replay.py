@@ -10,7 +10,7 @@ import drjit as dr
 import torch
 
 from drgs.information.groups import GROUPS, Information
-from drgs.information.hits import Hits, SummedOver, Walk, light, moved_records, shaped, shapes, summed, tangents_of
+from drgs.information.hits import Hits, SummedOver, Walk, moved_records, sh_squares, shaped, shapes, summed, tangents_of
 from drgs.information.jacobian import (
     GEOMETRY,
     BlockSums,
@@ -280,7 +280,7 @@ class Replay:
             "lit": self.shapes["lit"],
         }
         what = self.call.coefficients, tuple(weights.tolist())
-        found = light(what, arrays) if self.frame is None else replay(light, what, arrays)
+        found = sh_squares(what, arrays) if self.frame is None else replay(sh_squares, what, arrays)
         return found.torch().view(self.count, -1, 3)
 
     @property
