@@ -166,11 +166,15 @@ class Replay:
         """(N, width) float64, where kernels run: what `sums_of(first)` sums up over all walks, `first` or not; their
         hits are added to `more_sums`, too.
         """
-        total = torch.zeros(self.count, width, dtype=torch.float64, device=self.call.home)
+        total: torch.Tensor | None = None
         for buffer in self._buffers(sums_of, weights, more_sums):
-            # A buffer is float32, which one traversal fills; what several add up to is float64.
-            sums = buffer.torch().double().reshape(self.count, -1)[:, :width]
-            total[:, : sums.shape[1]] += sums
+            # A buffer is float32, which one traversal fills; what several add up to is float64. The first is widest.
+            sums = buffer.torch().reshape(self.count, -1)[:, :width].double()
+            if total is None:
+                total = sums
+            else:
+                total[:, : sums.shape[1]] += sums
+        assert total is not None  # a view has a walk
         return total
 
     def _buffers(
@@ -221,7 +225,8 @@ class Replay:
         scale = torch.tensor([1.0] * 3 if fisherrf else weights, dtype=torch.float64, device=self.call.home)
         for name, group in groups.items():
             # On a card all sums are made there: the CPU would take many times as long as the kernels.
-            result[name] = group.collect(sums[:, group.entries], self, scale).cpu()
+            own = sums[:, group.entries[0] : group.entries[-1] + 1].contiguous()
+            result[name] = group.collect(own, self, scale).cpu()
             if fisherrf:
                 result[name] = result[name] / group.fisherrf(self.call.inputs)
         return result
