@@ -12,7 +12,10 @@ __all__ = ["in_turns", "interleaved", "processor_seconds"]
 
 
 def in_turns(
-    runs: Mapping[str, Callable[[], object]], turns: int, clock: Callable[[], float] = time.perf_counter
+    runs: Mapping[str, Callable[[], object]],
+    turns: int,
+    clock: Callable[[], float] = time.perf_counter,
+    warm: bool = False,
 ) -> dict[str, list[float]]:
     """Seconds of each run in each turn, after a turn that compiles.
 
@@ -20,10 +23,14 @@ def in_turns(
         runs: Name -> what is timed.
         turns: Number of turns that count.
         clock: Clock in seconds; `time.process_time` is stretched little by what else runs on the machine.
+        warm: Each is run once before each time that counts, so that it does not pay for what its peer has left: a frame
+            after one of `volprim_rf_basic` takes twice its time.
     """
     seconds: dict[str, list[float]] = {name: [] for name in runs}
     for turn in range(turns + 1):
         for name, run in runs.items():
+            if warm and turn:
+                run()
             start = clock()
             run()
             if turn:
@@ -32,10 +39,13 @@ def in_turns(
 
 
 def interleaved(
-    runs: Mapping[str, Callable[[], object]], turns: int, clock: Callable[[], float] = time.perf_counter
+    runs: Mapping[str, Callable[[], object]],
+    turns: int,
+    clock: Callable[[], float] = time.perf_counter,
+    warm: bool = False,
 ) -> dict[str, float]:
     """Median seconds of each run, taking turns (`in_turns`)."""
-    return {name: statistics.median(x) for name, x in in_turns(runs, turns, clock).items()}
+    return {name: statistics.median(x) for name, x in in_turns(runs, turns, clock, warm).items()}
 
 
 def processor_seconds(pid: int) -> float:

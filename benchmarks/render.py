@@ -127,6 +127,7 @@ def headline(turns: int) -> dict:
             "fast on bvh, order ray, forward": forward(g, cam, fast.replace(order="ray", traversal="bvh")),
         },
         turns,
+        warm=True,
     )
 
 
