@@ -42,11 +42,11 @@ SIZES = ("200:32x24",)
 CARD_SIZES = ("100000:512x512", "1000000:1920x1080", "200:32x24")
 PRESETS = ("fast", "gsplat", "exact")
 SHOWN = ("fast",)  # on the page
-KINDS = ("forward", "step")
+KINDS = ("forward", "step", "diagonal")
 
 
 def frames(g: drgs.Gaussians, camera: drgs.Camera, preset: str) -> dict[str, Callable[[], list[torch.Tensor]]]:
-    """A frame without and with its gradients, which are read back."""
+    """A frame without and with its gradients, which are read back, and the diagonal of its Fisher information."""
     settings = drgs.RenderSettings.preset(preset)
 
     def forward() -> list[torch.Tensor]:
@@ -62,7 +62,10 @@ def frames(g: drgs.Gaussians, camera: drgs.Camera, preset: str) -> dict[str, Cal
         own.means.grad.sum().item()
         return [rgb.detach(), *[x.grad for x in own.parameters().values()]]
 
-    return {"forward": forward, "step": step}
+    def diagonal() -> list[torch.Tensor]:
+        return list(drgs.fisher.diagonal(g, camera, settings).values())
+
+    return {"forward": forward, "step": step, "diagonal": diagonal}
 
 
 def traced(frame: Callable[[], list[torch.Tensor]]) -> Callable[[], list[torch.Tensor]]:
@@ -159,7 +162,7 @@ def fit_steps(scene: str, trained: str, steps: int) -> dict:
 def section() -> str:
     """The part of docs/benchmarks.md, from the rows of processors: the last one of each frame, and of each fit."""
     rows = {(r["kind"], r.get("gaussians"), r.get("preset")): r for r in read_rows(ROWS) if not r.get("card")}
-    named = {"step": "with gradients", "fit": "a step of a fit"}
+    named = {"step": "with gradients", "diagonal": "its Fisher diagonal", "fit": "a step of a fit"}
     shown = {key: r for key, r in rows.items() if key[0] in named and key[2] in SHOWN}
     found = []
     for (kind, count, preset), r in shown.items():
@@ -169,9 +172,9 @@ def section() -> str:
         found.append(f"{told}: {recorded:.1f} instead of {traced:.1f}")
     made = list(shown.values())[-1]["ran"]
     return paragraph(
-        "Images of a pinhole on tiles, and their gradients, are launched as they were recorded at the first frame of "
-        "the same sizes and settings (`drgs/tracing/recordings.py`), with the same bits on LLVM; all else is traced by "
-        f"Python each time. Milliseconds of the processor on a busy machine: {'; '.join(found)} (`python "
+        "Images of a pinhole on tiles, their gradients and their Fisher information are launched as they were recorded "
+        "at the first frame of the same sizes and settings (`drgs/tracing/recordings.py`), with the same bits on LLVM; "
+        f"all else is traced by Python each time. Milliseconds of the processor: {'; '.join(found)} (`python "
         f"benchmarks/recordings.py`, {made['machine']}, {made['date']}, commit {made['commit']})."
     )
 
@@ -211,7 +214,7 @@ def main() -> None:
             ours = frames(g, camera, preset)
             for kind in KINDS:
                 runs = {"recorded": ours[kind], "traced": traced(ours[kind])}
-                own = {"gsplat's kernels": theirs[kind]} if theirs else {}
+                own = {"gsplat's kernels": theirs[kind]} if kind in theirs else {}
                 off = apart(runs["recorded"](), runs["traced"]())
                 off = [max(pair) for pair in zip(off, apart(runs["recorded"](), runs["traced"]()), strict=True)]
                 times = measured(runs | own, args.turns if int(count) < 500_000 else max(args.turns // 4, 5))
