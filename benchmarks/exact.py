@@ -154,10 +154,10 @@ def task_peers(name: str, folder: Path, turns: int) -> dict:
         "fast": forward(g, cam, Preset("fast")),
         "exact": forward(g, cam, Preset("exact")),
     }
-    result = {"rest": interleaved(runs, turns)}
+    result = {"rest": interleaved(runs, turns, warm=True)}
     load = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
     try:
-        result["busy"] = interleaved(runs, turns)
+        result["busy"] = interleaved(runs, turns, warm=True)
     finally:
         for process in load:
             process.kill()
