@@ -262,7 +262,7 @@ def report(result: dict) -> str:
     theirs, ours = ([slow[f"{name}, {kind}"] for kind in ("forward", "both")] for name in TORCH_ROWS)
     parts = [
         f"On one thread `exact` takes {cost[0]} times as long as `fast` for an image, {cost[1]} times with gradients "
-        f"and {cost[2]} times for a Fisher diagonal. {result.get('note', '')}",
+        f"and {cost[2]} times for a Fisher diagonal.",
         f"`python benchmarks/exact.py`, {result['machine']}, {result['date']}, commit {result['commit']}{again}: "
         f"views of {', '.join(one)}, without depth ([by scene](../benchmarks/exact.json)). Fits have 1,000 steps at "
         "10,800 pixels.",

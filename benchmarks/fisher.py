@@ -204,8 +204,7 @@ def report(r: dict) -> str:
         "backward. " + " ".join(r.get("note", [])),
         markdown_table(["", *(f"`{row['preset']}`, SH {row['sh']}" for row in r["headline"])], cells),
         f"**Tangents**, forward mode, `fast`: one takes {1e3 * t['1']:.0f} ms, the 6 of the pose "
-        f"{1e3 * t['pose']:.0f}. **Growth** of the diagonal, `fast`, SH 0, in ms: {', '.join(growth)} Gaussians; "
-        "nearly in proportion to the number of views.",
+        f"{1e3 * t['pose']:.0f}. **Growth** of the diagonal, `fast`, SH 0, in ms: {', '.join(growth)} Gaussians.",
         *([picks_line(r["picks"])] if "picks" in r else []),
     ]
     return "\n\n".join(part if part.startswith("|") else paragraph(part) for part in parts)
