@@ -5,11 +5,10 @@
     python examples/plan_views.py room --save flight.safetensors               a file before every photograph
     python examples/plan_views.py room --save flight.safetensors --resume      goes on from it, also after a crash
 
-A robot stands at one of the data set's cameras. It may go to any other, at a cost of one for each meter, and to read
-the photograph of a place is to take it there. After each one the model is fitted for a while, and what it shows of the
-views that are held out is measured. `--policy random` flies without a plan, `--policy order` along the data set's own
-trajectory, one frame of a sequence at a time. Nothing here is about ROS: a node would call `observe` where images come
-in, from one thread, and `next` where the robot asks, from another.
+A robot stands at one of the data set's cameras, and may go to any other: a meter costs one, and to read the photograph
+of a place is to take it there. `--policy random` flies without a plan, `--policy order` along the data set's own
+trajectory. Nothing here is about ROS: a node would call `observe` where images come in, from one thread, and `next`
+where the robot asks, from another.
 """
 
 from __future__ import annotations
@@ -22,9 +21,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 
 import drgs
 from drgs.cameras.sizes import at_most
+from drgs.fitting import losses
 
 CANDIDATES = 30  # places, at most, that are compared at a time
 
@@ -47,71 +48,50 @@ def psnr(scene: drgs.Gaussians, views: Sequence[drgs.View], pixels: int) -> floa
     found = []
     for view in views:
         camera = at_most(view.camera.undistorted(), pixels)
-        shown = drgs.render(scene, camera, drgs.RenderSettings.preset("fast")).rgb.clamp(0, 1).numpy()
-        error = ((shown - view.image(camera.width, camera.height)) ** 2).mean()
-        found.append(-10 * np.log10(error))
+        shown = drgs.render(scene, camera, drgs.RenderSettings.preset("fast")).rgb.clamp(0, 1)
+        found.append(losses.psnr(shown, torch.from_numpy(view.image(camera.width, camera.height))))
     return float(np.mean(found))
 
 
-def fly(
-    dataset: drgs.Dataset,
-    policy: str,
-    photographs: int,
-    seconds: float | None,
-    steps: int,
-    seed: int,
-    file: Path | None = None,
-    resume: bool = False,
-) -> list[float]:
-    """PSNR of the held-out views after each photograph, dB."""
-    draw = random.Random(seed)
+def fly(options: argparse.Namespace) -> None:
+    """Take photographs, and say after each how well the model shows the views that are held out."""
+    dataset = drgs.load_data(options.data)
     train, held_out = dataset.split()
     views = {view.name: view for view in train}
     places = {view.name: dataclasses.replace(view.camera.undistorted(), name=view.name) for view in train}
     print(f"{len(train)} places; the first photograph takes some seconds, for kernels are compiled", flush=True)
-    if resume:
-        assert file is not None, "--resume needs --save"
-        planner = drgs.Planner.load(file)
-        before = planner.notes  # what this program knows beside the planner
-        version, numbers, gauss = before["draw"]
-        draw.setstate((version, tuple(numbers), gauss))
-        curve, left, here = before["curve"], [places[name] for name in before["left"]], places[before["here"]]
-        begin = before["number"]
-    else:
-        planner = drgs.Planner()
-        curve, left, begin = [], list(places.values()), 0
-        here = left[0 if policy == "order" else draw.randrange(len(left))]
-    for number in range(begin, photographs):
-        if file is not None and number > begin:
-            names = [camera.name for camera in left]
-            planner.save(
-                file, {"number": number, "here": here.name, "left": names, "curve": curve, "draw": draw.getstate()}
-            )
-        left = [camera for camera in left if camera.name != here.name]
-        view = views[here.name]
-        planner.observe(view.image(), here, depth_of(dataset, view))
-        planner.fit(steps=steps)
+    planner, draw = drgs.Planner(), random.Random(options.seed)
+    begin, left = 0, list(places)
+    here = left[0 if options.policy == "order" else draw.randrange(len(left))]
+    if options.resume:
+        planner = drgs.Planner.load(options.save)
+        begin, here, left, state = (planner.notes[name] for name in ("number", "here", "left", "draw"))
+        draw.setstate((state[0], tuple(state[1]), state[2]))
+    for number in range(begin, options.photographs):
+        if options.save and number > begin:  # with what this program knows beside the planner
+            planner.save(options.save, {"number": number, "here": here, "left": left, "draw": draw.getstate()})
+        left.remove(here)
+        planner.observe(views[here].image(), places[here], depth_of(dataset, views[here]))
+        planner.fit(steps=options.steps)
         if planner.scene is None:  # two photographs are needed where none has depth
             here = left[0]
             continue
-        curve.append(psnr(planner.scene, held_out[:12], 12_000))
-        told = ""
-        if policy == "plan":
-            near = sorted(draw.sample(left, min(CANDIDATES, len(left))), key=lambda camera: camera.name)
-            planner.scores(near, cost=distance, seconds=seconds)
+        quality, told = psnr(planner.scene, held_out[:12], 12_000), ""
+        if options.policy == "plan":
+            near = [places[name] for name in sorted(draw.sample(left, min(CANDIDATES, len(left))))]
+            planner.scores(near, cost=distance, seconds=options.seconds)
             plan = planner.next(seconds=0)  # by what `scores` has just asked
-            chosen = near[plan.picks[0].index]
-            told = f", {plan.seconds:.1f} s, {distance(here, chosen):.1f} away, changed {plan.changed:.2f}"
+            pick = plan.picks[0]
+            there = pick.camera.name
+            told = f", {plan.seconds:.1f} s, {pick.cost:.1f} away, changed {plan.changed:.2f}"
         else:
-            chosen = left[0] if policy == "order" else draw.choice(left)
+            there = left[0] if options.policy == "order" else draw.choice(left)
         count = len(planner.scene)
-        print(f"{number + 1}: {here.name}, {count} Gaussians, {curve[-1]:.2f} dB; next {chosen.name}{told}", flush=True)
-        here = chosen
-    return curve
+        print(f"{number + 1}: {here}, {count} Gaussians, {quality:.2f} dB; next {there}{told}", flush=True)
+        here = there
 
 
-def main() -> None:
-    """The program."""
+if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Fly a simulated camera through a data set.")
     parser.add_argument("data", help="a data set, with depth or without")
     parser.add_argument("--policy", choices=("plan", "random", "order"), default="plan")
@@ -121,12 +101,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--save", type=Path, help="a file that is written before each photograph but the first")
     parser.add_argument("--resume", action="store_true", help="go on from that file; repeat the other options")
-    args = parser.parse_args()
-    if args.resume and (args.save is None or not args.save.is_file()):
+    options = parser.parse_args()
+    if options.resume and (options.save is None or not options.save.is_file()):
         parser.error("--resume must have the file of --save to go on from, there is none; leave --resume out")
-    how = args.policy, args.photographs, args.seconds, args.steps, args.seed
-    fly(drgs.load_data(args.data), *how, args.save, args.resume)
-
-
-if __name__ == "__main__":
-    main()
+    fly(options)
