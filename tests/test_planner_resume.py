@@ -20,7 +20,8 @@ from test_planner import config, photograph, planner_of
 import drgs
 from drgs.cameras import orbit
 from drgs.files import load_state, save_state
-from drgs.planner import Planner, _digest
+from drgs.planner import Planner
+from drgs.planner.file import digest_of
 from drgs.select import Scoring
 from drgs.selection.cache import named_by
 
@@ -116,7 +117,7 @@ def test_files_of_before(world, tmp_path):
     planner.save(tmp_path / "p.safetensors")
     tensors, header = load_state(tmp_path / "p.safetensors")
     header["answered_in"] = header.pop("answer_shares")
-    header["digest"] = _digest(tensors, header := {x: y for x, y in header.items() if x not in ("kind", "schema")})
+    header["digest"] = digest_of(tensors, header := {x: y for x, y in header.items() if x not in ("kind", "schema")})
     save_state(tmp_path / "p.safetensors", tensors, {"kind": "planner", **header})
     latest = planner._answer_share.latest
     assert 0.25 in latest
@@ -280,8 +281,6 @@ def test_damaged_files(saved, tmp_path):
 
 def test_values_that_cannot_be(saved, tmp_path):
     """Also where the digest fits: somebody who writes such a file gets one line, too."""
-    from drgs.planner import _digest
-
     path = tmp_path / "p.safetensors"
     tensors, header = load_state(saved)
     header.pop("schema")
@@ -290,7 +289,7 @@ def test_values_that_cannot_be(saved, tmp_path):
     def written(change):
         own, head = dict(tensors), json.loads(json.dumps(header))
         change(own, head)
-        save_state(path, own, {"kind": kind, **head, "digest": _digest(own, head)})
+        save_state(path, own, {"kind": kind, **head, "digest": digest_of(own, head)})
 
     written(lambda own, head: None)
     assert Planner.load(path).views == ["orbit_0000", "orbit_0001"]

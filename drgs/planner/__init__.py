@@ -20,12 +20,9 @@ and `fit` from one while another computes scores.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
-import hashlib
 import itertools
-import json
 import math
 import numbers
 import os
@@ -33,8 +30,7 @@ import statistics
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -42,17 +38,14 @@ import torch
 
 from drgs import runtime
 from drgs.cameras import Camera, camera_list
-from drgs.cameras.checks import as_numpy
 from drgs.cameras.sizes import at_most
-from drgs.checks.arguments import ArgumentError, check_path, kind_of, must_be
+from drgs.checks.arguments import ArgumentError, kind_of, must_be
 from drgs.ellipsoids import Gaussians
 from drgs.fitting.config import FitConfig
 from drgs.fitting.online import OnlineFit
 from drgs.gain import Information
-from drgs.information.region import NothingOfRegion, Region, RegionText
-from drgs.io import atomic
-from drgs.io.checkpoint import load_state, save_state, state_header
-from drgs.io.json_files import check_json, parse_json
+from drgs.information.region import NothingOfRegion, Region
+from drgs.planner.file import camera_json, camera_of, read_file, region_of, scene_of, scene_tensors, write_file
 from drgs.select import Scoring, select
 from drgs.selection.cache import Cache, NotCached, named_by
 from drgs.selection.informed import compute_candidates
@@ -70,43 +63,6 @@ _RNG = torch.Generator()  # a pool must have one; policies that score by informa
 _DURATIONS_KEPT = 3  # latest durations whose median is what the next one takes: the fewest that one compilation leaves
 _ANSWER_SHARE = 0.5  # duration of an answer, in those of its views, before one was measured: 0.2 to 0.5 on `office`
 _REGION_SHARE = 1.2  # the same of a region, whose information is computed in the answer: 1.1 to 1.4
-
-_ADVICE = "restore the file, or begin anew"
-_KIND = "planner"
-_CAMERA = {
-    "K": [[float]],
-    "w2c": [[float]],
-    "w2c_end": (None, [[float]]),
-    "width": int,
-    "height": int,
-    "model": str,
-    "distortion": [float],
-    "name": str,
-    "time": (None, float),
-    "shutter": str,
-}
-_HEADER = {
-    "digest": str,
-    "version": str,
-    "info_pixels": int,
-    "max_views": int,
-    "look": float,
-    "bound": float,
-    "max_bytes": int,
-    "counted": int,
-    "known": [_CAMERA],
-    "here": (None, _CAMERA),
-    "pool": [_CAMERA],
-    "costs": (None, bool, [float]),
-    "scoring": str,
-    "asked_in": [float],
-    "answer_shares": [float],
-    "origin": (None, [float]),
-    "fit": dict,
-    "photographs": [_CAMERA],
-    "cache": dict,
-    "expected": [_CAMERA],
-}
 
 
 def default_config() -> FitConfig:
@@ -395,11 +351,11 @@ class Planner:
             ValueError: If there is something else of that name, or notes are no JSON.
             OSError: If the file cannot be written.
         """
-        records = lambda cameras: [_camera_json(camera) for camera in cameras]  # noqa: E731
+        records = lambda cameras: [camera_json(camera) for camera in cameras]  # noqa: E731
         with self._answer_lock, self._fit_lock:
             fit, fit_header, photographs = self._fit.state()
             answers, cache_header, expected = self._cache.state()
-            own, origin = _scene_tensors(self._callers_scene)
+            own, origin = scene_tensors(self._callers_scene)
             costs = self._cost if self._cost is None or callable(self._cost) else [float(x) for x in self._cost]
             header = {
                 "version": runtime.version(),
@@ -410,7 +366,7 @@ class Planner:
                 "max_bytes": self._cache.max_bytes,
                 "counted": self._num_observed,
                 "known": records(self._known),
-                "here": None if self._last_camera is None else _camera_json(self._last_camera),
+                "here": None if self._last_camera is None else camera_json(self._last_camera),
                 "pool": records(self._pool),
                 "costs": True if callable(costs) else costs,
                 "scoring": named_by(self._scoring) or "",
@@ -424,7 +380,7 @@ class Planner:
                 "notes": notes,
                 **({} if self._region is None else {"region": self._region.text}),
             }
-        _write_file(path, {**fit, **answers, **own}, header)
+        write_file(path, {**fit, **answers, **own}, header)
 
     @classmethod
     def load(cls, path: str | os.PathLike, *, scoring: Scoring | None = None, region: Region | None = None) -> Planner:
@@ -441,8 +397,8 @@ class Planner:
             FileNotFoundError: If there is no such file.
             ValueError: If it is none that a planner wrote, or damaged, or the scoring or the region is another one.
         """
-        where, tensors, header = _read_file(path)
-        region = _region_of(where, header.get("region"), region)
+        where, tensors, header = read_file(path)
+        region = region_of(where, header.get("region"), region)
         names = ("info_pixels", "max_views", "bound", "look", "max_bytes")
         try:
             planner = cls(scoring=scoring, region=region, **{name: header[name] for name in names})
@@ -453,13 +409,13 @@ class Planner:
                 f"{where}: scoring must be that of the planner that was saved, is another one; give it to Planner.load"
             )
         cameras = lambda name, pixels=math.inf: [  # noqa: E731
-            _camera_of(where, one, pixels) for one in header[name]
+            camera_of(where, one, pixels) for one in header[name]
         ]
         planner._fit = OnlineFit.from_state(tensors, header["fit"], cameras("photographs"), where)
         if header["origin"] is not None:
-            planner._callers_scene = _scene_of(where, tensors, header["origin"])
+            planner._callers_scene = scene_of(where, tensors, header["origin"])
         planner._known, planner._pool = (cameras(name, planner.info_pixels) for name in ("known", "pool"))
-        planner._last_camera = None if header["here"] is None else _camera_of(where, header["here"])
+        planner._last_camera = None if header["here"] is None else camera_of(where, header["here"])
         planner._num_observed = header["counted"]
         costs = header["costs"]
         planner._cost = _unknown_cost if isinstance(costs, bool) else costs
@@ -694,18 +650,6 @@ class _Typical:
         return statistics.median_low(self.latest) if self.latest else self.first
 
 
-def _region_of(where: str, saved: Any, given: Region | None) -> Region | None:
-    """The region of a planner that was saved: the one that is given, or one that its text describes."""
-    if given is None and isinstance(saved, str) and saved.partition(":")[0] in ("box", "sphere"):
-        return RegionText.of(saved, where).region(lambda folder: ([], []), lambda: (None, None))
-    if saved != (None if given is None else given.text):
-        raise ValueError(
-            f"{where}: region must be that of the planner that was saved, {saved}, got "
-            f"{'none' if given is None else given.text}; give it to Planner.load"
-        )
-    return given
-
-
 def _unknown_cost(here: Camera, there: Camera) -> float:
     """Stands for costs that were a function when a planner was saved."""
     raise ValueError("Planner.next: costs were a function, which no file holds; give it to Planner.scores again")
@@ -739,140 +683,3 @@ def _sized_as(name: str, x: np.ndarray | None, shape: tuple[int, ...]) -> np.nda
             f"Planner.observe: {name} must be an array of shape {shape}, its camera's, got {got}; resize it"
         )
     return x
-
-
-# ------------------------------------------------------------------------------------------------- file of a planner
-
-
-def _write_file(path: str | os.PathLike, tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> None:
-    """Write a planner's file; half-written files of killed processes beside it are removed.
-
-    Args:
-        path: The file, which this process alone writes.
-        tensors: What it holds.
-        header: What else it holds, JSON.
-    Raises:
-        ValueError: If there is something else of that name, or the header is no JSON.
-        OSError: If it cannot be written.
-    """
-    path = check_path("Planner.save", path)
-    if os.path.lexists(path) and not _is_planner_file(path):
-        raise ValueError(f"{path}: must not be replaced, is no planner's file that can be read; choose another name")
-    try:
-        header = parse_json(json.dumps(header, allow_nan=False), "Planner.save")  # as it will be read
-    except (TypeError, ValueError, RecursionError) as error:
-        raise ValueError(f"Planner.save: notes must be JSON, got what is none ({error}); leave it out") from None
-    if path.parent.is_dir():
-        for other in path.parent.iterdir():
-            if other.name.startswith(f".drgs.{path.name}.") and atomic.is_left_over(other.resolve()):
-                atomic.delete(other)
-    tensors = _without_shared_memory(tensors)
-    save_state(path, tensors, {"kind": _KIND, **header, "digest": _digest(tensors, header)})
-
-
-def _read_file(path: str | os.PathLike) -> tuple[Path, dict[str, torch.Tensor], dict[str, Any]]:
-    """The path, the tensors and the header of `_write_file`.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it is none that a planner has written, or damaged.
-    """
-    path = check_path("Planner.load", path)
-    tensors, header = load_state(path)
-    if header.pop("kind", None) != _KIND:
-        raise ValueError(f"{path}: must be what Planner.save has written, is a checkpoint of a fit; see drgs fit")
-    header.pop("schema")
-    known = {"answer_shares": header.get("answered_in"), **header}  # as older files call them
-    check_json(str(path), known, _HEADER, _ADVICE)
-    if _digest(tensors, header) != header["digest"]:
-        raise ValueError(f"{path}: must be as Planner.save has written it, has been changed since; {_ADVICE}")
-    return path, tensors, known
-
-
-def _camera_json(camera: Camera) -> dict[str, Any]:
-    """A camera in JSON, to the bit."""
-    pose = lambda x: np.asarray(as_numpy(x), np.float64).tolist()  # noqa: E731
-    return {
-        "K": camera.K.tolist(),
-        "w2c": pose(camera.w2c),
-        "w2c_end": None if camera.w2c_end is None else pose(camera.w2c_end),
-        **{name: getattr(camera, name) for name in ("width", "height", "model", "name", "time", "shutter")},
-        "distortion": list(camera.distortion),
-    }
-
-
-def _camera_of(where: Path, record: dict[str, Any], pixels: float = math.inf) -> Camera:
-    """The camera of a record that `_read_file` has checked.
-
-    Args:
-        where: The file, for messages.
-        record: From `_camera_json`.
-        pixels: Largest number of pixels of its image.
-    Raises:
-        ValueError: If there is no such camera.
-    """
-    fields = {name: record[name] for name in _CAMERA}
-    try:
-        for name in ("K", "w2c", "w2c_end"):
-            if fields[name] is not None:
-                fields[name] = np.array(fields[name], np.float64)
-        camera = Camera(**fields | {"distortion": tuple(fields["distortion"])})
-    except (ValueError, OverflowError) as error:
-        raise ValueError(f"{where}: {error}; {_ADVICE}") from None
-    if camera.width * camera.height > pixels:
-        raise ValueError(f"{where}: {camera.name!r} must have at most {pixels} pixels, has more; {_ADVICE}")
-    return camera
-
-
-def _scene_tensors(scene: Gaussians | None) -> tuple[dict[str, torch.Tensor], list[float] | None]:
-    """Tensors of a caller's own model and its origin; None where there is none."""
-    if scene is None:
-        return {}, None
-    return {f"scene.{name}": x for name, x in scene.parameters().items()}, np.asarray(scene.origin).tolist()
-
-
-def _scene_of(where: Path, tensors: Mapping[str, torch.Tensor], origin: list[float]) -> Gaussians:
-    """The inverse of `_scene_tensors`.
-
-    Raises:
-        ValueError: If it is no model.
-    """
-    fields: dict[str, Any] = {
-        name.removeprefix("scene."): x for name, x in tensors.items() if name.startswith("scene.")
-    }
-    try:
-        scene = Gaussians(**fields, origin=np.array(origin, np.float64))
-        scene.validate(str(where))
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{where}: {str(error).removeprefix(f'{where}: ')}; {_ADVICE}") from None
-    return scene
-
-
-def _is_planner_file(path: Path) -> bool:
-    """Whether a file, no link, says that a planner has written it."""
-    with contextlib.suppress(ValueError, OSError):
-        return not path.is_symlink() and state_header(path).get("kind") == _KIND
-    return False
-
-
-def _without_shared_memory(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """The tensors on the CPU, copied where two share memory, which safetensors refuses."""
-    seen: set[int] = set()
-    separate = {}
-    for name, x in tensors.items():
-        x = x.detach().cpu()  # a file holds values
-        place = x.untyped_storage().data_ptr()
-        separate[name] = x.clone() if place in seen else x
-        seen.add(place)
-    return separate
-
-
-def _digest(tensors: Mapping[str, torch.Tensor], header: Mapping[str, Any]) -> str:
-    """A hash of all tensors, and of the header but for the hash."""
-    text = json.dumps({key: x for key, x in header.items() if key != "digest"}, sort_keys=True)
-    digest = hashlib.blake2b(text.encode(), digest_size=16)
-    for name in sorted(tensors):
-        x = tensors[name].contiguous().numpy()
-        digest.update(f"{name} {x.dtype.str} {x.shape}".encode())
-        digest.update(x.data if x.size else b"")
-    return digest.hexdigest()
