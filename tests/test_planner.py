@@ -66,6 +66,15 @@ def test_answers_are_those_of_select(world):
     assert planner.views == ["c0", "c1", "c2"]
 
 
+def test_before_the_first_photograph(world):
+    """A caller's own model is enough: scores and picks of `select` without known views."""
+    g, _, candidates = world
+    planner = Planner(scene=g)
+    right = select(g, candidates, [], 1, scoring=FAST)
+    assert planner.scores(candidates).scores == pytest.approx(right.scores, rel=1e-6)
+    assert planner.next().picks[0].index == right.picks[0].index
+
+
 def test_what_has_changed_little_is_not_asked_again(world):
     """The answer says how far; a bound of 0 asks all anew, and is right."""
     g, known, candidates = world

@@ -516,15 +516,19 @@ class Planner:
         Returns:
             How many views.
         """
-        queues = []
+        bound = self._cache.bound
+        assert bound is not None  # a planner's cache has one
+        queues: list[tuple[float, list[Camera]]] = []
         there = 0  # views that have information
         for cameras in (known, self._pool):
-            changes = {i: self._cache.change(scene, camera) for i, camera in enumerate(cameras)}
-            there += sum(change < math.inf for change in changes.values())
-            stale = sorted((i for i in changes if changes[i] > self._cache.bound), key=lambda i: (-changes[i], -i))
-            queues.append(([cameras[i] for i in stale], len(cameras)))
-        queues = [queue for queue, _ in sorted(queues, key=lambda x: -len(x[0]) / x[1])]  # where more is left first
-        turns = [camera for pair in itertools.zip_longest(*queues) for camera in pair if camera is not None]
+            changes = [self._cache.change(scene, camera) for camera in cameras]
+            there += sum(change < math.inf for change in changes)
+            stale = [i for i, change in enumerate(changes) if change > bound]
+            stale.sort(key=lambda i: (-changes[i], -i))
+            queues.append((len(stale) / max(len(cameras), 1), [cameras[i] for i in stale]))
+        queues.sort(key=lambda x: -x[0])  # where more is left first
+        pairs = itertools.zip_longest(*(queue for _, queue in queues))
+        turns = [camera for pair in pairs for camera in pair if camera is not None]
         done = 0
         for camera in turns:
             began = time.monotonic()
