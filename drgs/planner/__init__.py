@@ -408,9 +408,10 @@ class Planner:
             raise ValueError(
                 f"{where}: scoring must be that of the planner that was saved, is another one; give it to Planner.load"
             )
-        cameras = lambda name, pixels=math.inf: [  # noqa: E731
-            camera_of(where, one, pixels) for one in header[name]
-        ]
+
+        def cameras(name: str, pixels: float = math.inf) -> list[Camera]:
+            return [camera_of(where, one, pixels) for one in header[name]]
+
         planner._fit = OnlineFit.from_state(tensors, header["fit"], cameras("photographs"), where)
         if header["origin"] is not None:
             planner._callers_scene = scene_of(where, tensors, header["origin"])
@@ -457,7 +458,9 @@ class Planner:
         def coverage(camera: Camera) -> Information:
             if self._cache.image_weights(scene, camera) is None:
                 self._evaluate(scene, camera)
-            return {"coverage": self._cache.image_weights(scene, camera)}
+            weights = self._cache.image_weights(scene, camera)
+            assert weights is not None  # computed by now
+            return {"coverage": weights}
 
         return coverage
 

@@ -195,10 +195,10 @@ def digest_of(tensors: Mapping[str, torch.Tensor], header: Mapping[str, Any]) ->
     return digest.hexdigest()
 
 
-def region_of(where: str, saved: Any, given: Region | None) -> Region | None:
+def region_of(where: Path, saved: Any, given: Region | None) -> Region | None:
     """The region of a planner that was saved: the one that is given, or one that its text describes."""
     if given is None and isinstance(saved, str) and saved.partition(":")[0] in ("box", "sphere"):
-        return RegionText.of(saved, where).region(lambda folder: ([], []), lambda: (None, None))
+        return RegionText.of(saved, str(where)).region(lambda folder: ([], []), lambda: (None, None))
     if saved != (None if given is None else given.text):
         raise ValueError(
             f"{where}: region must be that of the planner that was saved, {saved}, got "
