@@ -21,8 +21,9 @@ from drgs import cli, fisher, reference
 from drgs.cameras import c2w_to_opengl, orbit
 from drgs.data.camera_lists import load_cameras_json
 from drgs.files import Run, load_state
-from drgs.fitting.components.exposure import ExposureComponent, ExposureEstimate, exposure_network
+from drgs.fitting.components.exposure import ExposureComponent, exposure_network
 from drgs.fitting.components.poses import CAMERAS, Poses, pose_network
+from drgs.fitting.exposures import ExposureEstimate
 from drgs.fitting.frames import Frame
 from drgs.fitting.networks import Network
 from drgs.fitting.records import fit_record

@@ -15,8 +15,9 @@ from drgs.cameras import orbit
 from drgs.data import load
 from drgs.files import load_state
 from drgs.fitting.components import exposure as exposures
-from drgs.fitting.components.exposure import Exposure, Meter, estimate_exposure, exposure_network
+from drgs.fitting.components.exposure import Exposure, Meter, exposure_network
 from drgs.fitting.evaluation import evaluate_run
+from drgs.fitting.exposures import estimate_exposure
 from drgs.fitting.frames import Frame
 from drgs.fitting.records import fit_record
 from drgs.fitting.resume import lock_run
@@ -240,7 +241,7 @@ def test_held_out_views_are_metered_in_fits_and_measured_again(tmp_path, monkeyp
     """What a fit with gains measures of its held-out views, `drgs eval` finds again, in every renderer; without the
     meter it is something else.
     """
-    monkeypatch.setattr(exposures, "_LEAST_LOWERED", -math.inf)
+    monkeypatch.setattr(exposures, "LEAST_LOWERED", -math.inf)
     write_photographs(tmp_path / "data", GAINS)
     settings = config(max_steps=2, exposure="points", test_every=9)
     result = fit(load(tmp_path / "data", test_every=9), tmp_path / "run", settings)
@@ -250,7 +251,7 @@ def test_held_out_views_are_metered_in_fits_and_measured_again(tmp_path, monkeyp
         assert first["mean"]["psnr"] == pytest.approx(again["mean"]["psnr"], abs=1e-4)
         rows = [[row["mean"]["psnr"] for row in one["renderers"]["rows"]] for one in (first, again)]
         assert rows[0] == pytest.approx(rows[1], abs=1e-4)
-        monkeypatch.setattr(exposures, "_LEAST_LOWERED", math.inf)
+        monkeypatch.setattr(exposures, "LEAST_LOWERED", math.inf)
         assert abs(evaluate_run(result.run, output)["mean"]["psnr"] - first["mean"]["psnr"]) > 0.01
 
 
