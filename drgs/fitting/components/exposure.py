@@ -37,10 +37,13 @@ if TYPE_CHECKING:
     from drgs.fitting.config import ExposureUse, FitConfig
     from drgs.settings import RenderSettings
 
+_Points = tuple[np.ndarray, np.ndarray | None]  # (P, 3), and which of V photographs show which, (V, P) bool
+
 NETWORK = "exposure"
 """Name of the gains in a checkpoint."""
 
-_FIRST_OBSERVATIONS = 250_000  # of them where nobody has asked for gains: 1.5 s; a gain still has hundreds of points
+# Photographs times points of the look that nobody has asked for: 1.5 s; a gain still has hundreds of points.
+_FIRST_OBSERVATIONS = 250_000
 _RATE = 1e-3  # learning rate of natural log gains: a factor of e in 1,000 steps; chosen
 _METERED = 48  # photographs that are rendered to find how the camera exposes; bounds seconds
 _METERED_PIXELS = 3_000  # of such a rendering, of which nothing but the mean is used; chosen
@@ -282,20 +285,10 @@ class ExposureComponent(Component):
         setup.config = fit.config = fit.config.replace(exposure=use)
         if use == "off":
             return
-        assert setup.points is not None  # initial ones are there
-        points, shown = compared or (setup.points, None)
-        # A trial takes photographs that are there and stand still, and points of which it is known who shows them.
-        is_tried = use == "auto" and compared is not None and not setup.is_active
         with Bar("exposure") as bar:
-            estimate = estimate_exposure(fit.frames, points, fit.config.seed, shown)
-            is_on = use != "auto" or (estimate.is_sound if is_tried else estimate.is_clear)
-            if is_tried and is_on:
-                estimate = estimate.confirmed()
-                gained = _trial(fit, setup.views, estimate)
-                estimate, is_on = dataclasses.replace(estimate, gained=gained), gained > 0
-            effect = "each has its own" if is_on else "off, all have the same"
+            estimate, is_on = _decided(fit, setup, compared)
             now = " for now" if setup.is_active and use == "auto" else ""
-            bar.note(f"exposure: {estimate.words()}; {effect}{now}")
+            bar.note(f"exposure: {estimate.words()}; {_effect(is_on)}{now}")
         self.evidence = estimate.to_json([frame.name for frame in fit.frames])
         if is_on:
             self.use(fit.config, fit.frames, estimate)
@@ -356,8 +349,7 @@ class ExposureComponent(Component):
             # A few points of the first photographs may have said something else than all of them do.
             is_on = fit.config.data.exposure != "auto" or estimate.is_clear
             if is_on != (self.module is not None):
-                now = "each has its own" if is_on else "off, all have the same"
-                bar.note(f"exposure: {estimate.words()}; {now} from step {fit.step_index} on")
+                bar.note(f"exposure: {estimate.words()}; {_effect(is_on)} from step {fit.step_index} on")
         self.evidence = estimate.to_json([frame.name for frame in frames])
         if is_on:
             self.extend(fit, frame, estimate)
@@ -392,8 +384,8 @@ class ExposureComponent(Component):
         return {} if known is None else {"exposure": known}
 
 
-def _compared(setup: Setup) -> tuple[np.ndarray, np.ndarray | None] | None:
-    """Points (P, 3) by which the exposure of photographs is compared, and which of the V show which, (V, P) bool.
+def _compared(setup: Setup) -> _Points | None:
+    """By what the exposure of photographs is compared.
 
     Returns:
         None where nothing says what hides points, and where nobody asks for exposure and to look would take matching;
@@ -409,7 +401,7 @@ def _compared(setup: Setup) -> tuple[np.ndarray, np.ndarray | None] | None:
         return shared_points(setup.dataset, setup.views, setup.config.seed, matches, bar.stage)
 
 
-def _use_of(setup: Setup, compared: tuple[np.ndarray, np.ndarray | None] | None) -> ExposureUse:
+def _use_of(setup: Setup, compared: _Points | None) -> ExposureUse:
     """`exposure` of a fit. Where it is not stated: auto if photographs differ at a first look, which costs little, and
     a trial is short beside the fit, else off. A fit that is to have no gains says that photographs differ.
     """
@@ -425,6 +417,27 @@ def _use_of(setup: Setup, compared: tuple[np.ndarray, np.ndarray | None] | None)
         if first.is_sound:
             bar.note(first.warning())
     return "off"
+
+
+def _decided(fit: Fit, setup: Setup, compared: _Points | None) -> tuple[ExposureEstimate, bool]:
+    """The gains of a fit's photographs, and whether it uses them: unless it is to decide by itself, always."""
+    assert setup.points is not None  # initial ones are there
+    points, shown = compared or (setup.points, None)
+    estimate = estimate_exposure(fit.frames, points, fit.config.seed, shown)
+    if fit.config.data.exposure != "auto":
+        return estimate, True
+    # A trial takes photographs that are there and stand still, and points of which it is known who shows them.
+    if compared is None or setup.is_active:
+        return estimate, estimate.is_clear
+    if not estimate.is_sound:
+        return estimate, False
+    estimate = estimate.confirmed()
+    gained = _trial(fit, setup.views, estimate)
+    return dataclasses.replace(estimate, gained=gained), gained > 0
+
+
+def _effect(is_on: bool) -> str:
+    return "each has its own" if is_on else "off, all have the same"
 
 
 def _is_trial_short(setup: Setup) -> bool:
@@ -445,33 +458,37 @@ def _trial(fit: Fit, views: list[View], estimate: ExposureEstimate) -> float:
         views: V views.
         estimate: What points say of the gains of the V photographs.
     """
-    config, rows = fit.config, fit.rows
+    config = fit.config
     frames = frames_for(views, config.data, min(_TRIAL_PIXELS, config.data.max_pixels))
     held_out = frames[_TRIAL_EVERY // 2 :: _TRIAL_EVERY]
     rest = [row for row in range(len(frames)) if row % _TRIAL_EVERY != _TRIAL_EVERY // 2]
     if not held_out:
         return 0.0
     short = config.replace(**_TRIAL, max_pixels=_TRIAL_PIXELS)
-    begin = rows.gaussians().detach()  # where both begin
-    kept = torch.randperm(len(begin) - rows.far, generator=torch.Generator().manual_seed(config.seed))
-    kept = kept[: short.density.max_gaussians] + rows.far
-    colors = (0.5 + Y_00 * begin.sh[kept, 0]).clamp(0, 1)
-    errors = []
+    gains = estimate.log_gains[rest] - estimate.log_gains[rest].mean(axis=0)
+    quality = []
     with Bar("whether exposure is of use", 2 * short.max_steps) as bar:
-        for use in (False, True):
-            few = GaussianRows.from_points(rows.places()[kept], colors, *short.density.start_of(False), rows.origin)
-            seen = [frames[row] for row in rest]
+        for used in (None, dataclasses.replace(estimate, log_gains=gains)):
             component = ExposureComponent()
-            if use:
-                gains = estimate.log_gains[rest] - estimate.log_gains[rest].mean(axis=0)
-                component.use(short, seen, dataclasses.replace(estimate, log_gains=gains))
-            trial = fit.trial(short, seen, few, component)
+            if used is not None:
+                component.use(short, [frames[row] for row in rest], used)
+            trial = fit.trial(short, [frames[row] for row in rest], _first_rows(fit, short), component)
             for _ in range(short.max_steps):
                 trial.step()
                 bar.advance()
             meter = component.meter(trial)
-            errors.append([_psnr(trial, frame, way) for frame in held_out for way in (meter, _suited)])
-    return float(np.mean(errors[1]) - np.mean(errors[0]))
+            quality.append(np.mean([_psnr(trial, frame, way) for frame in held_out for way in (meter, _suited)]))
+    return float(quality[1] - quality[0])
+
+
+def _first_rows(fit: Fit, config: FitConfig) -> GaussianRows:
+    """Some of the Gaussians that a fit begins with, by their places and colors, for a fit of this configuration."""
+    rows = fit.rows
+    begin = rows.gaussians().detach()  # where it begins
+    kept = torch.randperm(len(begin) - rows.far, generator=torch.Generator().manual_seed(config.seed))
+    kept = kept[: config.density.max_gaussians] + rows.far
+    colors = (0.5 + Y_00 * begin.sh[kept, 0]).clamp(0, 1)
+    return GaussianRows.from_points(rows.places()[kept], colors, *config.density.start_of(False), rows.origin)
 
 
 def _psnr(fit: Fit, frame: Frame, as_photograph: Callable[[Output, Frame], Output] | None) -> float:
