@@ -20,13 +20,8 @@ from drgs.display.pictures import write_png
 from drgs.dynamics.lifespans import LIFESPAN_PARAMETERS, Lifespans, is_limited, logit_at
 from drgs.ellipsoids import Gaussians
 from drgs.files import load_state, save_state
-from drgs.fitting.components.lifespans import (
-    REFERENCE_TIMES,
-    LifetimeTerm,
-    NewGaussians,
-    agreed_trajectories,
-    find_new_gaussians,
-)
+from drgs.fitting.appearing import NewGaussians, agreed_trajectories, find_new_gaussians
+from drgs.fitting.components.lifespans import REFERENCE_TIMES, LifetimeTerm
 from drgs.fitting.frames import load_frames
 from drgs.fitting.records import load_run
 from drgs.fitting.stages import shows_first_time, spacing

@@ -23,8 +23,8 @@ from drgs.data import Dataset, load
 from drgs.data.camera_layout import scene_origin
 from drgs.deform import DynamicGaussians
 from drgs.files import load_ply, load_state, save_ply, save_state
+from drgs.fitting.appearing import find_new_gaussians
 from drgs.fitting.components.filter_3d import Filter3D
-from drgs.fitting.components.lifespans import find_new_gaussians
 from drgs.fitting.components.motion import MotionComponent
 from drgs.fitting.components.poses import Poses
 from drgs.fitting.components.skybox import Skybox
