@@ -299,15 +299,7 @@ def _compared(
     rays = torch.from_numpy(camera.pixel_directions()).reshape(height, width, 3).float()
     if renders_z(settings):
         distance = distance / (rays @ torch.from_numpy(camera.c2w[:3, 2]).float())
-    residual = avg_pool2d((image - rgb).abs().mean(0)[None], 3, 1, 1)[0]
-    other = residual > _DIFFERENCE
-    if background is not None:
-        other &= avg_pool2d((image - background).abs().mean(0)[None], 3, 1, 1)[0] > _DIFFERENCE
-    if frame.mask is not None:
-        other &= interpolate(frame.mask[None, None], (height, width), mode="area")[0, 0] > _SOLID
-    # What is thinner than three pixels is an edge that is not sharp yet.
-    core = -max_pool2d(-other.float()[None], 3, 1, 1)
-    other = (max_pool2d(core, 3, 1, 1)[0] > 0) & other
+    other = _is_other(image, rgb, background, frame.mask)
     where = other.nonzero()
     if len(where):
         where = where[torch.randperm(len(where), generator=generator)[:_SAMPLES]]
@@ -330,6 +322,25 @@ def _compared(
     )
 
 
+def _is_other(
+    image: torch.Tensor, rgb: torch.Tensor, background: torch.Tensor | None, mask: torch.Tensor | None
+) -> torch.Tensor:
+    """(H, W) bool, where a photograph shows something else than its rendering does, and than it does at most times.
+
+    Args:
+        image, rgb, background: (3, H, W) photograph, rendering, and what is seen from there at most times.
+        mask: Of the photograph, of any size.
+    """
+    other = avg_pool2d((image - rgb).abs().mean(0)[None], 3, 1, 1)[0] > _DIFFERENCE
+    if background is not None:
+        other &= avg_pool2d((image - background).abs().mean(0)[None], 3, 1, 1)[0] > _DIFFERENCE
+    if mask is not None:
+        other &= interpolate(mask[None, None], other.shape, mode="area")[0, 0] > _SOLID
+    # What is thinner than three pixels is an edge that is not sharp yet.
+    core = -max_pool2d(-other.float()[None], 3, 1, 1)
+    return (max_pool2d(core, 3, 1, 1)[0] > 0) & other
+
+
 def _neighbors(i: int, comparisons: list[_Comparison], times: np.ndarray) -> list[int]:
     """Photographs that the pixels of one are compared with: of its time, and nearest in time."""
     apart = np.abs(times - times[i])
@@ -350,9 +361,30 @@ def _search_round(
     generator: torch.Generator,
 ) -> None:
     """Try other depths and velocities for the pixels of a photograph, and keep what agrees better."""
-    samples = len(comparison.samples)
     x, y = comparison.samples[:, 0], comparison.samples[:, 1]
     end = comparison.distance[y, x].clamp(max=far)
+    depth, velocity = _candidates(iteration, comparison, neighbors, end, fastest, generator)
+    depth = torch.minimum(depth.clamp(min=1e-3 * far), end[:, None])
+    score, confirmed = _agreement(comparison, depth, velocity, neighbors, fastest)
+    best = score.argmax(1)
+    rows = torch.arange(len(best))
+    comparison.depth, comparison.velocity = depth[rows, best], velocity[rows, best]
+    comparison.score, comparison.confirmed = score[rows, best], confirmed[rows, best]
+    comparison.is_searched = True
+
+
+def _candidates(
+    iteration: int,
+    comparison: _Comparison,
+    neighbors: list[_Comparison],
+    end: torch.Tensor,
+    fastest: float,
+    generator: torch.Generator,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """(S, T) depths and (S, T, 3) velocities that are tried: random ones up to a depth `end` (S,), and from the second
+    round on those that are known, with a change and of other pixels.
+    """
+    samples = len(comparison.samples)
     rand = lambda *shape: torch.rand(*shape, generator=generator)  # noqa: E731
     randn = lambda *shape: torch.randn(*shape, generator=generator)  # noqa: E731
     depths = [end[:, None] * (_LEAST_DEPTH + (1 - _LEAST_DEPTH) * rand(samples, _RANDOM))]
@@ -376,15 +408,7 @@ def _search_round(
         if taken is not None:
             depths.append(taken[0])
             velocities.append(taken[1])
-    depth = torch.cat(depths, 1).clamp(min=1e-3 * far)
-    depth = torch.minimum(depth, end[:, None])
-    velocity = torch.cat(velocities, 1)
-    score, confirmed = _agreement(comparison, depth, velocity, neighbors, fastest)
-    best = score.argmax(1)
-    rows = torch.arange(samples)
-    comparison.depth, comparison.velocity = depth[rows, best], velocity[rows, best]
-    comparison.score, comparison.confirmed = score[rows, best], confirmed[rows, best]
-    comparison.is_searched = True
+    return torch.cat(depths, 1), torch.cat(velocities, 1)
 
 
 def _propagated(comparison: _Comparison, neighbors: list[_Comparison]) -> tuple[torch.Tensor, torch.Tensor] | None:
