@@ -236,6 +236,7 @@ class Component:
         nuisance: The unknown of each photograph that it estimates, eliminated from information; None: none.
         pictures: Suffixes of the pictures that measuring a view draws besides that of its colors.
         rendering: Arguments of `drgs.render` of a step.
+        field_length: Unit of length of the field that moves the Gaussians, world units; None: it has no field.
     """
 
     name: ClassVar[str]
@@ -251,6 +252,7 @@ class Component:
     nuisance: Nuisance | None = None
     pictures: Sequence[str] = ()
     rendering: Mapping[str, Any] = {}
+    field_length: float | None = None
 
     # -------------------------------------------------------------------------------------- before the first step
 

@@ -24,7 +24,7 @@ import torch
 from drgs.ellipsoids import Gaussians, Scene
 from drgs.fitting.appearing import NewGaussians, find_new_gaussians
 from drgs.fitting.components.base import Checkpoint, Component, Fit, Setup
-from drgs.fitting.components.motion import WARM_UP, MotionComponent, limited_lifespans
+from drgs.fitting.components.motion import WARM_UP, limited_lifespans
 from drgs.fitting.rates import means_rate
 from drgs.fitting.stages import dynamic_stage, shows_first_time, spacing
 
@@ -114,7 +114,7 @@ class LifespansComponent(Component):
     def _use(self, fit: Fit) -> None:
         """The term of lifetimes, and rates of their tensors, in the unit of length of the field."""
         self.terms = [LifetimeTerm(fit.rows, spacing(self.times), fit.config.motion.life_weight)]
-        length = next((x.field_length for x in fit.components if isinstance(x, MotionComponent)), fit.extent)
+        length = next((x.field_length for x in fit.components if x.field_length is not None), fit.extent)
         self.rates = lifespan_rates(fit.config, self.times, length)
 
     def scene(self, fit: Fit, scene: Scene) -> Scene:

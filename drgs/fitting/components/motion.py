@@ -72,8 +72,7 @@ class MotionComponent(Component):
     Attributes:
         times: All that views of the data set have, sorted; none where nothing moves.
         field: None in the static stage.
-        field_length: The field's unit of length, world units: the extent of the scene or of its Gaussians, whichever
-            is less.
+        field_length: The extent of the scene or of its Gaussians, whichever is less.
     """
 
     name = "motion"
@@ -88,7 +87,7 @@ class MotionComponent(Component):
     def __init__(self, times: Sequence[float] = ()) -> None:
         self.times = tuple(times)
         self.field: DeformationField | None = None
-        self.field_length = 1.0
+        self.field_length: float = 1.0
         self._labels: frozenset[int] = frozenset()
 
     def prepare(self, setup: Setup) -> None:
