@@ -32,6 +32,7 @@ from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.metrics import evaluate
 from drgs.fitting.networks import Network, saved_networks
 from drgs.fitting.records import check_checkpoint, load_run
+from drgs.fitting.resume import FILES
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.trainer import StepResult, Trainer
 from drgs.integrator import render
@@ -133,6 +134,18 @@ def test_without_the_row_a_run_with_it_is_refused(vignette, darkened, tmp_path):
     data = load_dataset(darkened, record.config)
     with pytest.raises(ValueError, match=r"networks were \['vignette'\] and are \[\]; repeat"):
         fit(data, tmp_path / "run", record.config, components=others, resume=True, progress=False)
+
+
+def test_files_of_a_component_are_files_of_a_run(monkeypatch):
+    """Whoever checks, copies or removes what a fit has written knows those of a component that was added, too."""
+
+    class Noted(Component):
+        name = "noted"
+        files = ("noted.json",)
+
+    assert {"config.json", "text_embeddings.npy", "refined_cameras.json"} < set(FILES)
+    monkeypatch.setitem(COMPONENTS, "noted", Noted)
+    assert "noted.json" in FILES
 
 
 class Corrected(Component):

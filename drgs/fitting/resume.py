@@ -5,11 +5,10 @@ from __future__ import annotations
 import logging
 import os
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from drgs.fitting.components.poses import CAMERAS
-from drgs.fitting.components.semantics import EMBEDDINGS
+from drgs.fitting.components.table import component_files
 from drgs.fitting.records import check_checkpoint, is_fit_config
 from drgs.io.checkpoint import load_state
 from drgs.io.outputs import LockedFolder, lock_folder, replacing
@@ -17,19 +16,17 @@ from drgs.io.run import Run
 
 PREVIOUS = "state.previous.safetensors"
 _CHECKPOINTS = ("state.safetensors", PREVIOUS)
-FILES = (
-    "config.json",
-    "env.json",
-    "log.jsonl",
-    "metrics.json",
-    "selection.json",
-    EMBEDDINGS,
-    CAMERAS,
-    "point_cloud.ply",
-    "errors.safetensors",
-    "report.html",
-    *_CHECKPOINTS,
-)
+
+
+class _Files:
+    """The names, as iterated: components may have been added to their table since this module was imported."""
+
+    def __iter__(self) -> Iterator[str]:
+        yield from ("config.json", "env.json", "log.jsonl", "metrics.json", "selection.json", *component_files())
+        yield from ("point_cloud.ply", "errors.safetensors", "report.html", *_CHECKPOINTS)
+
+
+FILES = _Files()
 """What a fit writes into its run folder, besides `renders/`."""
 
 _log = logging.getLogger(__name__)

@@ -229,6 +229,7 @@ class Component:
             gives way.
         block: Block of information that needs this component, and what a fit without it is, in words; None: none.
         reserved_names: Names in a checkpoint, or their first parts up to a dot, that no network may have.
+        files: Names of the files that it writes into a run folder.
         header_kinds: Keys of its part of a checkpoint's header -> kind, as of `drgs.io.json_files.check_json`.
         terms: Terms of the loss, added up after those that every fit has.
         rates: Learning rates by the name of a tensor of `GaussianRows`, also of one that every fit has.
@@ -245,6 +246,7 @@ class Component:
     conflicts: ClassVar[tuple[Conflict, ...]] = ()
     block: ClassVar[tuple[Block, str] | None] = None
     reserved_names: ClassVar[tuple[str, ...]] = ()
+    files: ClassVar[tuple[str, ...]] = ()
     header_kinds: ClassVar[Mapping[str, Any]] = {}
     terms: Sequence[LossTerm] = ()
     rates: Mapping[str, Rate] = {}
@@ -353,7 +355,7 @@ class Component:
         return {}, {}
 
     def write_files(self, folder: Path) -> None:
-        """Write its own files into the run folder, atomically: when a run begins, and after every checkpoint."""
+        """Write its `files` into the run folder, atomically: when a run begins, and after every checkpoint."""
 
     def record(self, fit: Fit, before: Mapping[str, Any]) -> dict[str, Any]:
         """Its part of config.json; `before` is the one of a fit that is resumed, else empty."""

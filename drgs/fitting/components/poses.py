@@ -462,6 +462,7 @@ class PosesComponent(Component):
     name = "poses"
     option = ("poses", "fixed")
     where = "where poses are optimized"
+    files = (CAMERAS,)
     # A field explains a camera's error as well, and the photographs of one camera at many times have one pose.
     conflicts = (
         Conflict(

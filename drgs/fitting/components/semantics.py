@@ -347,6 +347,7 @@ class SemanticsComponent(Component):
     name = "semantics"
     option = ("semantics", "ignore")
     where = "where features are fitted, too"
+    files = (EMBEDDINGS,)
     conflicts = (Conflict("begin", "its Gaussians have no features", "ignore semantics, or fit anew"),)
     block = ("semantic", "a fit without a teacher's maps")
 

@@ -45,6 +45,11 @@ def components_of(kinds: Sequence[Callable[[], Component]] | None = None) -> lis
     return [kind() for kind in (COMPONENTS.values() if kinds is None else kinds)]
 
 
+def component_files() -> list[str]:
+    """Names of the files that components write into a run folder."""
+    return [name for kind in COMPONENTS.values() for name in kind.files]
+
+
 def held_components(
     names: list[str], networks: Mapping[str, Mapping[str, torch.Tensor]], settings: RenderSettings
 ) -> list[Component]:
