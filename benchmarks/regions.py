@@ -326,7 +326,6 @@ def made_study(name: str, runs: Path) -> Study:
 # -------------------------------------------------------------------------------------------------------- captures
 
 CAPTURES = ("statue", "head")
-OFFSETS = (0, 1, 2)  # every third photograph is held out, from these on
 
 
 def captured_study(name: str, runs: Path) -> Study:
