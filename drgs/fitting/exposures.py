@@ -68,6 +68,11 @@ class ExposureEstimate:
         return _three(self.log_gains.std(axis=0) / math.log(2))
 
     @property
+    def noise(self) -> tuple[float, float, float]:
+        """Root mean square over the photographs of the standard errors of log2 of the gains of R, G and B."""
+        return _three(np.sqrt(np.square(self.errors).mean(axis=0)) / math.log(2))
+
+    @property
     def is_clear(self) -> bool:
         """Whether the gains differ by more than points can be wrong about: in one channel at least."""
         return any(x**2 - e**2 > _CLEAR_STOPS**2 for x, e in zip(self.spread, self.noise, strict=True))
@@ -126,11 +131,6 @@ class ExposureEstimate:
             "unconfirmed": [name for name, good in zip(names, self.is_confirmed, strict=True) if not good],
             "gains": gains,
         }
-
-    @property
-    def noise(self) -> tuple[float, float, float]:
-        """Root mean square over the photographs of the standard errors of log2 of the gains of R, G and B."""
-        return _three(np.sqrt(np.square(self.errors).mean(axis=0)) / math.log(2))
 
 
 def estimate_exposure(

@@ -26,6 +26,7 @@ from drgs.fitting.appearing import NewGaussians, find_new_gaussians
 from drgs.fitting.components.base import Checkpoint, Component, Fit, Setup
 from drgs.fitting.components.motion import WARM_UP, limited_lifespans
 from drgs.fitting.rates import means_rate
+from drgs.fitting.rows import GaussianRows
 from drgs.fitting.stages import dynamic_stage, shows_first_time, spacing
 
 if TYPE_CHECKING:
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from drgs.fitting.config import FitConfig
     from drgs.fitting.frames import Frame
     from drgs.fitting.networks import Rate
-    from drgs.fitting.rows import GaussianRows
     from drgs.integrator import Output
 
 REFERENCE_TIMES = "births"
@@ -232,21 +232,13 @@ def add_new_gaussians(rows: GaussianRows, places: NewGaussians, times: Sequence[
         gate: Logit of the gates of those that are added.
         most: How many Gaussians there may be.
     """
-    from drgs.dynamics.lifespans import LIFESPAN_PARAMETERS
-
     count = len(places.points)
     if not count:
         return
     if REFERENCE_TIMES not in rows.tensors:
         for name, x in _unlimited(len(rows), times).items():
             rows.add_tensor(name, x)
-    new = rows.from_points(places.points, places.colors, _OPACITY).take(torch.arange(count))
-    new["log_scales"] = places.sizes.log()[:, None].repeat(1, 3)
-    new["motion"] = torch.full((count,), gate)
-    centers = places.times.float()
-    start = (centers, _first_widths(places, times).log().float(), places.velocities, places.accelerations)
-    new |= dict(zip(LIFESPAN_PARAMETERS, start, strict=True))
-    new[REFERENCE_TIMES] = centers
+    new = _rows_at(places, times, gate)
     for name, x in rows.tensors.items():  # features and view-dependent colors begin at 0
         if name not in new or new[name].shape[1:] != x.shape[1:]:
             new[name] = x.new_zeros(count, *x.shape[1:])
@@ -256,6 +248,19 @@ def add_new_gaussians(rows: GaussianRows, places: NewGaussians, times: Sequence[
     taken = faint[: count - room]
     rows.overwrite(taken, {name: x[room : room + len(taken)] for name, x in new.items()})
     rows.append({name: x[:room] for name, x in new.items()})
+
+
+def _rows_at(places: NewGaussians, times: Sequence[float], gate: float) -> dict[str, torch.Tensor]:
+    """Rows of Gaussians at places, as far as these say them; arguments as of `add_new_gaussians`."""
+    from drgs.dynamics.lifespans import LIFESPAN_PARAMETERS
+
+    count = len(places.points)
+    new = GaussianRows.from_points(places.points, places.colors, _OPACITY).take(torch.arange(count))
+    new["log_scales"] = places.sizes.log()[:, None].repeat(1, 3)
+    new["motion"] = torch.full((count,), gate)
+    centers = places.times.float()
+    start = (centers, _first_widths(places, times).log().float(), places.velocities, places.accelerations)
+    return {**new, **dict(zip(LIFESPAN_PARAMETERS, start, strict=True)), REFERENCE_TIMES: centers}
 
 
 def _unlimited(count: int, times: Sequence[float]) -> dict[str, torch.Tensor]:
