@@ -60,7 +60,7 @@ __all__ = [
 _log = logging.getLogger(__name__)
 
 _CONFIG = {"data": str, "train": [str], "test": [str], "fit": {"settings": dict}}
-_OPTIONAL = {"times": [float], "estimated": [str], "poses": {"refined": bool}, "pool": [str]}
+_OPTIONAL = {"estimated": [str], "pool": [str]}
 _VIEW = {"index": int, "name": str}
 _HEADER = {
     "step": int,
@@ -342,8 +342,10 @@ def fit_record(run: Run) -> FitRecord:
     config = run.config()
     where = f"{run.path / 'config.json'}"
     advice = "restore the file, or fit again in another folder"
-    optional = {name: kind for name, kind in _OPTIONAL.items() if name in config}
-    check_json(where, config, _CONFIG | optional, advice)
+    optional = dict(_OPTIONAL)
+    for component in COMPONENTS.values():
+        optional |= component.record_kinds
+    check_json(where, config, _CONFIG | {name: x for name, x in optional.items() if name in config}, advice)
     try:
         fit = FitConfig.from_json(config["fit"])
     except (ValueError, NotImplementedError) as error:

@@ -230,7 +230,8 @@ class Component:
         block: Block of information that needs this component, and what a fit without it is, in words; None: none.
         reserved_names: Names in a checkpoint, or their first parts up to a dot, that no network may have.
         files: Names of the files that it writes into a run folder.
-        header_kinds: Keys of its part of a checkpoint's header -> kind, as of `drgs.io.json_files.check_json`.
+        record_kinds, header_kinds: Keys of its part of config.json that are read again, and of a checkpoint's header ->
+            kind, as of `drgs.io.json_files.check_json`.
         terms: Terms of the loss, added up after those that every fit has.
         rates: Learning rates by the name of a tensor of `GaussianRows`, also of one that every fit has.
         networks: Networks that it fits beside the Gaussians.
@@ -247,6 +248,7 @@ class Component:
     block: ClassVar[tuple[Block, str] | None] = None
     reserved_names: ClassVar[tuple[str, ...]] = ()
     files: ClassVar[tuple[str, ...]] = ()
+    record_kinds: ClassVar[Mapping[str, Any]] = {}
     header_kinds: ClassVar[Mapping[str, Any]] = {}
     terms: Sequence[LossTerm] = ()
     rates: Mapping[str, Rate] = {}

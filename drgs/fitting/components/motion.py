@@ -78,6 +78,7 @@ class MotionComponent(Component):
     name = "motion"
     option = ("dynamics", "ignore")
     where = "where things move"
+    record_kinds = {"times": [float]}
     conflicts = (
         Conflict("begin", "a field is fitted from the first Gaussians on", "leave begin out, or use --dynamics ignore"),
         Conflict("pace", "its stages count steps", "leave pace out, or use --dynamics ignore"),

@@ -463,6 +463,7 @@ class PosesComponent(Component):
     option = ("poses", "fixed")
     where = "where poses are optimized"
     files = (CAMERAS,)
+    record_kinds = {"poses": {"refined": bool}}
     # A field explains a camera's error as well, and the photographs of one camera at many times have one pose.
     conflicts = (
         Conflict(
