@@ -555,19 +555,32 @@ class Planner:
         # Without costs all picks come of one call; with costs each is of another value than its score.
         at_once = max(k, 1) if self._cost is None else 1
         selection, places, there = self._selected(scene, list(range(len(self._pool))), known, at_once)
-        notes = [] if selection is None else selection.notes
-        note = next((x for x in notes if x.startswith("region ")), "")
         scores: list[float | None] = [None] * len(self._pool)
-        left_out = len(known) - len(there)
         picks: list[PlannedView] = []
+        note = ""
         if selection is not None:
+            note = next((x for x in selection.notes if x.startswith("region ")), "")
             for i, score in zip(places, selection.scores, strict=True):
                 scores[i] = score
             if self._cost is None:
                 scored = [(places[pick.index], pick.score) for pick in selection.picks[:k]]
                 picks = [PlannedView(i, self._pool[i], score, 0.0, score) for i, score in scored]
+            else:
+                picks = self._picks_by_value(scene, selection, places, there, k)
+        changed = max(self._cache.changes.values(), default=0.0)
+        return ViewPlan(picks, scores, changed, 0, len(known) - len(there), 0.0, note)
+
+    def _picks_by_value(
+        self, scene: Gaussians, selection: Selection | None, places: list[int], known: list[Camera], k: int
+    ) -> list[PlannedView]:
+        """k candidates, or as many as there is information of, each of the largest value given those before it.
+
+        Args:
+            selection, places, known: Of the first one, as `_selected` returns them.
+        """
+        picks: list[PlannedView] = []
         here = self._last_camera
-        while self._cost is not None and selection is not None and len(picks) < k:
+        while selection is not None and len(picks) < k:
             costs = self._costs(places, here)
             values = [score / (self.look + cost) for score, cost in zip(selection.scores, costs, strict=True)]
             best = int(np.argmax(values))
@@ -575,9 +588,8 @@ class Planner:
             picks.append(PlannedView(places[best], here, selection.scores[best], costs[best], values[best]))
             if len(picks) < k:
                 left = [i for i in places if i != places[best]]
-                selection, places, there = self._selected(scene, left, [*there, here], 1)
-        changed = max(self._cache.changes.values(), default=0.0)
-        return ViewPlan(picks, scores, changed, 0, left_out, 0.0, note)
+                selection, places, known = self._selected(scene, left, [*known, here], 1)
+        return picks
 
     def _selected(
         self, scene: Gaussians, places: list[int], known: list[Camera], k: int
