@@ -46,7 +46,6 @@ from drgs.fitting.resolution import updates_of
 from drgs.fitting.resume import keep_previous, last_checkpoint, lock_run
 from drgs.fitting.stages import fitted_times
 from drgs.fitting.start import start
-from drgs.fitting.threads import fewer_torch_threads, one_thread
 from drgs.fitting.trainer import StepResult, Trainer
 from drgs.integrator import render
 from drgs.io import interrupts
@@ -55,6 +54,7 @@ from drgs.io.outputs import lock_folder
 from drgs.io.run import Run
 from drgs.runtime.machine import peak_memory
 from drgs.runtime.memory import is_out_of_memory
+from drgs.runtime.threads import fewer_torch_threads, one_thread
 
 if TYPE_CHECKING:
     from drgs.data import Dataset

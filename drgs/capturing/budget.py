@@ -28,8 +28,8 @@ from drgs.display.progress import Bar, duration
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import frames_for
 from drgs.fitting.start import start_plain
-from drgs.fitting.threads import fewer_torch_threads
 from drgs.io.atomic import temporary_folder
+from drgs.runtime.threads import fewer_torch_threads
 from drgs.sfm.matching import FeatureOptions, extract, match, quiet, start_extraction
 from drgs.sfm.pairing import MAX_EXHAUSTIVE
 

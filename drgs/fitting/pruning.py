@@ -30,12 +30,12 @@ from drgs.fitting.config import FitConfig, RateConfig
 from drgs.fitting.frames import Frame
 from drgs.fitting.losses import psnr
 from drgs.fitting.rows import GaussianRows
-from drgs.fitting.threads import fewer_torch_threads
 from drgs.fitting.trainer import Trainer
 from drgs.information.inputs import Masks, mask_list
 from drgs.information.region import Region
 from drgs.information.semantics import SemanticMetric
 from drgs.integrator import Output, render
+from drgs.runtime.threads import fewer_torch_threads
 from drgs.settings import RenderSettings
 
 Unseen = Literal["keep", "remove"]

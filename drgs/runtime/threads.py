@@ -1,4 +1,4 @@
-"""How many threads a fit leaves to Dr.Jit and to torch."""
+"""How many threads are left to Dr.Jit and to torch while both compute."""
 
 from __future__ import annotations
 
