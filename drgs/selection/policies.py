@@ -10,6 +10,7 @@ import torch
 
 from drgs.checks.arguments import kind_of, must_be
 from drgs.information.choices import POLICIES, check_named
+from drgs.runtime.threads import fewer_torch_threads
 from drgs.selection.pool import Pick, Pool, Selection
 
 _INFORMED = ("fisher", "fisherrf", "coverage")
@@ -32,7 +33,8 @@ def choose(policy: str, pool: Pool) -> Selection:
                     f"select: {name} must be None with policy {policy}, got some; use {', '.join(_INFORMED)}{advice}"
                 )
     check_region(None if pool.region is None else pool.region.text, policy)
-    selection = function(pool)
+    with fewer_torch_threads():
+        selection = function(pool)
     _check_selection(f"select: policy {policy}", pool, selection)
     return selection
 
