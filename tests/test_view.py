@@ -42,6 +42,7 @@ from drgs.fitting.errors import run_error_record
 from drgs.io.run import Run
 from drgs.viewing import panel
 from drgs.viewing.client import ClientGaussians, Pose, camera_of, looking, pose_of
+from drgs.viewing.installation import view_command
 from drgs.viewing.layers import ExpectedError, Uncertainty, bands, layers_of, rendered_in_bands, stages, tinted
 from drgs.viewing.placed_views import PlacedView, Ranking, Score, Sight, placed_views_of, read_ranking, score_colors
 from drgs.viewing.server import Viewer
@@ -1019,10 +1020,16 @@ def test_bad_options_are_one_line(place, monkeypatch, capsys, line, told):  # no
 
 
 def test_without_viser_one_line_says_what_to_install(place, monkeypatch, capsys):  # noqa: F811
-    """The extra is named."""
+    """The extra is named, but not for a path that is not there; where a command names the next one, it is, too."""
     import importlib.util
 
+    assert view_command(Path("a run")) == "drgs view 'a run'"
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *_: None)
     monkeypatch.chdir(place)
     assert cli.main(["view", "scene.ply"]) == 2
     assert capsys.readouterr().err == "drgs view: viser must be installed, is not; pip install 'drgs[view]'\n"
+    assert cli.main(["view", "missing.ply"]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("drgs view: missing.ply: ")
+    assert "viser" not in told
+    assert view_command(Path("run")) == "drgs view run (after pip install 'drgs[view]')"

@@ -41,6 +41,7 @@ from drgs.pages.sharing.scene import FILE as PAGE
 from drgs.pages.sharing.scene import scene_of_run
 from drgs.pages.sharing.write import write_page
 from drgs.sfm.image_folder import make_image_folder, named_files, usable_files
+from drgs.viewing.installation import view_command
 
 Report = Callable[[Run, Path, "Dataset"], None]
 """Writes the report of a run to a file; the data set has the cameras as fitted."""
@@ -146,7 +147,8 @@ def _steps(
 
 def _run_steps(capture: Capture, steps: dict[str, Callable[[], Outcome]]) -> None:
     """Run the steps that are not done yet, and print the findings for the next shoot."""
-    run = shlex.quote(str(capture.options.output))
+    path = capture.options.output
+    run = shlex.quote(str(path))
     for name, work in steps.items():
         try:
             _run_step(capture, name, work)
@@ -160,7 +162,7 @@ def _run_steps(capture: Capture, steps: dict[str, Callable[[], Outcome]]) -> Non
         capture.say(f"at the next shoot: {finding.line()}")
     budget = capture.clock.budget
     capture.say(f"done in {duration(capture.clock.used)}" + ("" if budget is None else f" of {duration(budget)}"))
-    capture.say(f"next: drgs view {run}; which photographs to take next: drgs capture --more -o {run}")
+    capture.say(f"next: {view_command(path)}; which photographs to take next: drgs capture --more -o {run}")
 
 
 def _run_step(capture: Capture, name: str, work: Callable[[], Outcome]) -> None:

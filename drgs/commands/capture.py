@@ -14,6 +14,7 @@ from drgs.capturing.steps import run_capture
 from drgs.commands.options import Capture
 from drgs.commands.report import report_of
 from drgs.fitting.config import FitConfig
+from drgs.viewing.installation import view_command
 
 
 def run(args: Capture) -> None:
@@ -64,7 +65,7 @@ def _print_next(args: Capture) -> None:
         worth = "" if pick["gain"] is None else f" (adds {_times(pick['gain'])})"
         print(f"{pick['rank']}. {pick['text']}{worth}")
     run = shlex.quote(str(args.output))
-    print(f"arrows on the map: drgs report {run}; in the browser: drgs view {run}")
+    print(f"arrows on the map: drgs report {run}; in the browser: {view_command(args.output)}")
 
 
 def _times(gain: float) -> str:

@@ -17,6 +17,7 @@ from drgs.fitting.resume import lock_run
 from drgs.io.run import Run
 from drgs.pages.report.write import FILE
 from drgs.train import fit
+from drgs.viewing.installation import view_command
 
 _log = logging.getLogger(__name__)
 
@@ -49,7 +50,7 @@ def run(args: Fit) -> None:
     if args.report:
         print(f"report: {page}")
     run = shlex.quote(str(result.run.path))
-    print(f"next: drgs view {run}; as a page to send: drgs share {run} -o scene.html")
+    print(f"next: {view_command(result.run.path)}; as a page to send: drgs share {run} -o scene.html")
 
 
 def _on_background(dataset: Dataset, config: FitConfig, args: Fit, lazy: bool) -> FitConfig:

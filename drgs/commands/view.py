@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import threading
 import warnings
 import webbrowser
@@ -31,6 +30,7 @@ from drgs.io.checkpoint import state_header
 from drgs.io.run import Run
 from drgs.meshing.depths import seen_distance
 from drgs.viewing.client import pose_of
+from drgs.viewing.installation import require_viser
 from drgs.viewing.layers import SKETCH_VIEWS, ExpectedError, Uncertainty, layers_of
 from drgs.viewing.placed_views import NEXT, PlacedView, Ranking, placed_views_of
 from drgs.viewing.subject import FirstView, Subject
@@ -47,17 +47,17 @@ _STOP_SECONDS = 0.5  # seconds that a running computation gets to end; chosen
 
 def run(args: View) -> None:
     """`drgs view SCENE`; returns by Ctrl-C alone."""
-    if importlib.util.find_spec("viser") is None:
-        raise ValueError("view: viser must be installed, is not; pip install 'drgs[view]'")
     args.settings()  # refuses what cannot be, before anything is read
     OrbitShape.of(args)
-    from drgs.viewing.server import Viewer
-
-    # A browser may be closed while something is on its way to it: that is no news.
-    warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
     with Bar("the scene", show=not args.quiet):
         stamps = _stamps(watched_files(args))
-        subject = subject_of(args, SceneInput.of(args))
+        given = SceneInput.of(args)
+        require_viser()  # after the scene: who names a wrong path need not install anything to be told
+        from drgs.viewing.server import Viewer
+
+        # A browser may be closed while something is on its way to it: that is no news.
+        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
+        subject = subject_of(args, given)
     viewer = Viewer(subject, args.host, args.port, args.token, args.preset, args.max_pixels)
     try:
         print(f"{viewer.address}  (Ctrl-C ends)", flush=True)

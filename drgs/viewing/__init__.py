@@ -11,6 +11,7 @@ layers        which pictures of it there are, and how they are drawn in steps
 worker        the one thread that computes
 client        the browser's cameras and Gaussians, and ours
 placed_views  where photographs were taken, or could be
+installation  whether viser is installed, and what is said where it is not
 """
 
 from drgs.checks.imports import modules_of
