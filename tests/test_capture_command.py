@@ -261,6 +261,24 @@ def test_what_is_told(captured, capsys):
     assert "drgs capture --more -o" in lines[-1]
 
 
+def test_next_photographs_come_with_the_advice_of_the_capture(captured, tmp_path, capsys):
+    """--more repeats what the capture has advised, before its places; without a run it says which one is missing."""
+    folder = shutil.copytree(captured, tmp_path / "run", symlinks=True)
+    run(Capture(output=folder, more=True, k=1))
+    lines = capsys.readouterr().out.splitlines()
+    advice = CaptureRecord.read(folder / "capture").batch.advice()
+    assert lines[: len(advice)] == advice
+    assert "only 6 photographs have a pose" in advice[0]
+    assert lines[len(advice) + 1].startswith("1. go where IMG_")
+    for words in (["photos"], []):
+        told = refused(["--more", *words, "-o", tmp_path / "none"], capsys)
+        assert told.endswith(
+            "-o must be the run of a capture with --more, found none; make it first by drgs capture "
+            f"PHOTOS -o {tmp_path / 'none'}"
+        )
+    assert not (tmp_path / "none").exists()
+
+
 @pytest.mark.slow
 def test_further_photographs(joined, captured):
     """They join the world that was there; held-out views stay the same; the fit begins with the Gaussians that exist,

@@ -78,7 +78,7 @@ def test_what_no_photograph_is_matched_in(seen):
     assert "700 Gaussians" not in line
     line = by_kind(findings_of(fitted, record, cameras, is_full=True))["misfit"]
     assert "with all 700 Gaussians that it may have" in line
-    assert "fit with more Gaussians and steps" in line
+    assert "fit with more Gaussians and steps: give a larger --budget" in line
 
 
 def test_a_direction_that_is_missing():

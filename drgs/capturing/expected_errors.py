@@ -255,7 +255,8 @@ def _misfit(ninth: _Ninth, seen: Sequence[_Seen], full: int) -> Finding:
     return Finding(
         "misfit",
         f"{where}, as the fit does not match {count} of it (off by {usual:.2f}{full_text})",
-        f"fit with more {'Gaussians and ' if full else ''}steps; if something moves or shines there, mask it",
+        f"fit with more {'Gaussians and ' if full else ''}steps: give a larger --budget, in another folder (-o); if "
+        "something moves or shines there, mask it",
     )
 
 

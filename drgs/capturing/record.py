@@ -72,6 +72,10 @@ class Batch:
         """The record of a step; None while it is not done."""
         return next((step for step in self.steps if step.name == name), None)
 
+    def advice(self) -> list[str]:
+        """The findings, a line each."""
+        return [f"at the next shoot: {finding.line()}" for finding in self.findings]
+
 
 @dataclasses.dataclass
 class CaptureRecord:

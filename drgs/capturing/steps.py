@@ -158,8 +158,8 @@ def _run_steps(capture: Capture, steps: dict[str, Callable[[], Outcome]]) -> Non
             capture.say(f"share: not written, {error}; then drgs share {run}")
         if name == "report":  # which looks at what the fit gets wrong in them
             capture.photographs.forget()
-    for finding in capture.batch.findings:
-        capture.say(f"at the next shoot: {finding.line()}")
+    for line in capture.batch.advice():
+        capture.say(line)
     budget = capture.clock.budget
     capture.say(f"done in {duration(capture.clock.used)}" + ("" if budget is None else f" of {duration(budget)}"))
     capture.say(f"next: {view_command(path)}; which photographs to take next: drgs capture --more -o {run}")

@@ -10,10 +10,12 @@ import shlex
 from drgs.capturing.budget import seconds_of_budget
 from drgs.capturing.capture import CaptureOptions
 from drgs.capturing.next_views import rank_next
+from drgs.capturing.record import FOLDER, CaptureRecord
 from drgs.capturing.steps import run_capture
 from drgs.commands.options import Capture
 from drgs.commands.report import report_of
 from drgs.fitting.config import FitConfig
+from drgs.fitting.records import is_run
 from drgs.viewing.installation import view_command
 
 
@@ -51,7 +53,12 @@ def capture_photographs(args: Capture, config: FitConfig) -> None:
 
 
 def _print_next(args: Capture) -> None:
-    """Which photographs to take next."""
+    """Which photographs to take next, below what the capture itself has advised."""
+    if not is_run(args.output):
+        raise ValueError(
+            f"{args.output}: -o must be the run of a capture with --more, found none; make it first by drgs capture "
+            f"PHOTOS -o {shlex.quote(str(args.output))}"
+        )
     if args.paths:
         raise ValueError(f"--more must have no photographs, got {args.paths[0]}; drop one or the other")
     if args.k < 1:
@@ -59,6 +66,9 @@ def _print_next(args: Capture) -> None:
     picks = rank_next(args.output, args.k, args.length, not args.quiet, args.region)
     if args.quiet:
         return
+    record = CaptureRecord.read(args.output / FOLDER)
+    for line in record.batch.advice() if record is not None and args.region is None else ():
+        print(line)
     if args.length is None:
         print("lengths are shares of the way from a photograph to what it shows; with --length they are in meters")
     for pick in picks:
