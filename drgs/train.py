@@ -343,6 +343,7 @@ class _Loop:
         self.seconds = seconds
         self.recorded = recorded
         self._pace = pace
+        self._is_rescheduled = False
         self._recent: list[StepResult] = []
         self._psnr: float | None = None  # of the last steps
         self._saved: tuple[int, int] | None = None  # steps and views of the last checkpoint
@@ -374,6 +375,9 @@ class _Loop:
         self.recorded["fit"] = trainer.config.to_json()
         self.run_folder.record(self.recorded)
         self.run_folder.log("rescheduled", step=done, before=before, max_steps=wanted)
+        if not self._is_rescheduled:  # it may change many times more
+            bar.note(f"step {done}: {wanted} steps in place of {before}, as the time left allows; it may change again")
+            self._is_rescheduled = True
         bar.update(done, wanted)
 
     def run(self, bar: Bar) -> None:

@@ -279,6 +279,18 @@ def test_next_photographs_come_with_the_advice_of_the_capture(captured, tmp_path
     assert not (tmp_path / "none").exists()
 
 
+def test_steps_that_follow_the_clock_are_told(captured, tmp_path, monkeypatch, capsys):
+    """Once when their number first changes, and beside what was planned at the end."""
+    monkeypatch.setattr(capture_fit, "plan_fit", lambda *_: budget.FitPlan(2000, 400, 10, 1.0))
+    monkeypatch.setattr(capture_fit, "Pacer", lambda *_: lambda done, of: 9 if done < 5 else 8)
+    paths = (captured / "capture/scene",)
+    capture_photographs(Capture(paths=paths, output=tmp_path / "run", budget="60s"), CONFIG)
+    out, err = capsys.readouterr()
+    assert "Gaussians after 8 steps (10 were planned, the budget allowed 8), held-out PSNR" in out
+    assert err.count("steps in place of") == 1
+    assert "step 1: 9 steps in place of 10, as the time left allows" in err
+
+
 @pytest.mark.slow
 def test_further_photographs(joined, captured):
     """They join the world that was there; held-out views stay the same; the fit begins with the Gaussians that exist,
