@@ -135,7 +135,7 @@ def test_command(stage, tmp_path, monkeypatch, capsys):
     command = ["scene", "capture", "-o", str(out), "--size", "16x12", "--views", "4", "--spp", "1", "--no-shadow"]
     assert cli.main([*command, "--no-passer-by", "--pose-error", "1,0"]) == 0
     said = capsys.readouterr().out
-    assert "4 photographs, 1 held out; 0 with a shadow, 0 with a passer-by" in said
+    assert "4 views of 16x12, 1 held out\n0 photographs with a shadow, 0 with a passer-by" in said
     assert f"next: drgs fit {out} -o RUN\n" in said
     truth = truth_of(out)
     assert truth["pose_error"] == {"degrees": 1, "meters": 0}

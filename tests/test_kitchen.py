@@ -312,12 +312,14 @@ def test_command(stage, tmp_path, monkeypatch, capsys):
     command += ["--teacher-size", "8x6"]
     assert cli.main(command) == 0
     said = capsys.readouterr().out
-    assert "16 classes, 5 of them move, teacher right at" in said
+    assert "2 views of 32x24, 1 held out\n16 classes, 5 of them move, teacher right at" in said
     assert f"next: drgs fit {out} -o RUN\n" in said
     assert len(list((out / "rgb_feature_langseg").iterdir())) == 2
     monkeypatch.setattr(filmed, "Stage", lambda play, seed: pytest.fail("made again"))
     assert cli.main([*command, "--quiet"]) == 0
     assert capsys.readouterr().out == ""
+    assert cli.main([*command, "--free"]) == 2
+    assert "holds one with free False, not True" in capsys.readouterr().err
 
 
 def test_a_video_that_cannot_be_written(tmp_path):

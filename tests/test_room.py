@@ -247,10 +247,19 @@ def test_command(built, tmp_path, monkeypatch, capsys):
     ]
     assert cli.main(command) == 0
     said = capsys.readouterr().out
-    assert "18 classes, 2 test views" in said
+    assert "3 views of 24x16, 2 held out\n18 classes, teacher right at" in said
     assert f"next: drgs fit {out} -o RUN --test-every 2" in said
     assert (out / "test_views.txt").read_text().split() == ["rgb_000.png", "rgb_002.png"]
     assert teacher.load(out / "rgb_feature_langseg" / "rgb_001_fmap_CxHxW.pt").shape == (512, 8, 12)
     monkeypatch.setattr(room, "scene", lambda seed: pytest.fail("made again"))
     assert cli.main([*command, "--quiet"]) == 0
     assert capsys.readouterr().out == ""
+    assert cli.main(command) == 0
+    assert capsys.readouterr().out == f"{out}: already complete\n{said}"
+    for other, told in ((["--seed", "1"], "seed 0, not 1"), (["--size", "320x240"], "width 24, not 320")):
+        assert cli.main([*command, *other]) == 2
+        assert f"{out}: -o must be a new folder or hold the same data set, holds one with {told}; choose" in (
+            capsys.readouterr().err
+        )
+    assert cli.main(["scene", "kitchen", "-o", str(out)]) == 2
+    assert "holds one with scene 'room', not 'kitchen'" in capsys.readouterr().err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import json
 import shlex
 from pathlib import Path
@@ -13,6 +14,7 @@ from drgs.checks.records import options_in
 from drgs.commands.command_line import words_of
 from drgs.commands.values import parsed_size
 from drgs.display.progress import Bar
+from drgs.io.json_files import read_json
 
 if TYPE_CHECKING:
     from drgs.commands.options import Scene
@@ -54,10 +56,38 @@ def run(args: Scene) -> None:
     if args.teacher_size is not None:
         numbers |= _pair("--teacher-size", args.teacher_size, "teacher_width", "teacher_height")
     maker = maker_of(args.name)
+    stamp = args.output / "params.json"
+    before = _made_before(stamp, args.name, maker, numbers)
     with Bar("path tracing", show=not args.quiet) as bar:
         folder = maker.generate(args.output, **numbers, progress=bar.update)
-    if not args.quiet:
-        _print_result(args.name, folder, maker, numbers)
+    if args.quiet:
+        return
+    if stamp.read_bytes() == before:
+        print(f"{folder}: already complete")
+    _print_result(args.name, folder, maker, numbers)
+
+
+def _made_before(stamp: Path, name: str, maker: ModuleType, numbers: dict[str, Any]) -> bytes | None:
+    """The params.json of an output folder that holds the same data set; None where it holds none that was made.
+
+    Raises:
+        ValueError: If it holds another data set, which `generate` would replace.
+    """
+    if not stamp.is_file():
+        return None
+    made = read_json(stamp, "the parameters of a made data set", "choose another folder (-o)")
+    if not isinstance(made, dict) or "scene" not in made:  # somebody else's, which `generate` refuses
+        return None
+    defaults = {key: one.default for key, one in inspect.signature(maker.generate).parameters.items()}
+    del defaults["out_dir"], defaults["progress"]
+    for key, value in {"scene": name, **defaults, **numbers}.items():
+        value = list(value) if isinstance(value, tuple) else value
+        if (other := made.get(key, defaults.get(key))) != value:
+            raise ValueError(
+                f"{stamp.parent}: -o must be a new folder or hold the same data set, holds one with {key} {other!r}, "
+                f"not {value!r}; choose another folder or delete this one"
+            )
+    return stamp.read_bytes()
 
 
 def maker_of(name: str) -> ModuleType:
@@ -85,23 +115,29 @@ def _pose_error(text: str) -> tuple[float, float]:
 
 
 def _print_result(name: str, folder: Path, maker: ModuleType, numbers: dict[str, Any]) -> None:
-    """Print the data set's folder and the next command."""
+    """Print what there is, and the next command."""
+    from drgs.fitting.config import FitConfig  # they take seconds to load, that wrong options need not wait for
+    from drgs.fitting.frames import load_dataset
+
+    config = FitConfig()
     every = ""
+    if name == "room":
+        config = config.replace(test_every=numbers.get("test_every", maker.TEST_EVERY))
+        every = f" --test-every {config.data.test_every}"
+    dataset = load_dataset(folder, config, lazy=True, points=False, semantics=False)
+    train, test = dataset.split()
+    camera = (train or test)[0].camera
+    print(f"{len(train) + len(test)} views of {camera.width}x{camera.height}, {len(test)} held out")
     if name == "capture":
         truth = json.loads((folder / "truth.json").read_text())
-        images = len(truth["log_gains"])
         print(
-            f"{images} photographs, {len(truth['held_out'])} held out; {len(truth['shadow'])} with a shadow, "
-            f"{len(truth['passer_by'])} with a passer-by; the truth is in truth.json"
+            f"{len(truth['shadow'])} photographs with a shadow, {len(truth['passer_by'])} with a passer-by; the truth "
+            "is in truth.json"
         )
     elif name != "still_life":
         right = json.loads((folder / "teacher.json").read_text())["pixel_accuracy"]
-        if name == "room":
-            held_out = f"{len((folder / 'test_views.txt').read_text().split())} test views"
-            every = f" --test-every {numbers.get('test_every', maker.TEST_EVERY)}"
-        else:
-            held_out = f"{len(maker.MOVING)} of them move"
-        print(f"{len(maker.CLASSES)} classes, {held_out}, teacher right at {100 * right:.1f} % of the pixels")
+        moving = "" if name == "room" else f"{len(maker.MOVING)} of them move, "
+        print(f"{len(maker.CLASSES)} classes, {moving}teacher right at {100 * right:.1f} % of the pixels")
     print(f"next: drgs fit {shlex.quote(str(folder))} -o RUN{every}")
 
 
