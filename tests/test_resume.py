@@ -220,6 +220,20 @@ def test_outputs_are_checked_first(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "file").read_text() == "mine"
 
 
+def test_no_command_mixes_its_files_into_a_run(run, monkeypatch, capsys):  # noqa: F811
+    """A run folder as -o is refused before anything is loaded; a single picture may be put there."""
+    monkeypatch.setattr("drgs.commands.scene_input.SceneInput.at", lambda *_: pytest.fail("loaded"))
+    before = sorted(run.path.iterdir())
+    for line in ("fisher", "query --class wall", "crossval", "tradeoff", "render"):
+        command, *options = line.split()
+        assert cli.main([command, str(run.path), *options, "-o", str(run.path)]) == 2
+        told = f"drgs {command}: {run.path}: -o must be another folder than that of a run, with whose files"
+        assert capsys.readouterr().err.startswith(told)
+    assert sorted(run.path.iterdir()) == before
+    with pytest.raises(pytest.fail.Exception, match="loaded"):
+        cli.main(["render", str(run.path), "--view", "a", "-o", str(run.path / "a.png")])
+
+
 @pytest.mark.same_bits
 @pytest.mark.parametrize("options", ["", "--views active --policy random --add 1 --every 2"], ids=["all", "active"])
 def test_two_fits_leave_the_same_checkpoint(dataset, tmp_path, monkeypatch, capsys, two_threads, options):  # noqa: F811

@@ -13,8 +13,9 @@ from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import views_to_sample
 from drgs.display import tables
 from drgs.display.progress import Bar
+from drgs.fitting.resume import lock_output
 from drgs.io.journal import SCHEMA
-from drgs.io.outputs import check_file, lock_folder, write_json, write_whole
+from drgs.io.outputs import check_file, write_json, write_whole
 from drgs.lab import ladder, rasterizers
 from drgs.lab.crossval import Result, crossval
 from drgs.lab.report import html
@@ -25,7 +26,7 @@ def run(args: Crossval) -> int:
     OrbitShape.of(args)  # refuses what cannot be, before anything is read
     inputs = [args.scene, args.cameras or "", args.rasterizer]
     if args.export is None:
-        lock_folder(args.output, "crossval", ["report.html", "crossval.json"], inputs)
+        lock_output(args.output, "crossval", ["report.html", "crossval.json"], inputs)
     elif args.export.suffix != ".npz":
         raise ValueError(f"--export {args.export}: must end with .npz, got {args.export.suffix or 'no suffix'}")
     else:

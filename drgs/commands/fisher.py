@@ -40,6 +40,7 @@ from drgs.display.progress import Bar
 from drgs.ellipsoids import Scene
 from drgs.fitting.config import FitConfig
 from drgs.fitting.errors import error_record_of_views, run_error_record
+from drgs.fitting.resume import lock_output
 from drgs.gain import Information, Prior, check, information_gain, variances
 from drgs.information.blocks import MAP_PRIOR, SceneBlocks
 from drgs.information.expected_error import PARTS, ErrorRecord, error_parts
@@ -50,7 +51,7 @@ from drgs.information.sums import add, together
 from drgs.integrator import render
 from drgs.io.checkpoint import save_state
 from drgs.io.journal import SCHEMA
-from drgs.io.outputs import LockedFolder, lock_folder, write_json
+from drgs.io.outputs import LockedFolder, write_json
 from drgs.settings import RenderSettings
 
 KINDS = ("variance", "share")  # of maps
@@ -65,7 +66,7 @@ def run(args: Fisher) -> None:
     if args.region is not None:
         RegionText.of(args.region, "fisher")
     inputs = [args.scene, args.train or "", args.cameras or ""]
-    output = lock_folder(args.output, "fisher", ["information.safetensors", "fisher.json"], inputs)
+    output = lock_output(args.output, "fisher", ["information.safetensors", "fisher.json"], inputs)
     given = SceneInput.of(args)
     settings = given.over_background(settings)
     text = args.train

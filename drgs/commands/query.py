@@ -26,9 +26,10 @@ from drgs.features.decoder import Decoder, load_decoder
 from drgs.features.pictures import mask_picture
 from drgs.features.query import TEMPERATURE, TextQuery
 from drgs.features.teacher import read_tensor
+from drgs.fitting.resume import lock_output
 from drgs.integrator import render
 from drgs.io.journal import SCHEMA
-from drgs.io.outputs import lock_folder, write_json
+from drgs.io.outputs import write_json
 from drgs.settings import RenderSettings
 
 
@@ -41,7 +42,7 @@ def run(args: Query) -> None:
         raise ValueError(f"one of --class and --text-embedding must be given, got {got}; say what to look for")
     ply = "rest.ply" if args.remove else "selected.ply"
     inputs = [args.scene, args.text_embedding or "", args.decoder or "", args.cameras or ""]
-    output = lock_folder(args.output, "query", ["query.json", ply], inputs)
+    output = lock_output(args.output, "query", ["query.json", ply], inputs)
     given = SceneInput.of(args)
     settings = given.over_background(settings)
     g = given.gaussians

@@ -47,6 +47,7 @@ from drgs.display import pictures
 from drgs.display.mp4 import Mp4, need_mp4
 from drgs.display.progress import Bar, duration
 from drgs.ellipsoids import Gaussians, Scene, colors_only
+from drgs.fitting.resume import lock_output
 from drgs.integrator import render
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import lock_folder, write_json
@@ -81,7 +82,8 @@ def run(args: Render) -> None:
     kinds = [kind for kind in PICTURE_KINDS if getattr(args, kind)]
     movies = [_movie_of(movie, kind, end) for end in _FILMS if end in formats for kind in ("", *kinds)]
     fixed = ["render.json", "cameras.json", *movies] if single is None else [single.name]
-    output = lock_folder(args.output, "render", fixed, inputs=[args.scene, views, *([args.path] if args.path else [])])
+    lock = lock_output if single is None else lock_folder  # one file is named, and may well be in a run folder
+    output = lock(args.output, "render", fixed, [args.scene, views, *([args.path] if args.path else [])])
     given = SceneInput.of(args)
     paint = picture_functions(kinds, given, args.scene)
     gaussians = given.gaussians if paint else given.colors

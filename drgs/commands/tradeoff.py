@@ -39,8 +39,9 @@ from drgs.commands.viewpoints import views_to_sample
 from drgs.data.camera_lists import camera_to_json
 from drgs.display import tables
 from drgs.display.progress import Bar
+from drgs.fitting.resume import lock_output
 from drgs.io.journal import SCHEMA
-from drgs.io.outputs import lock_folder, write_json, write_whole
+from drgs.io.outputs import write_json, write_whole
 from drgs.lab.tradeoff import FullSize, measure, measure_full
 from drgs.lab.tradeoff_advice import USES, Advice, recommend
 from drgs.lab.tradeoff_plot import plot
@@ -63,7 +64,7 @@ def run(args: Tradeoff) -> None:
         _log.warning("no plot will be drawn: matplotlib is not installed; pip install 'drgs[report]'")
     OrbitShape.of(args)  # refuses what cannot be, before anything is read
     names = ["tradeoff.json", "tradeoff.md", "tradeoff.png"]
-    lock_folder(args.output, "tradeoff", names, inputs=[args.scene, args.cameras or ""])
+    lock_output(args.output, "tradeoff", names, [args.scene, args.cameras or ""])
     given = SceneInput.of(args)
     gaussians, fields = given.colors, given.fields
     if not len(gaussians):

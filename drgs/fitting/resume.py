@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from drgs.fitting.components.table import component_files
-from drgs.fitting.records import check_checkpoint, is_fit_config
+from drgs.fitting.records import check_checkpoint, is_fit_config, is_run
 from drgs.io.checkpoint import load_state
 from drgs.io.outputs import LockedFolder, lock_folder, replacing
 from drgs.io.run import Run
@@ -30,6 +30,20 @@ FILES = _Files()
 """What a fit writes into its run folder, besides `renders/`."""
 
 _log = logging.getLogger(__name__)
+
+
+def lock_output(folder: Path, command: str, names: Iterable[str], inputs: Iterable[str | os.PathLike]) -> LockedFolder:
+    """Lock a folder for what a command makes of a scene (`drgs.io.outputs.lock_folder`), which is no run folder.
+
+    Raises:
+        ValueError: If it is one, and as `lock_folder`.
+    """
+    if is_run(folder):
+        raise ValueError(
+            f"{folder}: -o must be another folder than that of a run, with whose files those of `drgs {command}` would "
+            f"be mixed; name another, e.g. {Path('out', command)}"
+        )
+    return lock_folder(folder, command, names, inputs)
 
 
 def lock_run(run: Run, command: str, resume: bool = True, inputs: Iterable = ()) -> LockedFolder:
