@@ -122,3 +122,17 @@ def test_a_run_holds_features_and_networks(run, caplog):  # noqa: F811
     save_state(run.state, tensors | {"parameter.features": features[1:]}, header)
     assert load_run(run).gaussians.features is None
     assert "parameter.features must be torch.float32 of shape" in caplog.text
+
+
+def test_gaussians_alone_are_no_run(run, tmp_path, capsys):  # noqa: F811
+    """What needs a run says what there is for a splat, of a file and of a trainer's folder."""
+    folder = tmp_path / "model/point_cloud/iteration_30"
+    folder.mkdir(parents=True)
+    run.point_cloud.rename(folder / "point_cloud.ply")
+    for path in (folder / "point_cloud.ply", tmp_path / "model"):
+        for command in ("report", "eval"):
+            assert cli.main([command, str(path)]) == 2
+            assert capsys.readouterr().err == (
+                f"drgs {command}: {path}: must be a run folder, is a file or a folder of Gaussians alone; of these, "
+                "drgs fisher --train DATA says what error to expect, and drgs render and drgs share show them\n"
+            )

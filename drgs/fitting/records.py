@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from drgs.cameras.origins import check_origin
+from drgs.codecs.folders import file_of_folder
 from drgs.codecs.ply import load_ply
 from drgs.data.camera_lists import load_cameras_json
 from drgs.fitting.components.base import Checkpoint, Setup
@@ -336,9 +337,14 @@ def fit_record(run: Run) -> FitRecord:
     """The record of a run.
 
     Raises:
-        FileNotFoundError: If it is no run folder.
+        FileNotFoundError: If it is no run folder; of Gaussians alone, with what there is for these.
         ValueError: If config.json is damaged, of another version, or says something that no fit has written.
     """
+    if run.path.is_file() or (run.path.is_dir() and not is_run(run.path) and file_of_folder(run.path) is not None):
+        raise FileNotFoundError(
+            f"{run.path}: must be a run folder, is a file or a folder of Gaussians alone; of these, drgs fisher "
+            "--train DATA says what error to expect, and drgs render and drgs share show them"
+        )
     config = run.config()
     where = f"{run.path / 'config.json'}"
     advice = "restore the file, or fit again in another folder"
