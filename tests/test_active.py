@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -606,7 +607,7 @@ def test_bad_resumes_are_refused(still, tmp_path):
 # ---- the command, and bad input
 
 
-def test_command(still, tmp_path, capsys):
+def test_command(still, tmp_path, capsys, caplog):
     """`drgs fit --views active` passes its options on, opens lazily, and says what to do next."""
     line = f"fit {still} -o {tmp_path / 'run'} --views active --policy coverage --initial 3 --add 1 --every 3"
     more = "--max-steps 6 --max-gaussians 60 --test-every 4 --seed 5 --prior 1e-4 --relative-prior --info-pixels 90"
@@ -616,6 +617,7 @@ def test_command(still, tmp_path, capsys):
     assert (len(record["start"]), len(record["picks"])) == (3, 1)
     out, err = capsys.readouterr()
     assert "added view" in err
+    assert len(re.findall(r"initial points: (?!\d)", err + caplog.text)) == 1
     assert f"\nnext: drgs view {tmp_path / 'run'}; " in out
 
 

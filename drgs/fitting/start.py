@@ -80,9 +80,8 @@ def _rows_at_points(setup: Setup) -> tuple[GaussianRows, str]:
             matches,
             None if is_active else seen,
         )
-        bar.note(f"initial points: {source}")
+        bar.note(f"{len(points)} initial points: {source}")
     setup.points, setup.matches = points, None if given else matches
-    _log.info("%d initial points: %s", len(points), source)
     dense = not given and any(view.depth_path is not None for view in seen)
     kind = config.density.start_of(dense)
     made = GaussianRows.from_points(torch.from_numpy(points), torch.from_numpy(colors), *kind, dataset.origin)
