@@ -86,6 +86,7 @@ def test_expected_error_of_a_run(place, monkeypatch, capsys, caplog):
         assert row["error"]["rmse"] == pytest.approx(float(told.mean().sqrt()), rel=1e-3)
         assert sum(row["error"]["parts"].values()) == pytest.approx(1)
     assert text.startswith("expected error")
+    assert " ".join(text.splitlines()[1].split()).startswith("view of a color expected PSNR misfit ")
     report, text = run("scene.ply --train cameras.json --limit 2", place, monkeypatch, capsys)
     assert report["misfit"] is None
     assert "error" not in report["views"][0]

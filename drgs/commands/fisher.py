@@ -433,7 +433,7 @@ def _print(args: Fisher, known: Known, groups: dict[str, GroupSummary], views: l
             shares = (f"{share:.0%}" for share in view.error.parts.values())
             rows.append((view.name, f"{view.error.rmse:.3g}", f"{-20 * math.log10(view.error.rmse):.1f}", *shares))
     if rows:
-        tables.show(f"expected error ({source})", ("view", "of a color", "PSNR", *PARTS), rows)
+        tables.show(f"expected error ({source})", ("view", "of a color", "expected PSNR", *PARTS), rows)
     rows = []
     for view in views:
         if view.region is not None:
