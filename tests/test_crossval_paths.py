@@ -159,6 +159,21 @@ def test_the_command_says_what_it_did_not_test(scene, tmp_path, capsys):
     assert all(path in page for path in PATHS)
 
 
+def test_the_command_says_the_same_hint_once(scene, tmp_path, capsys):
+    """With the number of paths that it is for; in the JSON each has its own."""
+    g, cameras = scene
+    save_ply(g, tmp_path / "scene.ply")
+    save_cameras_json(tmp_path / "cameras.json", cameras[:1])
+    command = ["crossval", str(tmp_path / "scene.ply"), "--cameras", str(tmp_path / "cameras.json"), "--no-ladder"]
+    assert cli.main([*command, "-o", str(tmp_path / "out")]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    rows = json.loads((tmp_path / "out" / "crossval.json").read_text())["paths"]
+    alike = [row["path"] for row in rows if row["why"] == "presets are drawn without gsplat's arguments"]
+    assert printed.count("presets are drawn without gsplat's arguments") == 1
+    assert f"rasterize:rasterization ({len(alike)} paths)" in printed
+    assert printed.count(f"not tested as {alike[0]}") == len(alike) - 1 > 10
+
+
 def test_presets_and_dumps_say_so(scene):
     """What has no arguments of gsplat's is tested in one view alone."""
     g, cameras = scene

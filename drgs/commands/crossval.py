@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from drgs import runtime
@@ -18,6 +20,7 @@ from drgs.io.journal import SCHEMA
 from drgs.io.outputs import check_file, write_json, write_whole
 from drgs.lab import ladder, rasterizers
 from drgs.lab.crossval import Result, crossval
+from drgs.lab.paths import PathRow
 from drgs.lab.report import html
 
 
@@ -95,8 +98,20 @@ def _print(result: Result, args: Crossval) -> None:
     rms = max(view.rms for view in result.views)
     share = max(view.share for view in result.views)
     print(f"image at these conventions: RMS {rms:.1e}, {share:.2%} of the pixels off by more than 0.001")
-    rows = [(row.path, row.status, "; ".join(x for x in (row.why, row.how) if x)) for row in result.paths]
     columns = ("path", "status", "why, and what would test it")
-    tables.show("paths of the rasterizer", columns, rows, texts=columns[1:])
+    tables.show("paths of the rasterizer", columns, _path_rows(result.paths), texts=columns[1:])
     left = result.not_tested()
     print(f"{report['verdict']}{f' ({left})' if left else ''}: {args.output / 'report.html'}, crossval.json")
+
+
+def _path_rows(paths: Sequence[PathRow]) -> list[tuple[str, str, str]]:
+    """The rows of the table of paths: what several have in common is said once, with how many they are."""
+    texts = ["; ".join(x for x in (path.why, path.how) if x) for path in paths]
+    rows, said = list[tuple[str, str, str]](), dict[str, str]()
+    for path, text in zip(paths, texts, strict=True):
+        shown = f"as {said[text]}" if text in said else text
+        if text and text not in said and (count := texts.count(text)) > 1:
+            said[text] = path.path
+            shown += f" ({count} paths)"
+        rows.append((path.path, path.status, shown))
+    return rows
