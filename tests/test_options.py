@@ -9,7 +9,7 @@ from typing import Literal
 
 import pytest
 
-from drgs import cli, fisher, gain, runtime, select
+from drgs import cli, codecs, fisher, gain, runtime, select
 from drgs.checks.records import Record, option, options_in, part
 from drgs.commands import options
 from drgs.commands.command_line import help_page, parsed_options, words_of
@@ -139,6 +139,15 @@ def test_information_options_are_those_of_an_active_fit(command):
     """`select` and `fisher` weigh views as an active fit does, and as Python's `Scoring()`: it is one record."""
     words = {options.Select: ["x", "--candidates", "y"], options.Fisher: ["x"]}[command]
     assert parsed_options(command, words).scoring == SelectionConfig().scoring == select.Scoring()
+
+
+def test_a_scene_is_what_is_read():
+    """Help names every format and folder that `load_gaussians` reads; query needs features."""
+    told = f"A run folder, or Gaussians: {codecs.readable()}."
+    scenes = {name: options_in(kind).get("scene") for name, kind in options.COMMANDS.items()}
+    texts = {name: one.spec.help for name, one in scenes.items() if one is not None}
+    assert {name for name, text in texts.items() if text != told} == {"query"}
+    assert len(texts) > 8
 
 
 def test_choices_are_what_there_is():

@@ -41,7 +41,8 @@ of_views = functools.partial(option, heading="Views")
 def _scene() -> Any:
     """The scene of a command, its first argument."""
     return option(
-        help="A run folder, or Gaussians: .ply, .spz, .splat, .ksplat, .sog, .glb, a SOG or INRIA model folder.",
+        help="A run folder, or Gaussians: .ply, .spz, .splat, .ksplat, .sog, .glb and .pt, a SOG folder or the folder "
+        "of a trainer (INRIA's, gsplat's, splatfacto).",
         positional=True,
     )
 
@@ -345,9 +346,7 @@ class Render(Settings, Orbits, Views, SceneTimes, Lenses):
 class View(Information, Orbits, Views):
     """Look at a run or a file of Gaussians in the browser, also during a fit."""
 
-    scene: Path = option(
-        help="A run folder, a 3DGS point_cloud.ply, or Gaussians in another format (docs/files.md).", positional=True
-    )
+    scene: Path = _scene()
     train: str | None = of_views(
         None,
         "Training views to display: a data set, a run, a cameras.json or selection.json; default those of the run.",
