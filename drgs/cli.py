@@ -46,7 +46,7 @@ def main(argv: list[str] | None = None) -> int:
     name = argv[0] if argv and argv[0] in COMMANDS else None
     try:
         args = _parse_arguments(argv)
-    except (ValueError, OSError) as error:
+    except (ValueError, NotImplementedError, OSError) as error:
         _complain(name, str(error))
         return 2
     logging.basicConfig(format="%(message)s", handlers=[_Stderr()])

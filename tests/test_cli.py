@@ -211,6 +211,28 @@ def test_bad_settings(monkeypatch, capsys, text, expected):
     assert error.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("render s.ply --set order=foo", "order must be one of"),
+        ("render s.ply --orbit foo=1", "--orbit: must be of a known key"),
+        ("view s.ply --preset gsplat --set traversal=bvh", "use traversal='tiles'"),
+        ("tradeoff s.ply --set foo=1", "--set: must be a render setting"),
+        ("select s.ply --candidates orbit --policy foo", "policy must be one of"),
+        ("select s.ply --candidates orbit --region foo", "region must be box:"),
+        ("fisher s.ply --region box:1", "region must be box:"),
+        ("fit data -o run --set order=entry", "use traversal='bvh'"),
+    ],
+)
+def test_values_are_checked_before_libraries_are_loaded(monkeypatch, capsys, line, expected):
+    """Which takes seconds: one line by the options alone."""
+    monkeypatch.setattr(cli, "_run", lambda *_: pytest.fail("loaded"))
+    assert cli.main(line.split()) == 2
+    error = capsys.readouterr().err
+    assert expected in error
+    assert error.count("\n") == 1
+
+
 def test_info_json():
     """`drgs info --json` prints one JSON object and nothing else."""
     done = _drgs("info", "--json")

@@ -45,7 +45,6 @@ from drgs.gain import Information, Prior, check, information_gain, variances
 from drgs.information.blocks import MAP_PRIOR, SceneBlocks
 from drgs.information.expected_error import PARTS, ErrorRecord, error_parts
 from drgs.information.maps import fisherrf_map, moments_map
-from drgs.information.region import RegionText
 from drgs.information.scoring import Scoring
 from drgs.information.sums import add, together
 from drgs.integrator import render
@@ -63,8 +62,6 @@ def run(args: Fisher) -> None:
     OrbitShape.of(args)  # refuses what cannot be, before anything is read, as settings do
     settings = args.settings()
     prior = args.scoring.prior or MAP_PRIOR
-    if args.region is not None:
-        RegionText.of(args.region, "fisher")
     inputs = [args.scene, args.train or "", args.cameras or ""]
     output = lock_output(args.output, "fisher", ["information.safetensors", "fisher.json"], inputs)
     given = SceneInput.of(args)

@@ -18,9 +18,11 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from drgs.checks.records import check_ranges, option, options_in, part, same_option
 from drgs.cluster.options import check_options
-from drgs.commands.values import ORBIT_KEYS, check_color, parsed
+from drgs.commands.values import ORBIT_KEYS, check_color, parsed, parsed_orbit
 from drgs.fitting.config import COUNT, SEED, FitConfig, SelectionConfig, UndistortUse
 from drgs.fitting.renderers import AUTO, own_preset
+from drgs.information.choices import POLICIES, check_named
+from drgs.information.region import RegionText
 from drgs.information.scoring import Scoring
 from drgs.meshing.options import MeshOptions
 from drgs.settings import Preset, RenderSettings
@@ -99,6 +101,11 @@ class Settings(Common):
         "Error of colors that cut-offs may make, e.g. 1e-3, in place of those of --preset exact: faster, with a bound.",
         rare=True,
     )
+    compares: ClassVar[bool] = False  # presets, some of which may not have what --set says
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.replaced() if self.compares else self.settings()
 
     def settings(self) -> RenderSettings:
         """The `RenderSettings` that --preset and --set describe.
@@ -106,6 +113,10 @@ class Settings(Common):
         Raises:
             ValueError: If an override is no KEY=VALUE, names no field or has the wrong type.
         """
+        return self._settings
+
+    @functools.cached_property
+    def _settings(self) -> RenderSettings:
         return RenderSettings.preset(self.preset, **self.replaced())
 
     def replaced(self) -> dict[str, Any]:
@@ -175,7 +186,7 @@ class Lenses:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Orbits:
+class Orbits(Settings):
     """Options of commands that can make cameras around a scene."""
 
     heading: ClassVar[str] = "Views"
@@ -188,10 +199,16 @@ class Orbits:
     )
     orbit_keys: ClassVar[tuple[str, ...]] = tuple(ORBIT_KEYS)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        parsed_orbit(self.orbit, self.orbit_keys)
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SampledViews(Settings, Orbits, Views):
+class SampledViews(Orbits, Views):
     """Options of commands that look at a scene from a few cameras."""
+
+    compares: ClassVar[bool] = True
 
     scene: Path = _scene()
     cameras: str | None = of_views(
@@ -282,7 +299,7 @@ class Info(Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Render(Settings, Orbits, Views, SceneTimes, Lenses):
+class Render(Orbits, Views, SceneTimes, Lenses):
     """Render a file of Gaussians, or a finished run, to pictures or a video."""
 
     scene: Path = _scene()
@@ -541,6 +558,12 @@ class Select(ComparedViews, Workers):
     config: Path | None = same_option(Fit, "config")
     seed: int = option(0, "Random seed.", within=SEED, rare=True)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_named("select", POLICIES, self.policy)
+        if self.region is not None:
+            RegionText.of(self.region)
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Fisher(ComparedViews):
@@ -567,9 +590,14 @@ class Fisher(ComparedViews):
         False, "Also write an image of each view side by side with its maps of moments, of fisherrf and of every block."
     )
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.region is not None:
+            RegionText.of(self.region, "fisher")
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Query(Settings, Orbits, Views, Lenses):
+class Query(Orbits, Views, Lenses):
     """Find objects by text: write masks of views, and a PLY of the Gaussians of the objects, or of all others."""
 
     scene: Path = option(help="A run that was fitted with semantics, or a 3DGS PLY with features.", positional=True)

@@ -18,7 +18,6 @@ from drgs.data.camera_lists import camera_to_json
 from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.information.criteria import criterion_named
-from drgs.information.region import RegionText
 from drgs.information.scoring import Scoring
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import check_file, write_json
@@ -39,8 +38,6 @@ def run(args: Select) -> None:
     settings = args.settings()
     refine = _refine(args)
     check_region(args.region, args.policy)
-    if args.region is not None:
-        RegionText.of(args.region)  # before the scene is read
     check_file(args.output, "select", [args.scene, args.train or "", args.candidates])
     policy_named(args.policy)
     criterion_named(args.scoring.criterion, "--criterion")

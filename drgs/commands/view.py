@@ -47,8 +47,7 @@ _STOP_SECONDS = 0.5  # seconds that a running computation gets to end; chosen
 
 def run(args: View) -> None:
     """`drgs view SCENE`; returns by Ctrl-C alone."""
-    args.settings()  # refuses what cannot be, before anything is read
-    OrbitShape.of(args)
+    OrbitShape.of(args)  # refuses what cannot be, before anything is read
     with Bar("the scene", show=not args.quiet):
         stamps = _stamps(watched_files(args))
         given = SceneInput.of(args)
