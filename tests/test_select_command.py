@@ -13,10 +13,12 @@ import drgs
 from drgs import cli, fisher
 from drgs.cameras import Camera, look_at, orbit
 from drgs.commands.orbits import dome
+from drgs.commands.select import print_picks
 from drgs.data import load
 from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.files import Run, load_ply, save_ply
 from drgs.gain import Prior, information_gain, unit_length
+from drgs.selection.pool import Pick, Selection
 from drgs.train import fit
 
 
@@ -95,6 +97,26 @@ def test_commands_know_the_backdrop(place, monkeypatch, capsys):
     told = json.loads((place / "fisher/fisher.json").read_text())
     assert told["blocks"] == ["geometry", "backdrop"]
     assert told["groups"]["backdrop"]["sum"] > 0
+
+
+def test_a_score_of_empty_pixels_is_told(tmp_path, capsys):
+    """Where most of a pick's score is of what is behind all Gaussians; not of z-scores, whose parts do not add up."""
+    shares = {"a": 0.6, "b": 0.5, "c": 0.9, "d": 0.8, "e": 0.7}
+    picks = [
+        Pick(i, name, 2.0, {"means": 2 * (1 - share), "backdrop": 2 * share}, None)
+        for i, (name, share) in enumerate(shares.items())
+    ]
+    known = {"names": ["x"], "source": "run"}
+    report = {"policy": "fisher", "criterion": "v_opt", "candidates": [1] * 5, "source": "data", "known": known}
+    selection = Selection(picks, [2.0] * 5, blocks=["geometry", "backdrop"])
+    print_picks({**report, "seconds": 1.0}, selection, tmp_path / "x.json")
+    told = (
+        "note: most of the score of a, c, d and 1 more is of pixels where no Gaussian is (backdrop); --blocks geometry"
+    )
+    assert told in capsys.readouterr().out
+    selection.combine = "zscore"
+    print_picks({**report, "seconds": 1.0}, selection, tmp_path / "x.json")
+    assert "note: " not in capsys.readouterr().out
 
 
 def _selection(place) -> dict:

@@ -30,6 +30,7 @@ _SHORT = {
     "logit_opacities": "opac.",
     "backdrop": "back.",
 }  # a table has 80 columns
+_SHOWN = 3  # names that a note repeats: it is one line
 
 
 def run(args: Select) -> None:
@@ -159,6 +160,13 @@ def print_picks(report: dict, selection: Selection, output: Path) -> None:
     for pick in selection.picks:
         if pick.camera is not None and pick.start is not None:
             print(f"{pick.name}: moved, its score is {pick.score:.4g} instead of {pick.start:.4g}")
+    empty = [pick.name for pick in selection.picks if not compared and pick.parts.get("backdrop", 0) > pick.score / 2]
+    if empty:
+        more = f" and {len(empty) - _SHOWN} more" if len(empty) > _SHOWN else ""
+        print(
+            f"note: most of the score of {', '.join(empty[:_SHOWN])}{more} is of pixels where no Gaussian is "
+            "(backdrop); --blocks geometry scores what Gaussians show alone"
+        )
     for note in selection.notes:
         print(f"note: {note}")
     known = report["known"]
