@@ -36,6 +36,7 @@ from drgs.display.progress import Bar, duration
 from drgs.files import Run, load_state
 from drgs.fitting.config import FitConfig
 from drgs.pages.sharing import npm
+from drgs.sfm.findings import Finding
 from drgs.train import SelectionConfig, Trainer, fit
 
 pytest.importorskip("pycolmap")
@@ -529,8 +530,24 @@ def test_a_view_that_nothing_else_shows(rng):
     assert found.text.startswith("held-out view away has 8.0 dB, and is the only one: the nearest photograph")
     assert diagnosis.of_views(dataset, train, {"4": 8.0}) == []
     assert diagnosis.of_views(dataset, train, {"4": 28.0, "away": 26.0}) == []
+    metrics = {"split": "test", "views": [{"name": "away", "psnr": 8.0}, {"name": "4", "psnr": None}]}
+    assert diagnosis.of_held_out(dataset, train, metrics) == diagnosis.of_views(dataset, train, {"away": 8.0})
+    assert diagnosis.of_held_out(dataset, train, {**metrics, "split": "train"}) == []
     (found,) = diagnosis.of_views(dataset, [name for name in train if name != "6"], {"4": 20.0, "6": 28.0})
     assert found.advice.startswith("look at it in the report")
+
+
+def test_a_fit_tells_of_such_a_view(captured, tmp_path, monkeypatch, capsys):
+    """As a capture does."""
+    asked = []
+    found = [Finding("view", "held-out view away has 8.0 dB", "take two")]
+    monkeypatch.setattr("drgs.commands.fit.of_held_out", lambda *args: asked.append(args) or found)
+    options = "--max-steps 2 --max-pixels 2000 --max-gaussians 100 --for fast --skybox off --no-report"
+    assert cli.main(["fit", str(captured / "capture/scene"), "-o", str(tmp_path / "run"), *options.split()]) == 0
+    assert "\nnote: held-out view away has 8.0 dB; take two\nnext: drgs view" in capsys.readouterr().out
+    ((_, train, metrics),) = asked
+    assert train == [f"IMG_{index}" for index in range(1, 6)]
+    assert metrics["split"] == "test"
 
 
 # ------------------------------------------------------------------------------------------------- budget

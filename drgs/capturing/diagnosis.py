@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -267,6 +267,15 @@ def of_views(dataset: Dataset, train: Sequence[str], psnr: Mapping[str, float]) 
         )
         findings.append(Finding("view", f"{text}{why if far and nearest else ''}", advice))
     return findings
+
+
+def of_held_out(dataset: Dataset, train: Sequence[str], metrics: Mapping[str, Any]) -> list[Finding]:
+    """The findings of `of_views` in the metrics of a fit (metrics.json); none where these are of other views."""
+    if metrics["split"] != "test":
+        return []
+    return of_views(
+        dataset, train, {row["name"]: row["psnr"] for row in metrics["views"] if row.get("psnr") is not None}
+    )
 
 
 def _distance_to_nearest(view: View, others: Sequence[View]) -> float:

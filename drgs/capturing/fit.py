@@ -68,9 +68,7 @@ def fit_photographs(capture: Capture) -> Outcome:
     steps, planned = result.metrics["step"], capture.batch.plan.get("fit", {}).get("max_steps")
     instead = "" if planned in (None, steps) else f" ({planned} were planned, the budget allowed {steps})"
     line = f"{len(result.gaussians)} Gaussians after {steps} steps{instead}{quality}"
-    is_test = result.metrics["split"] == "test"
-    psnr = {row["name"]: row["psnr"] for row in result.metrics["views"] if is_test and row.get("psnr") is not None}
-    findings = diagnosis.of_views(capture.dataset, fit_record(result.run).train, psnr)
+    findings = diagnosis.of_held_out(capture.dataset, fit_record(result.run).train, result.metrics)
     return line, findings + _of_expected_error(capture)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import shlex
 
+from drgs.capturing.diagnosis import of_held_out
 from drgs.commands.eval import print_table
 from drgs.commands.options import Fit
 from drgs.commands.report import report_of
@@ -12,7 +13,7 @@ from drgs.data import Dataset
 from drgs.data.view_checks import default_background
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import load_dataset
-from drgs.fitting.records import fit_record, is_run
+from drgs.fitting.records import fit_record, fitted_views, is_run
 from drgs.fitting.resume import lock_run
 from drgs.io.run import Run
 from drgs.pages.report.write import FILE
@@ -47,6 +48,8 @@ def run(args: Fit) -> None:
         return
     print_table(result.metrics)
     print(f"{len(result.gaussians)} Gaussians in {result.seconds:.0f} s: {result.run.point_cloud}")
+    for finding in of_held_out(dataset, fitted_views(result.run), result.metrics):
+        print(f"note: {finding.line()}")
     if args.report:
         print(f"report: {page}")
     run = shlex.quote(str(result.run.path))
