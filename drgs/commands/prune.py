@@ -21,9 +21,7 @@ from drgs.display import tables
 from drgs.display.progress import Bar
 from drgs.ellipsoids import Gaussians, Scene
 from drgs.fitting.components.base import Checkpoint, Component, RunViews
-from drgs.fitting.components.poses import CAMERAS
-from drgs.fitting.components.semantics import EMBEDDINGS
-from drgs.fitting.components.table import COMPONENTS, held_components
+from drgs.fitting.components.table import COMPONENTS, component_files, held_components
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.metrics import TRAIN_VIEWS, through_renderers
@@ -39,8 +37,10 @@ from drgs.io.run import Run
 from drgs.pruning import ROUNDS, Pruned, check_amount, fit_on, prune
 from drgs.settings import RenderSettings
 
-_COPIED = ("config.json", "env.json", "log.jsonl", SELECTION, EMBEDDINGS, CAMERAS)
-"""Files of a run that hold for it with fewer Gaussians, too."""
+
+def _copied() -> tuple[str, ...]:
+    """Files of a run that hold for it with fewer Gaussians, too."""
+    return ("config.json", "env.json", "log.jsonl", SELECTION, *component_files())
 
 
 def run(args: Prune) -> None:
@@ -138,7 +138,7 @@ class _Output:
         if not path.suffix and is_run(args.scene):
             if is_run(path):
                 raise ValueError(f"{path}: must be a new run folder, holds a run already; choose another")
-            return cls(path, path / "prune.json", [*_COPIED, "state.safetensors", "point_cloud.ply", "prune.json"])
+            return cls(path, path / "prune.json", [*_copied(), "state.safetensors", "point_cloud.ply", "prune.json"])
         report = path.with_name(path.name[: -len(check_suffix("prune", path))] + ".json")
         return cls(path, report, [path.name, origin_file(path).name, report.name])
 
@@ -158,7 +158,7 @@ class _Output:
             save_gaussians(scene.at(None), self.scene)
             return
         run, fewer = Run(self.scene), of_some(checkpoint, kept)
-        for name in _COPIED:
+        for name in _copied():
             if (given.run.path / name).is_file():
                 write_whole(run.path / name, (given.run.path / name).read_bytes())
         save_state(run.state, dict(fewer.tensors), dict(fewer.header))

@@ -47,8 +47,9 @@ class Prior:
 
     value: float = option(
         1e-6,
-        "Prior information about every parameter (lambda): 1e-2 with v_opt, 1 in drgs fisher, else 1e-6. With 0, "
-        "parameters that no training view sees are left out of every score.",
+        "What is known of every parameter before any view (lambda, FisherRF's reg_lambda), added to the information of "
+        "the training views: 1e-2 with v_opt, 1 in drgs fisher, else 1e-6. With 0, parameters that no training view "
+        "sees are left out of every score.",
         flag="prior",
         shown="",
     )
