@@ -20,8 +20,9 @@ for seeds 31, 32 and 33, and in the same way with two starts each
 Named before any fit ran: these rooms, starts and policies (`uniform` is by name, which says nothing here, as `random`).
 Six starts can tell about 0.6 to 1.0 dB, by how much starts in rooms have differed.
 
-Named before any fit ran, and not run yet: still lifes 41 and 42 with three starts each, with the same policies; halls
-43 and 44, kitchens 45 and 46 with two starts each. Nothing was chosen on them. Still lifes are made and raced by
+Named before any fit ran: still lifes 41 and 42 with three starts each, with the same policies; halls 43 and 44,
+kitchens 45 and 46 with two starts each, which were not run yet. Nothing was chosen on them. Still lifes are made and
+raced by
 
     drgs scene still_life --free --views 225 --size 160x120 --spp 16 --seed 41 -o still41
     sed -i /depth_file_path/d still41/transforms.json        fits are by color alone, as in rooms
@@ -120,14 +121,17 @@ def section(rows: Rows) -> str:
 
 
 def free_section(rows: Rows) -> str:
-    """The text and the table of free poses."""
-    rooms, commits = (", ".join(sorted({row[key] for row in rows})) for key in ("scene", "commit"))
-    head = (
-        f"Three rooms ({rooms}) with two starts each, named before any fit ran; {len(rows)} fits, "
-        f"{len({unit_of(row) for row in rows})} starts, commit {commits} ([rows](../benchmarks/free_poses.jsonl)), "
-        "measured and compared as on captures."
-    )
-    return textwrap.fill(head, 120) + "\n\n" + compared_with(rows, ("random", "farthest", "fisherrf"))
+    """The text and the tables of free poses: rooms, and still lifes."""
+    parts = []
+    for kind, start in (("rooms", "free"), ("still lifes", "still")):
+        own = [row for row in rows if row["scene"].startswith(start)]
+        scenes, commits = (", ".join(sorted({row[key] for row in own})) for key in ("scene", "commit"))
+        head = (
+            f"**{kind.capitalize()}** ({scenes}), named before any fit ran: {len(own)} fits, "
+            f"{len({unit_of(row) for row in own})} starts, commit {commits} ([rows](../benchmarks/free_poses.jsonl))."
+        )
+        parts += [textwrap.fill(head, 120), compared_with(own, ("random", "farthest", "fisherrf"))]
+    return "\n\n".join(parts)
 
 
 def pool_section(rows: Rows) -> str:

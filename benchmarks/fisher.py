@@ -190,11 +190,6 @@ def report(r: dict) -> str:
         [name, *(f"{1e3 * row[name]:.0f} ({row[name] / row['forward+backward']:.2f})" for row in r["headline"])]
         for name in names
     ]
-    growth = [
-        f"{1e3 * x['diagonal']:.0f} for {x['gaussians']:,}"
-        for x in r["growth"]
-        if x["views"] == 1 and x["pixels"] == 512  # the others are in fisher.json
-    ]
     parts = [
         f"The exact diagonal of a view takes {min(ratios):.2f} to {max(ratios):.2f} times as long as an image with "
         "gradients. "
@@ -204,7 +199,7 @@ def report(r: dict) -> str:
         "backward. " + " ".join(r.get("note", [])),
         markdown_table(["", *(f"`{row['preset']}`, SH {row['sh']}" for row in r["headline"])], cells),
         f"**Tangents**, forward mode, `fast`: one takes {1e3 * t['1']:.0f} ms, the 6 of the pose "
-        f"{1e3 * t['pose']:.0f}. **Growth** of the diagonal, `fast`, SH 0, in ms: {', '.join(growth)} Gaussians.",
+        f"{1e3 * t['pose']:.0f} ([how the diagonal grows](../benchmarks/fisher.json)).",
         *([picks_line(r["picks"])] if "picks" in r else []),
     ]
     return "\n\n".join(part if part.startswith("|") else paragraph(part) for part in parts)
