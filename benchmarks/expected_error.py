@@ -29,8 +29,9 @@ from where import ran, rows_of_runs
 import drgs
 from drgs import fisher
 from drgs.ellipsoids import Scene, colors_only
+from drgs.files import Run
 from drgs.fitting.frames import Frame, frames_for, load_dataset
-from drgs.fitting.records import load_run
+from drgs.fitting.records import fitted_views, load_run
 from drgs.gain import Prior, variances
 from drgs.information.expected_error import PARTS, error_parts, error_record
 from drgs.studies.tables import markdown_table, paragraph
@@ -45,6 +46,7 @@ TOLD = "expected error"
 MAPS = {"variance, lambda 1": Prior(1.0), "variance, lambda 1e-2": Prior(1e-2)}  # of the blocks geometry and backdrop
 ROWS = ROOT / "benchmarks" / "expected_error.jsonl"
 PAGE = ROOT / "docs" / "uncertainty.md"
+PICKED = "-blind-"  # in names of runs of `drgs reproduce captures`
 VIEWS = 12  # of those held out at most, evenly spaced
 BINS = (0.0, 0.0125, 0.025, 0.05, 0.1, 0.2, 0.4, np.inf)  # expected root of the squared error, units of color
 FEWEST = 0.01  # share of the pixels that a bin must have to be reported
@@ -66,7 +68,10 @@ def measured(path: Path) -> dict:
     config, scene = loaded.record.config, loaded.scene
     settings = config.settings
     dataset = loaded.record.with_refined_poses(load_dataset(loaded.record.data, config, points=False))
-    train, test = (frames_for(views, config.data) for views in dataset.split())
+    fitted = set(fitted_views(Run(path), loaded.record))  # of a pool only those that were picked
+    train, test = dataset.split()
+    train = frames_for([view for view in train if view.name in fitted], config.data)
+    test = frames_for(test, config.data)
     test = test[:: -(-len(test) // VIEWS)]
     cameras, masks = [frame.camera for frame in train], [frame.mask for frame in train]
     record = error_record(scene, cameras, [frame.image() for frame in train], settings, masks=masks)
@@ -177,15 +182,17 @@ def main_table(rows: list[dict]) -> str:
 
 
 def halves(rows: list[dict]) -> dict[str, list[dict]]:
-    """The runs that constants were chosen on, and captures and made scenes that only report."""
+    """The runs that constants were chosen on, captures and made scenes that only report, and fits to picked views."""
     moving = [row for row in rows if row["run"] in MOVING]
-    rows = [row for row in rows if row["run"] not in MOVING]
+    picked = [row for row in rows if PICKED in row["run"]]
+    rows = [row for row in rows if row["run"] not in MOVING and PICKED not in row["run"]]
     other = [row for row in rows if row["run"] not in CHOOSING]
     return {
         "choosing": [row for row in rows if row["run"] in CHOOSING],
         "moving": moving,
         "captures": [row for row in other if row["run"] not in MADE],
         "made": [row for row in other if row["run"] in MADE],
+        "picked": picked,
     }
 
 
@@ -193,14 +200,17 @@ def summary(rows: list[dict]) -> str:
     """What the runs that only report say together, captures and made scenes apart."""
     sentences = []
     parts = halves(rows)
-    for what, some in (("captures", parts["captures"]), ("made scenes", parts["made"])):
+    kinds = {"captures": "captures that chose nothing", "made": "made scenes that chose nothing"}
+    kinds["picked"] = "fits to 20 views that the default picked among free poses or in pools as people leave them"
+    for kind, what in kinds.items():
+        some = parts[kind]
         if not some:
             continue
         names = [TOLD, next(iter(MAPS)), "1 - alpha"]
         means = (f"{name} {statistics.mean(row['ause'][name] for row in some):.2f}" for name in names)
         told, true = ([x for row in some for x in row[key]] for key in ("told", "true"))
         sentences.append(
-            f"On {len(some)} {what} that chose nothing, mean AUSE: {', '.join(means)}; Spearman's rho of expected and "
+            f"On {len(some)} {what}, mean AUSE: {', '.join(means)}; Spearman's rho of expected and "
             f"true error over their {len(true)} views is {studies.rank_correlation(told, true):.2f}."
         )
     ratio = statistics.median(row["seconds"][1] / row["seconds"][0] for row in rows)
