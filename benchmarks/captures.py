@@ -135,21 +135,13 @@ def free_section(rows: Rows) -> str:
 
 
 def pool_section(rows: Rows) -> str:
-    """The sentences of pools as people leave them: what the default is ahead of others with most views, by pool."""
-    last = at_views(rows, SHOWN[-1])
-    leads = []
-    for name in dict.fromkeys(row["scene"] for row in rows):
-        own = [row for row in last if row["scene"] == name]
-        ahead = ", ".join(
-            f"{estimate(differences(own, 'psnr', DEFAULT, other)).mean:+.1f} over `{other}`" for other in POOL_OTHERS
-        )
-        leads.append(f"`{name}` {ahead}")
-    units, commits = {unit_of(row) for row in rows}, ", ".join(sorted({row["commit"] for row in rows}))
-    text = (
-        f"With {SHOWN[-1]} views the default gains, in dB: {'; '.join(leads)} ({len(units)} starts, {len(rows)} "
-        f"fits, no verdict; commit {commits}, [rows](../benchmarks/pools.jsonl))."
+    """The text and the table of pools as people leave them."""
+    pools, commits = (", ".join(sorted({row[key] for row in rows})) for key in ("scene", "commit"))
+    head = (
+        f"{pools}, named before any fit ran: {len(rows)} fits, {len({unit_of(row) for row in rows})} starts, commits "
+        f"{commits} ([rows](../benchmarks/pools.jsonl))."
     )
-    return textwrap.fill(text, 120)
+    return textwrap.fill(head, 120) + "\n\n" + compared_with(rows, POOL_OTHERS)
 
 
 def compared_with(rows: Rows, others: Sequence[str]) -> str:

@@ -214,7 +214,7 @@ def summary(rows: list[dict]) -> str:
             f"true error over their {len(true)} views is {studies.rank_correlation(told, true):.2f}."
         )
     ratio = statistics.median(row["seconds"][1] / row["seconds"][0] for row in rows)
-    cost = f"A record takes {ratio:.2f} times the CPU time of the same views' diagonal and backdrop."
+    cost = f"A record takes {ratio:.2f} times the CPU time of the same views' information."
     return " ".join([*sentences, cost])
 
 
@@ -248,7 +248,7 @@ def data_lines(rows: list[dict]) -> list[list[str]]:
 def main() -> int:
     rows = rows_of_runs(ROWS, measured, __doc__)
     parts = halves(rows)
-    text = [f"`python benchmarks/expected_error.py`, {studies.made(rows)}."]
+    text = [paragraph(f"`python benchmarks/expected_error.py`, {studies.made(rows)}.")]
     text += [paragraph(summary(rows))] if parts["captures"] else []
     text += [main_table([*parts["captures"], *parts["made"], *parts["moving"]])]
     print("\n\n".join(text))

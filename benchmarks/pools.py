@@ -9,7 +9,7 @@ two degrees about its center, which is exact: a photograph says what is seen in 
 view that looks away is a corner of a photograph, a third of its width.
 
 Named before any fit ran: `moved` of every fourth photograph of `bonsai`, `blurred` of `watch`, and `rooftop.mp4` as
-`drgs sfm` leaves it (not run yet), two starts each, with the policies of the race on captures but `blur`, and `random`:
+`drgs sfm` leaves it, two starts each, with the policies of the race on captures but `blur`, and `random`:
 
     drgs reproduce captures --protocol blind --seeds 2 --data FOLDER --policy random --policy uniform \
         --policy farthest --policy fisherrf --policy "geometry+backdrop, v_opt" -o OUT

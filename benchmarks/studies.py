@@ -138,9 +138,10 @@ def stamp(script: str) -> str:
 
 
 def made(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Where and when rows were measured, the last of them named."""
+    """Where and when rows were measured."""
+    machines, days = (" and ".join(dict.fromkeys(row[key] for row in rows)) for key in ("machine", "date"))
     commits = dict.fromkeys(row["commit"] for row in rows)
-    return f"{rows[-1]['machine']}, {rows[-1]['date']}, commit{'s' * (len(commits) > 1)} {', '.join(commits)}"
+    return f"{machines}, {days}, commit{'s' * (len(commits) > 1)} {', '.join(commits)}"
 
 
 def write_rows(path: Path, rows) -> None:

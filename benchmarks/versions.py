@@ -269,7 +269,8 @@ def page() -> None:
     last = rows[-1]
     timed: dict[str, list[float]] = {}
     for row in rows:
-        timed.setdefault(row["timed"], []).append(row["ratio"])
+        if "backward" in row["timed"] or "pick" in row["timed"]:  # the others are in the rows
+            timed.setdefault(row["timed"], []).append(row["ratio"])
     ratios = "; ".join(
         f"{name} {' to '.join(dict.fromkeys(f'{of(found):.2f}' for of in (min, max)))}" for name, found in timed.items()
     )
