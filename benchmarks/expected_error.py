@@ -210,8 +210,8 @@ def summary(rows: list[dict]) -> str:
         means = (f"{name} {statistics.mean(row['ause'][name] for row in some):.2f}" for name in names)
         told, true = ([x for row in some for x in row[key]] for key in ("told", "true"))
         sentences.append(
-            f"On {len(some)} {what}, mean AUSE: {', '.join(means)}; Spearman's rho of expected and "
-            f"true error over their {len(true)} views is {studies.rank_correlation(told, true):.2f}."
+            f"On {len(some)} {what}, mean AUSE: {', '.join(means)}; Spearman's rho of views' errors, over "
+            f"{len(true)}, {studies.rank_correlation(told, true):.2f}."
         )
     ratio = statistics.median(row["seconds"][1] / row["seconds"][0] for row in rows)
     cost = f"A record takes {ratio:.2f} times the CPU time of the same views' information."
