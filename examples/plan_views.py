@@ -67,7 +67,7 @@ def fly(options: argparse.Namespace) -> None:
         planner = drgs.Planner.load(options.save)
         begin, here, left, state = (planner.notes[name] for name in ("number", "here", "left", "draw"))
         draw.setstate((state[0], tuple(state[1]), state[2]))
-    for number in range(begin, options.photographs):
+    for number in range(begin, min(options.photographs, len(places) - 1)):  # from each there is a next one
         if options.save and number > begin:  # with what this program knows beside the planner
             planner.save(options.save, {"number": number, "here": here, "left": left, "draw": draw.getstate()})
         left.remove(here)
@@ -79,11 +79,11 @@ def fly(options: argparse.Namespace) -> None:
         quality, told = psnr(planner.scene, held_out[:12], 12_000), ""
         if options.policy == "plan":
             near = [places[name] for name in sorted(draw.sample(left, min(CANDIDATES, len(left))))]
-            planner.scores(near, cost=distance, seconds=options.seconds)
+            scored = planner.scores(near, cost=distance, seconds=options.seconds)
             plan = planner.next(seconds=0)  # by what `scores` has just asked
             pick = plan.picks[0]
             there = pick.camera.name
-            told = f", {plan.seconds:.1f} s, {pick.cost:.1f} away, changed {plan.changed:.2f}"
+            told = f", {scored.seconds:.1f} s, {pick.cost:.1f} away, changed {plan.changed:.2f}"
         else:
             there = left[0] if options.policy == "order" else draw.choice(left)
         count = len(planner.scene)

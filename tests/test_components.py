@@ -32,7 +32,7 @@ from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.metrics import evaluate
 from drgs.fitting.networks import Network, saved_networks
 from drgs.fitting.records import check_checkpoint, load_run
-from drgs.fitting.resume import FILES
+from drgs.fitting.resume import run_files
 from drgs.fitting.rows import GaussianRows
 from drgs.fitting.trainer import StepResult, Trainer
 from drgs.integrator import render
@@ -143,9 +143,9 @@ def test_files_of_a_component_are_files_of_a_run(monkeypatch):
         name = "noted"
         files = ("noted.json",)
 
-    assert {"config.json", "text_embeddings.npy", "refined_cameras.json"} < set(FILES)
+    assert {"config.json", "text_embeddings.npy", "refined_cameras.json"} < set(run_files())
     monkeypatch.setitem(COMPONENTS, "noted", Noted)
-    assert "noted.json" in FILES
+    assert "noted.json" in run_files()
 
 
 class Corrected(Component):

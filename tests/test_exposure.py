@@ -241,7 +241,7 @@ def test_held_out_views_are_metered_in_fits_and_measured_again(tmp_path, monkeyp
     """What a fit with gains measures of its held-out views, `drgs eval` finds again, in every renderer; without the
     meter it is something else.
     """
-    monkeypatch.setattr(exposures, "LEAST_LOWERED", -math.inf)
+    monkeypatch.setattr("drgs.fitting.exposures.LEAST_LOWERED", -math.inf)
     write_photographs(tmp_path / "data", GAINS)
     settings = config(max_steps=2, exposure="points", test_every=9)
     result = fit(load(tmp_path / "data", test_every=9), tmp_path / "run", settings)
@@ -251,7 +251,7 @@ def test_held_out_views_are_metered_in_fits_and_measured_again(tmp_path, monkeyp
         assert first["mean"]["psnr"] == pytest.approx(again["mean"]["psnr"], abs=1e-4)
         rows = [[row["mean"]["psnr"] for row in one["renderers"]["rows"]] for one in (first, again)]
         assert rows[0] == pytest.approx(rows[1], abs=1e-4)
-        monkeypatch.setattr(exposures, "LEAST_LOWERED", math.inf)
+        monkeypatch.setattr("drgs.fitting.exposures.LEAST_LOWERED", math.inf)
         assert abs(evaluate_run(result.run, output)["mean"]["psnr"] - first["mean"]["psnr"]) > 0.01
 
 

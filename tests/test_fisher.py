@@ -225,7 +225,9 @@ def test_features_have_the_information_of_their_weights():
     exact, columns = fisher.diagonal(g, cam, settings), fisher.diagonal(g, cam, settings, "columns")
     assert exact["features"].shape == (len(g),)
     assert error(exact["features"], columns["features"]) <= 1e-4
-    assert torch.allclose(exact["features"], fisher.coverage(g, cam, settings), rtol=1e-6)
+    coverage = fisher.coverage(g, cam, settings)
+    assert torch.allclose(exact["features"], coverage, rtol=1e-6)
+    assert coverage.untyped_storage().nbytes() == 8 * len(g)  # and not that of all sums
 
 
 @pytest.mark.parametrize("direction", ["gaussian", "ray"])

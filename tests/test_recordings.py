@@ -91,6 +91,9 @@ def information(g, camera, settings, mask=None):
         of = fisher.diagonal(seen, camera, settings, method, masks=mask)
         found |= {f"{method} {name}": x for name, x in of.items()}
     weights = {name: 1 / (x + 1) for name, x in of.items()}
+    weighted = fisher.diagonal(seen, camera, settings, groups=("means", "sh"), channel_weights=(0.3, 0.5, 2.0))
+    found |= {f"weighted {name}": x for name, x in weighted.items()}
+    found |= {f"removal, {power}": fisher.removal_error(seen, camera, settings, power=power) for power in (2, 1)}
     return found | {"map": fisher.variance_map(seen, camera, weights, settings)}
 
 
@@ -139,6 +142,7 @@ def test_all_that_changes_between_the_information_of_two_views():
         mask[:5] = 0
         check_information(g, camera, fast, [mask])
     check_information(g.replace(sh=g.sh[:, :1]), camera, fast)
+    check_information(scene(dtype=torch.float64)[0], camera, fast)
     check_information(g, camera, fast.replace(extent=2.0, alpha_min=0.02))
     behind = camera.w2c.copy()
     behind[2, 3] = -100.0
@@ -161,7 +165,7 @@ def test_information_of_a_second_view_is_not_traced(monkeypatch):
         assert calls
         fisher.diagonal(seen, camera, settings)  # Dr.Jit may record once more, for arrays that are aligned otherwise
         calls.clear()
-        other = fisher.diagonal(seen.replace(logit_opacities=seen.logit_opacities - 0.5), camera, settings)
+        other = fisher.diagonal(seen.replace(sh=0.5 * seen.sh), camera, settings)
         assert not calls
         assert not torch.equal(first["means"], other["means"])
 

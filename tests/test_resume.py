@@ -15,7 +15,7 @@ import drgs
 from drgs import cli
 from drgs.files import Run, load_state, save_ply, save_state
 from drgs.fitting.records import load_run
-from drgs.fitting.resume import FILES, PREVIOUS
+from drgs.fitting.resume import PREVIOUS, run_files
 from drgs.io import locks
 from drgs.train import Trainer, fit
 
@@ -156,7 +156,7 @@ def test_edited_gaussians_stay(dataset, run):  # noqa: F811
     assert len(drgs.load_ply(run.point_cloud)) == len(g)
 
 
-@pytest.mark.parametrize("name", [*FILES, "renders/preview_000003.png", "renders/test/0.png"])
+@pytest.mark.parametrize("name", [*run_files(), "renders/preview_000003.png", "renders/test/0.png"])
 def test_files_of_others_stay(dataset, tmp_path, name):  # noqa: F811
     """Each name that a fit writes, in a folder that is no run, is refused before the first step."""
     file = tmp_path / "run" / name

@@ -19,6 +19,7 @@ from scenes_random import camera, gaussians
 
 from drgs import fisher, runtime
 from drgs.integrator import render, render_jvp
+from drgs.runtime.threads import fewer_torch_threads
 from drgs.settings import RenderSettings
 from drgs.tracing.call import Call
 
@@ -244,3 +245,17 @@ def test_the_garbage_collector_waits():
     thread.join(30)
     assert seen == [False, False, True, False]
     assert gc.isenabled()
+
+
+def test_a_pick_within_a_fit_has_half_of_torchs_threads():
+    """Not a quarter; and all of them afterwards."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(8)
+    try:
+        with fewer_torch_threads():
+            with fewer_torch_threads():
+                assert torch.get_num_threads() == 4
+            assert torch.get_num_threads() == 4
+        assert torch.get_num_threads() == 8
+    finally:
+        torch.set_num_threads(before)

@@ -12,7 +12,7 @@ from drgs.capturing.capture import Capture, config_of
 from drgs.capturing.expected_errors import of_expected_error
 from drgs.fitting.config import FitConfig
 from drgs.fitting.records import fit_record, is_run
-from drgs.fitting.resume import FILES, last_checkpoint, lock_run
+from drgs.fitting.resume import last_checkpoint, lock_run, run_files
 from drgs.io.checkpoint import save_state
 from drgs.io.outputs import lock_folder
 from drgs.pages.report.write import FILE as REPORT
@@ -123,7 +123,7 @@ def _put_checkpoint_aside(capture: Capture) -> Path:
         capture.record.write()
     if batch.handover == "kept":
         with lock_run(run, "capture") as held:
-            for name in (*FILES, "renders", NEXT, REPORT, PAGE):
+            for name in (*run_files(), "renders", NEXT, REPORT, PAGE):
                 held.remove(run.path / name)
         batch.handover = "cleared"
         capture.record.write()

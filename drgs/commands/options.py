@@ -101,11 +101,14 @@ class Settings(Common):
         "Error of colors that cut-offs may make, e.g. 1e-3, in place of those of --preset exact: faster, with a bound.",
         rare=True,
     )
-    compares: ClassVar[bool] = False  # presets, some of which may not have what --set says
+    draws_presets: ClassVar[bool] = False  # several, some of which may not have what --set says
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.replaced() if self.compares else self.settings()
+        if self.draws_presets:
+            self.replaced()
+        else:
+            self.settings()
 
     def settings(self) -> RenderSettings:
         """The `RenderSettings` that --preset and --set describe.
@@ -208,7 +211,7 @@ class Orbits(Settings):
 class SampledViews(Orbits, Views):
     """Options of commands that look at a scene from a few cameras."""
 
-    compares: ClassVar[bool] = True
+    draws_presets: ClassVar[bool] = True
 
     scene: Path = _scene()
     cameras: str | None = of_views(

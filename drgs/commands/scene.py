@@ -119,11 +119,14 @@ def _print_result(name: str, folder: Path, maker: ModuleType, numbers: dict[str,
     from drgs.fitting.config import FitConfig  # they take seconds to load, that wrong options need not wait for
     from drgs.fitting.frames import load_dataset
 
-    config = FitConfig()
-    every = ""
+    config, chosen = FitConfig(), ""  # options of the fit that the data set needs
     if name == "room":
         config = config.replace(test_every=numbers.get("test_every", maker.TEST_EVERY))
-        every = f" --test-every {config.data.test_every}"
+        chosen = f" --test-every {config.data.test_every}"
+    times = numbers.get("times", 0)
+    if config.data.times is not None and times > config.data.times:
+        config = config.replace(times=times)
+        chosen = f" --times {times}"
     dataset = load_dataset(folder, config, lazy=True, points=False, semantics=False)
     train, test = dataset.split()
     camera = (train or test)[0].camera
@@ -138,7 +141,7 @@ def _print_result(name: str, folder: Path, maker: ModuleType, numbers: dict[str,
         right = json.loads((folder / "teacher.json").read_text())["pixel_accuracy"]
         moving = "" if name == "room" else f"{len(maker.MOVING)} of them move, "
         print(f"{len(maker.CLASSES)} classes, {moving}teacher right at {100 * right:.1f} % of the pixels")
-    print(f"next: drgs fit {shlex.quote(str(folder))} -o RUN{every}")
+    print(f"next: drgs fit {shlex.quote(str(folder))} -o RUN{chosen}")
 
 
 def _pair(option: str, text: str, *names: str) -> dict[str, int]:

@@ -48,10 +48,11 @@ _STOP_SECONDS = 0.5  # seconds that a running computation gets to end; chosen
 def run(args: View) -> None:
     """`drgs view SCENE`; returns by Ctrl-C alone."""
     OrbitShape.of(args)  # refuses what cannot be, before anything is read
+    if args.scene.exists():  # else `SceneInput` says so: who names a wrong path need not install anything to be told
+        require_viser()
     with Bar("the scene", show=not args.quiet):
         stamps = _stamps(watched_files(args))
         given = SceneInput.of(args)
-        require_viser()  # after the scene: who names a wrong path need not install anything to be told
         from drgs.viewing.server import Viewer
 
         # A browser may be closed while something is on its way to it: that is no news.

@@ -6,10 +6,12 @@ count on, or is refused in one line.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import logging
 import math
 import os
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +20,7 @@ import numpy as np
 import torch
 
 from drgs.cameras.origins import check_origin
+from drgs.codecs import CODECS
 from drgs.codecs.folders import file_of_folder
 from drgs.codecs.ply import load_ply
 from drgs.data.camera_lists import load_cameras_json
@@ -333,6 +336,15 @@ def config_record(
     return recorded | ({} if began is None else {"begin": began})
 
 
+def _is_of_gaussians(path: Path) -> bool:
+    """Whether it is a file that `load_gaussians` reads by its suffix, or a folder of another trainer."""
+    if path.is_file():
+        return path.name.lower().endswith((".ply", *(codec.suffix for codec in CODECS.values())))
+    with contextlib.suppress(FileNotFoundError, ValueError):  # what is wrong with it matters to who reads it
+        return path.is_dir() and file_of_folder(path) is not None
+    return False
+
+
 def fit_record(run: Run) -> FitRecord:
     """The record of a run.
 
@@ -340,10 +352,10 @@ def fit_record(run: Run) -> FitRecord:
         FileNotFoundError: If it is no run folder; of Gaussians alone, with what there is for these.
         ValueError: If config.json is damaged, of another version, or says something that no fit has written.
     """
-    if run.path.is_file() or (run.path.is_dir() and not is_run(run.path) and file_of_folder(run.path) is not None):
+    if not is_run(run.path) and _is_of_gaussians(run.path):
         raise FileNotFoundError(
-            f"{run.path}: must be a run folder, is a file or a folder of Gaussians alone; of these, drgs fisher "
-            "--train DATA says what error to expect, and drgs render and drgs share show them"
+            f"{run.path}: must be a run folder, is one of Gaussians alone; drgs fisher {shlex.quote(str(run.path))} "
+            "--train DATA -o OUT says what error to expect of these, and drgs render and drgs share show them"
         )
     config = run.config()
     where = f"{run.path / 'config.json'}"

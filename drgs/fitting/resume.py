@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
 from drgs.fitting.components.table import component_files
@@ -18,15 +18,12 @@ PREVIOUS = "state.previous.safetensors"
 _CHECKPOINTS = ("state.safetensors", PREVIOUS)
 
 
-class _Files:
-    """The names, as iterated: components may have been added to their table since this module was imported."""
-
-    def __iter__(self) -> Iterator[str]:
-        yield from ("config.json", "env.json", "log.jsonl", "metrics.json", "selection.json", *component_files())
-        yield from ("point_cloud.ply", "errors.safetensors", "report.html", *_CHECKPOINTS)
+def run_files() -> tuple[str, ...]:
+    """Names of what a fit writes into its run folder, besides `renders/`, for components as they are by now."""
+    before = "config.json", "env.json", "log.jsonl", "metrics.json", "selection.json", *component_files()
+    return *before, "point_cloud.ply", "errors.safetensors", "report.html", *_CHECKPOINTS
 
 
-FILES = _Files()
 """What a fit writes into its run folder, besides `renders/`."""
 
 _log = logging.getLogger(__name__)
@@ -55,7 +52,7 @@ def lock_run(run: Run, command: str, resume: bool = True, inputs: Iterable = ())
         resume: A run is there already, or may be.
         inputs: What the command reads.
     Raises:
-        ValueError: If another process writes there, there is a run and `resume` is False, or one of `FILES` is not
+        ValueError: If another process writes there, there is a run and `resume` is False, or one of `run_files` is not
             what drgs wrote.
     """
     held = lock_folder(run.path, command, inputs=inputs)
@@ -64,13 +61,13 @@ def lock_run(run: Run, command: str, resume: bool = True, inputs: Iterable = ())
         if is_fit and resume:
             pictures = ("preview_*.png", "test/*.png", "train/*.png", "all/*.png")
             drawn = [str(path.relative_to(run.path)) for kind in pictures for path in run.renders.glob(kind)]
-            held.record_existing([*FILES, *drawn], "fit")  # a copy without hidden files
+            held.record_existing([*run_files(), *drawn], "fit")  # a copy without hidden files
         if is_fit and not resume:
             raise ValueError(
                 f"{run.path}: must be a new run folder, holds a run already; add --resume or choose another"
             )
-        held.check(name for name in FILES if not (resume and name in _CHECKPOINTS))  # those: `last_checkpoint`
-        there = [name for name in FILES if (run.path / name).exists()]
+        held.check(name for name in run_files() if not (resume and name in _CHECKPOINTS))  # those: `last_checkpoint`
+        there = [name for name in run_files() if (run.path / name).exists()]
         if there and not resume:
             raise ValueError(
                 f"{run.path}: must be a new run folder, holds {there[0]} of one; add --resume or choose another"

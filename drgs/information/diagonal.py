@@ -166,7 +166,7 @@ class Coverage(Quantity):
         if not len(view.gaussians):
             return {"coverage": torch.zeros(0, dtype=torch.float64)}
         sums = view.replay(geometry=False).sums((GEOMETRY,), [1.0] * 3)
-        return {"coverage": sums[:, GEOMETRY].cpu()}
+        return {"coverage": sums[:, GEOMETRY].cpu().contiguous()}
 
 
 # -------------------------------------------------- methods

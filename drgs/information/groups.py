@@ -28,7 +28,8 @@ class Group:
     Attributes:
         owner: `gaussians` or `scene`: of which of them `input` and the tangents are.
         shape: Gaussians -> shape of its information.
-        entries: What it is made from, of the sums of a replay (`jacobian.SquareSums`); empty where that knows nothing.
+        entries: What it is made from, of the sums of a replay (`jacobian.SquareSums`), one after the other; empty where
+            that knows nothing.
         collect: (N, entries) sums, `Replay`, channel weights -> its information; None likewise.
         spread: Weights shaped like its information, `Replay` -> (N, entries or 3) weights of squares in a pixel
             (`jacobian.VarianceSums`); None where a pixel's RGB do not depend on it.

@@ -1,4 +1,6 @@
-"""The hits of a rendered view, walked again for the rows of the Jacobian, and what they need besides the records.
+"""The hits of a rendered view, walked again for the rows of the Jacobian.
+
+What they need of each Gaussian besides its record (`tracing/records.py`), dc/dmu among it, are `gaussian_slopes`.
 
 For a view whose frame is made of recorded steps (`tracing/frames.py`), sums over its hits are such steps, too, each of
 which makes its own `Hits` of arrays. Other views are traced each time, by the same functions.
@@ -38,7 +40,7 @@ class Walk(NamedTuple):
     """Rays of one traversal, to be walked again.
 
     Attributes:
-        first: It is the traversal whose colors weigh.
+        first: Its colors count; further traversals, for more semantic channels, composite them with a weight of 0.
         start: Row of its first semantic channel.
         weights: Weights of its channels: three colors, then semantic channels.
         channels: What it composited.
@@ -111,7 +113,7 @@ class Hits:
 
 
 @runtime.exactly
-def shapes(
+def gaussian_slopes(
     lib: Lib,
     settings: RenderSettings,
     response: Response,
@@ -213,8 +215,8 @@ def tangents_of(inputs: dict[str, torch.Tensor]) -> dict[str, list[torch.Tensor]
 # -------------------------------------------------- recorded steps: functions of what they depend on, and of arrays
 
 
-def shaped(view: frames.View, a: dict) -> dict:
-    """`shapes` of a frame."""
+def gaussian_slopes_of_frame(view: frames.View, a: dict) -> dict:
+    """`gaussian_slopes` of a frame."""
     response = view.response
     seen = frames.projected(view, a["inputs"], a["pinhole"])
     moved = None
@@ -222,10 +224,10 @@ def shaped(view: frames.View, a: dict) -> dict:
         record_of = lambda inputs: frames.projected(view, inputs, a["pinhole"]).record  # noqa: E731
         moved = moved_records(a["inputs"], a["tangents"], record_of)
     given = runtime.dr_types(), view.settings, response, a["inputs"]
-    return shapes(*given, seen, view.coefficients, moved)
+    return gaussian_slopes(*given, seen, view.coefficients, moved)
 
 
-class SummedOver(NamedTuple):
+class SumOfFrame(NamedTuple):
     """What a sum over the hits of a frame depends on besides arrays.
 
     Attributes:
@@ -243,7 +245,7 @@ class SummedOver(NamedTuple):
     color: bool
 
 
-def summed(what: SummedOver, a: dict) -> Float:
+def summed(what: SumOfFrame, a: dict) -> Float:
     """The buffer of the sums of a frame."""
     hits = Hits(frames.composited(what.view, a["seen"], a["finals"]), a.get("extras"), what.color, a.get("mask"))
     compositor = hits.compositor
@@ -258,7 +260,7 @@ def sh_squares(what: tuple[int, tuple[float, ...]], a: dict) -> Float:
 
     Args:
         what: K, and the weights.
-        a: `squares`, (N,) float64 sum w^2, with `basis` and `lit` of `shapes`.
+        a: `squares`, (N,) float64 sum w^2, with `basis` and `lit` of `gaussian_slopes`.
     """
     lib = runtime.dr_types()
     coefficients, weights = what

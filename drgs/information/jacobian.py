@@ -4,7 +4,7 @@ With the notation of kernels.py, dC_c = T (c_c - B_c) da + w dc_c, where B_c lie
 to a channel is summed up, then squared. Channels are those that were composited: colors, whose c moves with the mean
 and behind which there is a background, then any number of others, for which dc = 0 and the background is 0. The
 derivatives da of a hit's opacity by the geometry of its Gaussian are closed forms of the responses
-(`tracing/peak.py`, where they are derived); dc by the mean is the same for all hits of a Gaussian (replay.py).
+(`tracing/peak.py`, where they are derived); dc by the mean is the same for all hits of a Gaussian (hits.py).
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ class SquareSums(Sink):
         entries: Those that are wanted.
         bands: SH coefficients whose sums (w Y_k)^2 over the rays where a channel is not clamped are wanted as well:
             where SH are evaluated along each ray, they are no multiple of sum w^2.
-        summed: Sum the channels before squaring, as FisherRF does.
+        channels_first: Sum the channels before squaring, as FisherRF does.
     """
 
     def __init__(
@@ -203,7 +203,7 @@ class SquareSums(Sink):
         mode: dr.ReduceMode,
         entries: Sequence[int],
         bands: int = 0,
-        summed: bool = False,
+        channels_first: bool = False,
     ) -> None:
         self.width = packed_size(GEOMETRY + 1 + 3 * bands)
         self.buffer = dr.zeros(lib.Float, count * self.width)
@@ -211,7 +211,7 @@ class SquareSums(Sink):
         self.entries = entries
         self.mode = mode
         self.bands = bands
-        self.summed = summed
+        self.channels_first = channels_first
         self.needs_color = bands > 0
 
     def take(self, lib: Lib, index: UInt32, hits: Mask, rows: list[Row], states: list[dict]) -> list[dict]:
@@ -223,7 +223,7 @@ class SquareSums(Sink):
                 if k == GEOMETRY:
                     total = dr.fma(row.w, row.w, total)
                 else:
-                    total += weighted_squares(row, k, self.weights, self.summed)
+                    total += weighted_squares(row, k, self.weights, self.channels_first)
             sums[k] = total
         for k in range(self.bands):
             for c in range(3):
@@ -233,10 +233,10 @@ class SquareSums(Sink):
         return states
 
 
-def weighted_squares(row: Row, j: int, weights: Sequence[float], summed: bool = False) -> Float:
+def weighted_squares(row: Row, j: int, weights: Sequence[float], channels_first: bool = False) -> Float:
     """sum_c weight_c (dC_c / d(geometry j))^2."""
     slopes, g, turned = row.slopes, row.g, row.turned
-    if summed:
+    if channels_first:
         value = sum(_entry(slopes, g, turned, j, c) for c in range(len(g)))
         return value * value
     if turned and j < 3:

@@ -10,7 +10,17 @@ import drjit as dr
 import torch
 
 from drgs.information.groups import GROUPS, Information
-from drgs.information.hits import Hits, SummedOver, Walk, moved_records, sh_squares, shaped, shapes, summed, tangents_of
+from drgs.information.hits import (
+    Hits,
+    SumOfFrame,
+    Walk,
+    gaussian_slopes,
+    gaussian_slopes_of_frame,
+    moved_records,
+    sh_squares,
+    summed,
+    tangents_of,
+)
 from drgs.information.jacobian import (
     GEOMETRY,
     BlockSums,
@@ -97,17 +107,17 @@ class Replay:
         if call.is_recorded:
             self.frame = call.frame({name: x.array for name, x in self.inputs.items()}, _OF_GAUSSIANS)
             images = self.frame.images
-            self.shapes = self._recorded_shapes() if geometry else {}
+            self.gaussian_slopes = self._recorded_gaussian_slopes() if geometry else {}
         else:
             self.compositor, arguments = call.prepare(self.inputs)
             with dr.suspend_grad():  # nothing is recorded: what is wanted are the hits of this view
                 images = self.compositor.forward(*arguments, keep=True, joint=call.width)
-            self.shapes = self._shapes(self.compositor.traversal.projected) if geometry else {}
+            self.gaussian_slopes = self._gaussian_slopes(self.compositor.traversal.projected) if geometry else {}
         self.opacity = images["alpha"].torch().cpu().reshape(call.shape)  # (H, W)
         self.image = images["rgb"].torch().cpu().reshape(*call.shape, 3)
 
-    def _shapes(self, projected: Projected) -> dict:
-        """`hits.shapes` of Gaussians that were projected into the view."""
+    def _gaussian_slopes(self, projected: Projected) -> dict:
+        """`hits.gaussian_slopes` of Gaussians that were projected into the view."""
         call = self.call
         response = response_of(self.settings)
         moved = None
@@ -116,22 +126,22 @@ class Replay:
             moved = moved_records(self.inputs, tangents, lambda inputs: call.prepare(inputs)[1].record)
         p = {name: x.array for name, x in self.inputs.items()}
         coefficients = 0 if self.along_ray else call.coefficients
-        found = shapes(self.lib, self.settings, response, p, projected, coefficients, moved)
+        found = gaussian_slopes(self.lib, self.settings, response, p, projected, coefficients, moved)
         dr.eval(found)
         return found
 
-    def _recorded_shapes(self) -> dict:
+    def _recorded_gaussian_slopes(self) -> dict:
         """The same of the frame."""
         assert self.frame is not None
         tangents = tangents_of(self.call.inputs) if response_of(self.settings).by_tangents else {}
         arrays = {name: [to_drjit(self.lib, x).array for x in xs] for name, xs in tangents.items()}
-        return replay(shaped, self.frame.view, self.frame.given | {"tangents": arrays})
+        return replay(gaussian_slopes_of_frame, self.frame.view, self.frame.given | {"tangents": arrays})
 
     @functools.cached_property
     def hits(self) -> Hits:
         """The hits of the view."""
         compositor = self.compositor if self.frame is None else self.frame.compositor()
-        return Hits(compositor, self.shapes.get("extras"), self.color, self.mask)
+        return Hits(compositor, self.gaussian_slopes.get("extras"), self.color, self.mask)
 
     def walks(self, weights: Sequence[float]) -> Iterator[Walk]:
         """Each part of each traversal.
@@ -182,9 +192,9 @@ class Replay:
     ) -> Iterator[Float]:
         """The buffer of each walk, as of `_summed`."""
         frame = self.frame
-        if frame is not None and frame.several is None and not more_sums:
-            what = SummedOver(frame.view, tuple(weights), sums_of(True), self.count, self.color)
-            optional = {"extras": self.shapes.get("extras"), "mask": self.mask}
+        if frame is not None and frame.banded is None and not more_sums:
+            what = SumOfFrame(frame.view, tuple(weights), sums_of(True), self.count, self.color)
+            optional = {"extras": self.gaussian_slopes.get("extras"), "mask": self.mask}
             arrays = {name: x for name, x in optional.items() if x is not None}
             yield replay(summed, what, arrays | {"seen": frame.seen, "finals": frame.finals})
             return
@@ -205,7 +215,7 @@ class Replay:
         """(N, 11) float64, where kernels run: squares of the geometry, and sum w^2; those of SH along each ray are kept
         in `light`. `channels_first`: channels are summed before they are squared.
         """
-        bands = self.call.coefficients if self.along_ray and self.shapes and GEOMETRY in entries else 0
+        bands = self.call.coefficients if self.along_ray and self.gaussian_slopes and GEOMETRY in entries else 0
 
         def sums_of(first: bool) -> SumsOf:
             own = tuple(k for k in entries if first or k < GEOMETRY)
@@ -225,7 +235,7 @@ class Replay:
         scale = torch.tensor([1.0] * 3 if fisherrf else weights, dtype=torch.float64, device=self.call.home)
         for name, group in groups.items():
             # On a card all sums are made there: the CPU would take many times as long as the kernels.
-            own = sums[:, group.entries[0] : group.entries[-1] + 1].contiguous()
+            own = sums[:, group.entries[0] : group.entries[-1] + 1].clone(memory_format=torch.contiguous_format)
             result[name] = group.collect(own, self, scale).cpu()
             if fisherrf:
                 result[name] = result[name] / group.fisherrf(self.call.inputs)
@@ -281,8 +291,8 @@ class Replay:
             return self.light * weights
         arrays = {
             "squares": to_drjit(self.lib, squares).array,
-            "basis": self.shapes["basis"],
-            "lit": self.shapes["lit"],
+            "basis": self.gaussian_slopes["basis"],
+            "lit": self.gaussian_slopes["lit"],
         }
         what = self.call.coefficients, tuple(weights.tolist())
         found = sh_squares(what, arrays) if self.frame is None else replay(sh_squares, what, arrays)
@@ -304,5 +314,5 @@ class Replay:
     @property
     def _squared_basis(self) -> tuple[torch.Tensor, torch.Tensor]:
         """(N, K) squares of the SH basis towards each Gaussian, and (N, 3) 1 where a channel is above 0, or 0."""
-        basis, lit = (self.shapes[name].torch().reshape(self.count, -1) for name in ("basis", "lit"))
+        basis, lit = (self.gaussian_slopes[name].torch().reshape(self.count, -1) for name in ("basis", "lit"))
         return basis, lit.double()

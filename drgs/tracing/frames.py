@@ -59,6 +59,7 @@ class Frame:
         images: Flat images by name, without those of `extra`.
         extra: Outputs without a derivative.
         certificate: That of `Output`.
+        banded: The compositor of rows that were made and sorted band by band; None: there is one band.
     """
 
     def __init__(self, view: View, settings: RenderSettings, pinhole: tuple[float, ...], inputs: dict) -> None:
@@ -78,7 +79,7 @@ class Frame:
             "numbers": list(_numbers(chosen, settings)),
         }
         self.certificate: dict = {"pairs": lists.pairs}
-        self.several: Compositor | None = None
+        self.banded: Compositor | None = None
         if view.settings.order == "ray":
             self.certificate |= {"rays": view.width * view.height, "redone": 0}  # rows hold every hit
             if not tiles.is_one_band(dr.width(lists.index)):
@@ -146,12 +147,12 @@ class Frame:
         view.lists.cut = lists.cut
         view.budget = MemoryBudget(tiles.order_bytes() if self.view.needed else 0)
         compositor.parts = view.parts(1)
-        self.several = compositor
+        self.banded = compositor
         return _images(self.view, compositor)
 
     def compositor(self) -> Compositor:
-        """The compositor after `forward`, with the final states of its rays if gradients are needed."""
-        return self.several or composited(self.view, self.seen, self.finals)
+        """The compositor after `forward`, with the final states of its rays; of a view whose gradients are needed."""
+        return self.banded or composited(self.view, self.seen, self.finals)
 
     def gradients(self, cotangents: dict) -> dict:
         """Gradients by the inputs that are needed, flat, by name.
@@ -159,8 +160,8 @@ class Frame:
         Args:
             cotangents: Flat, by name of the image.
         """
-        if self.several is not None:
-            record = self.several.adjoint(cotangents)["record"]
+        if self.banded is not None:
+            record = self.banded.adjoint(cotangents)["record"]
             dr.eval(record)
             return replay(_unprojected, self.view, self.given | {"slopes": record})
         return replay(_gradients, self.view, self.given | {"seen": self.seen, "finals": self.finals, "g": cotangents})

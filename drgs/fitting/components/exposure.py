@@ -20,8 +20,9 @@ from drgs.cameras.sizes import reduced_size
 from drgs.data.resampling import resize_area
 from drgs.display.progress import Bar
 from drgs.ellipsoids import Y_00, Scene, colors_only
+from drgs.fitting import exposures
 from drgs.fitting.components.base import Checkpoint, Component, Fit, RunViews, Setup
-from drgs.fitting.exposures import BRIGHT, LEAST_LOWERED, ExposureEstimate, estimate_exposure
+from drgs.fitting.exposures import BRIGHT, ExposureEstimate, estimate_exposure
 from drgs.fitting.frames import Frame, frames_for
 from drgs.fitting.losses import psnr
 from drgs.fitting.networks import Network
@@ -183,7 +184,7 @@ class Meter:
         # What is left of a photograph that was left out, without fitting anew: 1 - h, h on the diagonal of the hat.
         left = np.maximum(1 - np.sum(terms * inverse.T, axis=1), 1e-12)[:, None]
         lowered = 1 - float(np.square((log_gains - terms @ coefficients) / left).sum() / np.square(log_gains).sum())
-        if lowered < LEAST_LOWERED:
+        if lowered < exposures.LEAST_LOWERED:
             return None
         return cls(coefficients, log_gains.min(axis=0), log_gains.max(axis=0), background, lowered)
 
