@@ -18,7 +18,8 @@ from torch_rasterizer import DEFECTS
 import drgs
 from drgs import cli
 from drgs.cameras import Camera
-from drgs.commands.orbits import OrbitShape, scene_orbit
+from drgs.commands.orbits import scene_orbit
+from drgs.commands.values import OrbitShape
 from drgs.data.camera_lists import save_cameras_json
 from drgs.ellipsoids import Gaussians
 from drgs.files import load_ply, save_ply

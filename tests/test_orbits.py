@@ -7,7 +7,8 @@ import pytest
 
 import drgs
 from drgs.cameras import Camera, intrinsics_from_fov, look_at
-from drgs.commands.orbits import OrbitShape, capture_orbit, scene_orbit
+from drgs.commands.orbits import capture_orbit, scene_orbit
+from drgs.commands.values import OrbitShape
 from drgs.data.camera_layout import Focus, path, upright
 from drgs.meshing.depths import seen_distance
 

@@ -16,7 +16,7 @@ import drgs
 from drgs import cli
 from drgs.cameras import Camera, intrinsics_from_fov, look_at, orbit
 from drgs.commands import orbits
-from drgs.commands.values import UP
+from drgs.commands.values import UP, OrbitShape
 from drgs.data.camera_lists import load_cameras_json, save_cameras_json
 from drgs.display import pictures
 from drgs.files import save_ply
@@ -111,7 +111,7 @@ def test_orbit_frames_the_scene(gaussians):
     far = drgs.Gaussians.from_arrays([[500.0, 0, 0]], [[1.0, 0, 0, 0]], [[1.0] * 3], [0.9], np.zeros((1, 4, 3)))
     both = gaussians.replace(**{name: torch.cat([x, getattr(far, name)]) for name, x in gaussians.parameters().items()})
     for up in ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0)):
-        cameras = orbits.scene_orbit(both, 12, width=64, height=48, fixed=orbits.OrbitShape(up=up))
+        cameras = orbits.scene_orbit(both, 12, width=64, height=48, fixed=OrbitShape(up=up))
         reach = []
         for camera in cameras:
             pixels, z = camera.project(gaussians.means.numpy())
@@ -349,7 +349,7 @@ def test_wolf(data_dir, tmp_path):
     if not path.is_file():
         pytest.skip(f"no {path}")
     g = drgs.load_ply(path)
-    for camera in orbits.scene_orbit(g, 3, width=96, height=72, fixed=orbits.OrbitShape(up=UP["y"])):
+    for camera in orbits.scene_orbit(g, 3, width=96, height=72, fixed=OrbitShape(up=UP["y"])):
         alpha = drgs.render(g, camera, drgs.RenderSettings.preset("fast")).alpha.numpy()
         rows, columns = np.nonzero(alpha > 0.5)
         assert rows.min() > 3

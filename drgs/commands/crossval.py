@@ -10,7 +10,6 @@ from drgs import runtime
 from drgs.cameras.origins import origin_text
 from drgs.cameras.sizes import at_most
 from drgs.commands.options import Crossval
-from drgs.commands.orbits import OrbitShape
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import views_to_sample
 from drgs.display import tables
@@ -26,7 +25,6 @@ from drgs.lab.report import html
 
 def run(args: Crossval) -> int:
     """`drgs crossval SCENE`: 1 if a gradient or a path is wrong, with --strict if anything differs."""
-    OrbitShape.of(args)  # refuses what cannot be, before anything is read
     inputs = [args.scene, args.cameras or "", args.rasterizer]
     if args.export is None:
         lock_output(args.output, "crossval", ["report.html", "crossval.json"], inputs)

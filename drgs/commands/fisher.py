@@ -30,7 +30,6 @@ import torch
 from drgs import fisher
 from drgs.cameras import Camera
 from drgs.commands.options import Fisher
-from drgs.commands.orbits import OrbitShape
 from drgs.commands.regions import region_of
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import Known, Source, check_lenses, evenly, known_views, views_to_compare, with_times
@@ -59,7 +58,6 @@ _log = logging.getLogger(__name__)
 
 def run(args: Fisher) -> None:
     """`drgs fisher SCENE`."""
-    OrbitShape.of(args)  # refuses what cannot be, before anything is read, as settings do
     settings = args.settings()
     prior = args.scoring.prior or MAP_PRIOR
     inputs = [args.scene, args.train or "", args.cameras or ""]

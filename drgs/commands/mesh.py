@@ -21,7 +21,7 @@ from drgs.meshing.writing import MESH_SUFFIXES, save_mesh
 
 def run(args: Mesh) -> None:
     """`drgs mesh SCENE -o FILE`."""
-    settings = args.settings()  # refuses what cannot be, before anything is read
+    settings = args.settings()
     suffix = args.output.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise ValueError(

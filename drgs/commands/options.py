@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from drgs.checks.records import check_ranges, option, options_in, part, same_option
 from drgs.cluster.options import check_options
-from drgs.commands.values import ORBIT_KEYS, check_color, parsed, parsed_orbit
+from drgs.commands.values import ORBIT_KEYS, OrbitShape, check_color, parsed
 from drgs.fitting.config import COUNT, SEED, FitConfig, SelectionConfig, UndistortUse
 from drgs.fitting.renderers import AUTO, own_preset
 from drgs.information.choices import POLICIES, check_named
@@ -204,7 +204,7 @@ class Orbits(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        parsed_orbit(self.orbit, self.orbit_keys)
+        OrbitShape.of(self)  # refuses what cannot be
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -18,13 +18,12 @@ import numpy as np
 import numpy.typing as npt
 
 from drgs.cameras import Camera, intrinsics_from_fov, look_at, orbit
-from drgs.commands.values import UP, parsed_orbit
+from drgs.commands.values import UP, OrbitShape
 from drgs.data.camera_layout import Focus, path, upright
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from drgs.commands.options import Orbits
     from drgs.ellipsoids import Gaussians
 
 # Chosen, not tuned.
@@ -36,56 +35,6 @@ _FAR_FACTOR = 3.0  # times the median distance from the center: beyond are float
 _INSIDE_SHARE = 0.998  # share of the rest that every frame shows
 _MARGIN = 1.1  # of the frame's size over that of the Gaussians in it
 _SOLID_OPACITY = 0.05  # opacity below which a Gaussian is no part of the shape
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class OrbitShape:
-    """What of an orbit's shape is fixed; None leaves it to the cameras or the Gaussians.
-
-    Attributes:
-        up: (3,) world direction.
-        center: (3,) world point that all frames look at.
-        distance: Distance of every frame from the center, in scene units.
-        elevation: Degrees above the center.
-        span: Degrees that the frames cover; below 360 they stay in the middle of what the cameras cover.
-        fov: Horizontal field of view in degrees.
-    Raises:
-        ValueError: If one is out of range, named as the command-line option.
-    """
-
-    up: tuple[float, float, float] | None = None
-    center: tuple[float, float, float] | None = None
-    distance: float | None = None
-    elevation: float | None = None
-    span: float | None = None
-    fov: float | None = None
-
-    def __post_init__(self):
-        if self.center is not None and not np.isfinite(self.center).all():
-            raise ValueError(f"--orbit center must be three finite numbers, got {self.center}; correct it")
-        if self.distance is not None and not 0 < self.distance < math.inf:
-            raise ValueError(f"--orbit distance must be positive and finite, got {self.distance}; correct it")
-        for option, value, low, high in (
-            ("--orbit elevation", self.elevation, -89, 89),
-            ("--orbit span", self.span, 0, 360),
-            ("--orbit fov", self.fov, 1, 170),
-        ):
-            if value is not None and not low <= value <= high:
-                raise ValueError(f"{option} must be in [{low}, {high}] degrees, got {value}; correct it")
-
-    @classmethod
-    def of(cls, args: Orbits) -> OrbitShape:
-        """The shape that `--orbit` of a command fixes.
-
-        Raises:
-            ValueError: If it names what there is not, or a value is out of range.
-        """
-        return cls(**parsed_orbit(args.orbit, args.orbit_keys))
-
-    @property
-    def moves(self) -> bool:
-        """Whether it fixes where frames are or what they look at, and not only their lens."""
-        return any(value is not None for value in (self.up, self.center, self.distance, self.elevation, self.span))
 
 
 def scene_orbit(

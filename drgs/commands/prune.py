@@ -45,7 +45,7 @@ def _copied() -> tuple[str, ...]:
 
 def run(args: Prune) -> None:
     """`drgs prune SCENE -o FILE`, or of a run `-o FOLDER`."""
-    settings = args.settings()  # refuses what cannot be, before anything is read, as all up to the lock
+    settings = args.settings()
     loss = None if args.loss is None else _decibels(args.loss)
     check_amount("prune", args.keep, loss)
     if args.region is not None:

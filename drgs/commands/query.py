@@ -13,7 +13,6 @@ from drgs.cameras import Camera
 from drgs.cameras.sizes import at_most
 from drgs.codecs import save_gaussians
 from drgs.commands.options import Query
-from drgs.commands.orbits import OrbitShape
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.semantic_pictures import OPAQUE
 from drgs.commands.viewpoints import check_lenses, views_to_sample
@@ -35,7 +34,6 @@ from drgs.settings import RenderSettings
 
 def run(args: Query) -> None:
     """`drgs query SCENE`."""
-    OrbitShape.of(args)  # refuses what cannot be, before anything is read, as settings do
     settings = args.settings()
     if bool(args.classes) == (args.text_embedding is not None):
         got = "both" if args.classes else "neither"

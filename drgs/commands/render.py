@@ -37,9 +37,9 @@ from drgs.commands.films import (
     write_plys,
 )
 from drgs.commands.options import Render
-from drgs.commands.orbits import OrbitShape
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.semantic_pictures import PICTURE_KINDS, PictureFunction, picture_functions
+from drgs.commands.values import OrbitShape
 from drgs.commands.viewpoints import captured_cameras, check_lenses, views_to_render
 from drgs.data.camera_layout import middle_camera
 from drgs.data.camera_lists import camera_to_json, save_cameras_json
@@ -68,7 +68,7 @@ _BAND_HEIGHT = 1 / 32  # of the height: each band; an eighth of the view is rend
 
 def run(args: Render) -> None:
     """`drgs render SCENE`."""
-    settings = args.settings()  # refuses what cannot be, before anything is read
+    settings = args.settings()
     single = single_file(args)
     if single is not None:
         args = dataclasses.replace(args, output=single.folder, format=single.format)
@@ -123,7 +123,6 @@ def run(args: Render) -> None:
 
 def _check(args: Render, settings: RenderSettings, formats: tuple[str, ...]) -> None:
     """Raise ValueError for options that contradict each other, before anything is read."""
-    OrbitShape.of(args)
     check_flight_options(args)
     if args.moving and "ply" not in formats:
         raise ValueError("render: --moving must have ply among --format, which only it means; add it or drop --moving")

@@ -10,7 +10,6 @@ import torch
 
 from drgs.cameras import Camera
 from drgs.commands.options import Select
-from drgs.commands.orbits import OrbitShape
 from drgs.commands.regions import region_of
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import Known, Source, check_lenses, known_views, views_to_compare, with_times
@@ -35,7 +34,6 @@ _SHOWN = 3  # names that a note repeats: it is one line
 
 def run(args: Select) -> None:
     """`drgs select SCENE --candidates ...`."""
-    OrbitShape.of(args)  # refuses what cannot be, before anything is read, as settings do
     settings = args.settings()
     refine = _refine(args)
     check_region(args.region, args.policy)

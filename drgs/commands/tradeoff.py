@@ -33,7 +33,6 @@ from drgs import runtime
 from drgs.cameras import Camera
 from drgs.cameras.sizes import at_most
 from drgs.commands.options import Tradeoff
-from drgs.commands.orbits import OrbitShape
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import views_to_sample
 from drgs.data.camera_lists import camera_to_json
@@ -62,7 +61,6 @@ def run(args: Tradeoff) -> None:
         raise ValueError(f"--max-error must be finite numbers > 0, got {got}; correct it")
     if not charts.is_available():
         _log.warning("no plot will be drawn: matplotlib is not installed; pip install 'drgs[report]'")
-    OrbitShape.of(args)  # refuses what cannot be, before anything is read
     names = ["tradeoff.json", "tradeoff.md", "tradeoff.png"]
     lock_output(args.output, "tradeoff", names, [args.scene, args.cameras or ""])
     given = SceneInput.of(args)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
+import math
 import re
 import typing
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from drgs.settings import RenderSettings
+
+if TYPE_CHECKING:
+    from drgs.commands.options import Orbits
 
 UP = {
     "x": (1.0, 0.0, 0.0),
@@ -89,6 +94,56 @@ def _setting(key: str, hint: Any, text: str) -> Any:
     except (ValueError, KeyError):
         kind = hint.__name__ if kinds == (hint,) else hint
         raise ValueError(f"--set {key}: must be of type {kind}, got {text!r}") from None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OrbitShape:
+    """What of an orbit's shape is fixed; None leaves it to the cameras or the Gaussians.
+
+    Attributes:
+        up: (3,) world direction.
+        center: (3,) world point that all frames look at.
+        distance: Distance of every frame from the center, in scene units.
+        elevation: Degrees above the center.
+        span: Degrees that the frames cover; below 360 they stay in the middle of what the cameras cover.
+        fov: Horizontal field of view in degrees.
+    Raises:
+        ValueError: If one is out of range, named as the command-line option.
+    """
+
+    up: tuple[float, float, float] | None = None
+    center: tuple[float, float, float] | None = None
+    distance: float | None = None
+    elevation: float | None = None
+    span: float | None = None
+    fov: float | None = None
+
+    def __post_init__(self):
+        if self.center is not None and not all(map(math.isfinite, self.center)):
+            raise ValueError(f"--orbit center must be three finite numbers, got {self.center}; correct it")
+        if self.distance is not None and not 0 < self.distance < math.inf:
+            raise ValueError(f"--orbit distance must be positive and finite, got {self.distance}; correct it")
+        for option, value, low, high in (
+            ("--orbit elevation", self.elevation, -89, 89),
+            ("--orbit span", self.span, 0, 360),
+            ("--orbit fov", self.fov, 1, 170),
+        ):
+            if value is not None and not low <= value <= high:
+                raise ValueError(f"{option} must be in [{low}, {high}] degrees, got {value}; correct it")
+
+    @classmethod
+    def of(cls, args: Orbits) -> OrbitShape:
+        """The shape that `--orbit` of a command fixes.
+
+        Raises:
+            ValueError: If it names what there is not, or a value is out of range.
+        """
+        return cls(**parsed_orbit(args.orbit, args.orbit_keys))
+
+    @property
+    def moves(self) -> bool:
+        """Whether it fixes where frames are or what they look at, and not only their lens."""
+        return any(value is not None for value in (self.up, self.center, self.distance, self.elevation, self.span))
 
 
 def parsed_orbit(texts: Sequence[str], keys: Sequence[str] = tuple(ORBIT_KEYS)) -> dict[str, Any]:

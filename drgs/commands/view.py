@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drgs.commands.orbits import OrbitShape, capture_orbit, scene_orbit
+from drgs.commands.orbits import capture_orbit, scene_orbit
 from drgs.commands.scene_input import SELECTION, SceneInput, ranking_of
 from drgs.commands.semantic_pictures import PICTURE_KINDS, PictureFunction, picture_functions
-from drgs.commands.values import UP
+from drgs.commands.values import UP, OrbitShape
 from drgs.commands.viewpoints import Known, Source, evenly, known_views
 from drgs.data import View as DataView
 from drgs.data.camera_layout import Focus, upright
@@ -47,7 +47,6 @@ _STOP_SECONDS = 0.5  # seconds that a running computation gets to end; chosen
 
 def run(args: View) -> None:
     """`drgs view SCENE`; returns by Ctrl-C alone."""
-    OrbitShape.of(args)  # refuses what cannot be, before anything is read
     if args.scene.exists():  # else `SceneInput` says so: who names a wrong path need not install anything to be told
         require_viser()
     with Bar("the scene", show=not args.quiet):

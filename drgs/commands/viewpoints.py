@@ -24,8 +24,8 @@ from drgs.cameras.sizes import at_most, resized_alike
 from drgs.codecs.folders import cameras_of_model
 from drgs.commands.frames import DATAPARSER_TRANSFORMS
 from drgs.commands.options import SIDE, Crossval, Fisher, Query, Render, Select, Tradeoff, Views
-from drgs.commands.orbits import OrbitShape, capture_orbit, dome, scene_orbit
-from drgs.commands.values import UP
+from drgs.commands.orbits import capture_orbit, dome, scene_orbit
+from drgs.commands.values import UP, OrbitShape
 from drgs.data.camera_lists import is_camera_list, load_cameras_json
 from drgs.fitting.config import FitConfig
 from drgs.fitting.records import FitRecord, fit_record, fitted_views, is_run
