@@ -133,6 +133,10 @@ def test_gaussians_alone_are_no_run(run, tmp_path, capsys):  # noqa: F811
         for command in ("report", "eval"):
             assert cli.main([command, str(path)]) == 2
             assert capsys.readouterr().err == (
-                f"drgs {command}: {path}: must be a run folder, is a file or a folder of Gaussians alone; of these, "
-                "drgs fisher --train DATA says what error to expect, and drgs render and drgs share show them\n"
+                f"drgs {command}: {path}: must be a run folder, holds Gaussians alone; drgs fisher {path} --train DATA "
+                "-o OUT says what error to expect of these, and drgs render and drgs share show them\n"
             )
+    other = tmp_path / "views.json"
+    other.write_text("[]")
+    assert cli.main(["eval", str(other)]) == 2
+    assert "Gaussians alone" not in capsys.readouterr().err
