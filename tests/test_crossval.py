@@ -550,6 +550,8 @@ def test_bad_dumps(folder, tmp_path, capsys, change, message):
             arrays[name] = f(arrays[name])
     np.savez(tmp_path / "dump.npz", **arrays)
     capsys.readouterr()
+    assert _run(folder, "--rasterizer", str(folder / "scene.npz"), output="nothing") == 2
+    assert "holds the scene alone, as --export writes it" in capsys.readouterr().err
     assert _run(folder, "--rasterizer", str(tmp_path / "dump.npz"), output="nothing") == 2
     error = capsys.readouterr().err
     assert message in error

@@ -66,6 +66,11 @@ def run_capture(options: CaptureOptions, config: FitConfig, say: Callable[[str],
     if not options.paths and options.resume and before is not None:
         named = tuple(Path(row[0]) for row in before.batch.inputs)
         options = dataclasses.replace(options, paths=named, add=len(before.batches) > 1)
+    if not options.paths and before is not None:
+        raise ValueError(
+            f"{options.output}: there must be photographs or --resume, got none, and it holds a capture; add --resume "
+            "to go on with it"
+        )
     if not options.paths:
         raise ValueError(
             "there must be photographs, videos or a data set, got none; name them, e.g. drgs capture photos -o RUN"

@@ -530,7 +530,8 @@ class Select(ComparedViews, Workers):
 
     candidates: str = of_views(
         help="A data set or a run (its views without the training views), a cameras.json or selection.json, orbit,"
-        " or dome."
+        " or dome.",
+        metavar="dome|orbit|PATH",
     )
     k: int = of_views(1, "Number of views to pick, one after the other.", short="k")
     halving: bool = of_views(

@@ -448,7 +448,13 @@ def read_dump(path: Path, g: Gaussians, cameras: list[Camera], background: tuple
     shapes = {"image": (*size, 3), "alpha": size, "cotangent": (*size, 3)}
     names = [*shapes, *(f"grad_{name}" for name in PARAMETERS), *scene]
     pose = [_POSE] if _POSE in arrays else []
-    if missing := [name for name in names if name not in arrays]:
+    missing = [name for name in names if name not in arrays]
+    if "image" not in arrays and all(name in arrays for name in scene):
+        raise ValueError(
+            f"{path}: must hold {', '.join(names)}, holds the scene alone, as --export writes it; render it by your "
+            "rasterizer (examples/dump_rasterizer.py), and name the file that this writes"
+        )
+    if missing:
         raise ValueError(f"{path}: must hold {', '.join(names)}; {missing[0]} is missing; write it anew from --export")
     for name, array in arrays.items():
         if name in (*names, *pose) and not np.isfinite(array).all():
