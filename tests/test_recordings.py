@@ -12,12 +12,11 @@ import pytest
 import torch
 
 import drgs
-from drgs import fisher, runtime
+from drgs import runtime
 from drgs.testing import random_scene
 from drgs.tracing import projection, recordings, tiles
 from drgs.tracing.composite import Compositor
 from drgs.tracing.recordings import padded, replay, without_recordings
-from drgs.tracing.walk import Part
 
 pytestmark = pytest.mark.core
 
@@ -80,33 +79,6 @@ def check(g, camera, settings, outputs=()):
         assert_same(recorded, frame(g, camera, settings, outputs))
 
 
-def information(g, camera, settings, mask=None):
-    """Diagonals, blocks and coverage of a view."""
-    seen = g.detach()
-    found = {
-        "blocks": fisher.blocks(seen, camera, settings, masks=mask),
-        "coverage": fisher.coverage(seen, camera, settings),
-    }
-    for method in ("exact", "fisherrf"):
-        of = fisher.diagonal(seen, camera, settings, method, masks=mask)
-        found |= {f"{method} {name}": x for name, x in of.items()}
-    weights = {name: 1 / (x + 1) for name, x in of.items()}
-    weighted = fisher.diagonal(seen, camera, settings, groups=("means", "sh"), channel_weights=(0.3, 0.5, 2.0))
-    found |= {f"weighted {name}": x for name, x in weighted.items()}
-    found |= {f"removal, {power}": fisher.removal_error(seen, camera, settings, power=power) for power in (2, 1)}
-    return found | {"map": fisher.variance_map(seen, camera, weights, settings)}
-
-
-def check_information(g, camera, settings, mask=None):
-    """Information is what it is without recordings, but for the order of sums."""
-    recorded = information(g, camera, settings, mask)
-    with without_recordings():
-        expected = information(g, camera, settings, mask)
-    assert list(recorded) == list(expected)
-    for name, x in expected.items():
-        torch.testing.assert_close(recorded[name], x, rtol=1e-5, atol=1e-6 * float(x.abs().max()), msg=name)
-
-
 def test_all_that_changes_between_two_frames():
     """Numbers of Gaussians and pixels, entries of lists, scenes, poses, settings and outputs; and back again."""
     fast, exact = (drgs.RenderSettings.preset(name) for name in ("fast", "exact"))
@@ -126,48 +98,6 @@ def test_all_that_changes_between_two_frames():
             check(g, camera, drgs.RenderSettings.preset(name), outputs)
     check(g, camera, exact.replace(tolerance=1e-3))
     check(g, camera, exact, ("depth",))
-
-
-def test_all_that_changes_between_the_information_of_two_views():
-    """Likewise of information, which also depends on masks and on what a response's derivatives need."""
-    fast, exact, inria = (drgs.RenderSettings.preset(name) for name in ("fast", "exact", "inria"))
-    for settings in (fast, exact, inria):
-        for seed, count, width, height in ((0, 60, 24, 16), (1, 44, 24, 16), (1, 44, 17, 31), (0, 60, 24, 16)):
-            g, camera = scene(count, seed)
-            check_information(g, sized(camera, width, height), settings.replace(background=BACKGROUNDS[seed]))
-    g, camera = scene()
-    camera = sized(camera, 24, 16)
-    for value in (1.0, 0.3):
-        mask = torch.full((16, 24), value)
-        mask[:5] = 0
-        check_information(g, camera, fast, [mask])
-    check_information(g.replace(sh=g.sh[:, :1]), camera, fast)
-    check_information(scene(dtype=torch.float64)[0], camera, fast)
-    check_information(g, camera, fast.replace(extent=2.0, alpha_min=0.02))
-    behind = camera.w2c.copy()
-    behind[2, 3] = -100.0
-    for settings in (fast, exact):
-        check_information(g, sized(camera, 24, 16, behind), settings)
-        check_information(scene(1)[0], sized(camera, 1, 1), settings)
-
-
-def test_information_of_a_second_view_is_not_traced(monkeypatch):
-    """Of a view with other numbers in the same arrays nothing is projected or walked by Python, and they count."""
-    calls = []
-    project, run = projection.project_screen, Part.run
-    monkeypatch.setattr(projection, "project_screen", lambda *args: calls.append(1) or project(*args))
-    monkeypatch.setattr(Part, "run", lambda *args, **kwargs: calls.append(1) or run(*args, **kwargs))
-    g, camera = scene()
-    seen, camera = g.detach(), sized(camera, 24, 16)
-    for preset in ("fast", "exact", "inria"):
-        settings = drgs.RenderSettings.preset(preset)
-        first = fisher.diagonal(seen, camera, settings)
-        assert calls
-        fisher.diagonal(seen, camera, settings)  # Dr.Jit may record once more, for arrays that are aligned otherwise
-        calls.clear()
-        other = fisher.diagonal(seen.replace(sh=0.5 * seen.sh), camera, settings)
-        assert not calls
-        assert not torch.equal(first["means"], other["means"])
 
 
 def test_a_second_frame_is_not_traced(monkeypatch):
@@ -233,7 +163,6 @@ def test_several_bands(monkeypatch):
     whole, _ = frame(g, camera, settings)
     monkeypatch.setattr(tiles, "TABLES", 1 << 16)
     check(g, camera, settings)
-    check_information(g, camera, settings)
     assert torch.equal(frame(g, camera, settings)[0]["rgb"], whole["rgb"])
 
 
@@ -365,7 +294,7 @@ BESIDE = """
 import threading, time
 import drjit as dr, numpy as np, torch
 import drgs
-from drgs import fisher, runtime
+from drgs import runtime
 
 n = 200
 draw = torch.Generator().manual_seed(0)
