@@ -1,4 +1,4 @@
-"""A rasterizer in plain torch, for SH up to degree 1: what docs/tutorials/rasterizer.md checks. Needs no drgs: copy it.
+"""A rasterizer in plain torch, which docs/tutorials/rasterizer.md checks, for few Gaussians. Needs no drgs: copy it.
 
 gsplat's conventions and names of arguments; torch differentiates it. Every Gaussian meets every pixel.
 """
@@ -12,7 +12,7 @@ def rasterization(
     """(C, H, W, 3) images, (C, H, W, 1) opacities and a dict, of C views."""
     images, alphas = [], []
     for i, (w2c, K) in enumerate(zip(viewmats, Ks, strict=True)):
-        rgb = colors if sh_degree is None else shade(means, colors, w2c)
+        rgb = colors if sh_degree is None else shade(means, colors[:, : (sh_degree + 1) ** 2], w2c)
         image, light = view(means, quats, scales, opacities, rgb, w2c, K, width, height)
         images.append(image if backgrounds is None else image + light * backgrounds[i])
         alphas.append(1 - light)
@@ -42,10 +42,15 @@ def view(means, quats, scales, opacities, colors, w2c, K, width, height):
 
 
 def shade(means, sh, w2c):
-    """(N, 3) colors of (N, 1 or 4, 3) spherical harmonics, seen from the camera."""
+    """(N, 3) colors of (N, K, 3) spherical harmonics, K = 1, 4, 9 or 16, seen from the camera."""
     x, y, z = torch.nn.functional.normalize(means + w2c[:3, :3].mT @ w2c[:3, 3], dim=1).unbind(1)
-    basis = torch.stack([0.28209479 * torch.ones_like(x), -0.48860251 * y, 0.48860251 * z, -0.48860251 * x], 1)
-    return (0.5 + (basis[:, : sh.shape[1], None] * sh).sum(1)).clamp(min=0)
+    xx, yy, zz = x * x, y * y, z * z
+    basis = [0.28209479 * torch.ones_like(x), -0.48860251 * y, 0.48860251 * z, -0.48860251 * x]
+    basis += [1.09254843 * x * y, -1.09254843 * y * z, 0.31539157 * (2 * zz - xx - yy), -1.09254843 * x * z]
+    basis += [0.54627422 * (xx - yy), -0.59004359 * y * (3 * xx - yy), 2.89061144 * x * y * z]
+    basis += [-0.45704580 * y * (4 * zz - xx - yy), 0.37317633 * z * (2 * zz - 3 * xx - 3 * yy)]
+    basis += [-0.45704580 * x * (4 * zz - xx - yy), 1.44530572 * z * (xx - yy), -0.59004359 * x * (xx - 3 * yy)]
+    return (0.5 + (torch.stack(basis[: sh.shape[1]], 1)[..., None] * sh).sum(1)).clamp(min=0)
 
 
 def rotation(quats):
