@@ -623,8 +623,8 @@ def test_a_budget_that_is_not_enough(photographs):
     """The plan says what it takes instead, and a fit that begins too late has its fewest steps, not one."""
     poses = budget.PosePlan(480, 240.0)
     assert budget.planned_poses(poses, 292, 50.0, 60.0) == (
-        "60 s are not enough: poses of 292 photographs take about 4 min even at 480 pixels, and the smallest fit "
-        "follows; --budget 10min leaves time for a fit, fewer photographs take less"
+        "60 s are not enough and are exceeded: poses of 292 photographs take about 4 min even at 480 pixels, and "
+        "the smallest fit follows; --budget 10min leaves time for a fit, fewer photographs take less"
     )
     enough = budget.planned_poses(poses, 292, 590.0, 600.0)
     assert enough.startswith(

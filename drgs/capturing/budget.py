@@ -278,9 +278,9 @@ def planned_poses(plan: PosePlan, count: int, left: float, budget: float) -> str
         )
     enough = math.ceil(plan.seconds / _POSES_SHARE / 60)
     return (
-        f"{duration(budget)} are not enough: poses of {count} photographs take about {duration(plan.seconds)} even at "
-        f"{size} pixels, and the smallest fit follows; --budget {enough}min leaves time for a fit, fewer photographs "
-        "take less"
+        f"{duration(budget)} are not enough and are exceeded: poses of {count} photographs take about "
+        f"{duration(plan.seconds)} even at {size} pixels, and the smallest fit follows; --budget {enough}min leaves "
+        "time for a fit, fewer photographs take less"
     )
 
 
