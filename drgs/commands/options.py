@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from drgs.checks.records import check_ranges, option, options_in, part, same_option
 from drgs.cluster.options import check_options
-from drgs.commands.values import ORBIT_KEYS, OrbitShape, check_color, parsed
+from drgs.commands.values import ORBIT_KEYS, OrbitShape, check_color, parsed, parsed_orbit
 from drgs.fitting.config import COUNT, SEED, FitConfig, SelectionConfig, UndistortUse
 from drgs.fitting.renderers import AUTO, own_preset
 from drgs.information.choices import POLICIES, check_named
@@ -189,7 +189,7 @@ class Lenses:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Orbits(Settings):
+class Orbits(Common):
     """Options of commands that can make cameras around a scene."""
 
     heading: ClassVar[str] = "Views"
@@ -204,11 +204,20 @@ class Orbits(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        OrbitShape.of(self)  # refuses what cannot be
+        _ = self.orbit_shape  # refuses what cannot be
+
+    @functools.cached_property
+    def orbit_shape(self) -> OrbitShape:
+        """The shape that --orbit fixes.
+
+        Raises:
+            ValueError: If it names what there is not, or a value is out of range.
+        """
+        return OrbitShape(**parsed_orbit(self.orbit, self.orbit_keys))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SampledViews(Orbits, Views):
+class SampledViews(Settings, Orbits, Views):
     """Options of commands that look at a scene from a few cameras."""
 
     draws_presets: ClassVar[bool] = True
@@ -302,7 +311,7 @@ class Info(Common):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Render(Orbits, Views, SceneTimes, Lenses):
+class Render(Settings, Orbits, Views, SceneTimes, Lenses):
     """Render a file of Gaussians, or a finished run, to pictures or a video."""
 
     scene: Path = _scene()
@@ -601,7 +610,7 @@ class Fisher(ComparedViews):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Query(Orbits, Views, Lenses):
+class Query(Settings, Orbits, Views, Lenses):
     """Find objects by text: write masks of views, and a PLY of the Gaussians of the objects, or of all others."""
 
     scene: Path = option(help="A run that was fitted with semantics, or a 3DGS PLY with features.", positional=True)

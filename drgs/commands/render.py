@@ -39,7 +39,6 @@ from drgs.commands.films import (
 from drgs.commands.options import Render
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.semantic_pictures import PICTURE_KINDS, PictureFunction, picture_functions
-from drgs.commands.values import OrbitShape
 from drgs.commands.viewpoints import captured_cameras, check_lenses, views_to_render
 from drgs.data.camera_layout import middle_camera
 from drgs.data.camera_lists import camera_to_json, save_cameras_json
@@ -187,7 +186,7 @@ def _cameras_of(
     placed = photographs or cameras
     cameras = at_times(cameras[: args.limit], args.time, film.frames, given, is_film=is_flight)
     if args.panorama:
-        up, across = up_of(placed, OrbitShape.of(args).up), panorama_size(args)
+        up, across = up_of(placed, args.orbit_shape.up), panorama_size(args)
         cameras = [level_panorama(camera, up, *across) for camera in cameras]
     else:
         cameras = [_resized(camera, args.width, args.height) for camera in cameras]

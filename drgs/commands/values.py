@@ -8,12 +8,9 @@ import math
 import re
 import typing
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from drgs.settings import RenderSettings
-
-if TYPE_CHECKING:
-    from drgs.commands.options import Orbits
 
 UP = {
     "x": (1.0, 0.0, 0.0),
@@ -130,15 +127,6 @@ class OrbitShape:
         ):
             if value is not None and not low <= value <= high:
                 raise ValueError(f"{option} must be in [{low}, {high}] degrees, got {value}; correct it")
-
-    @classmethod
-    def of(cls, args: Orbits) -> OrbitShape:
-        """The shape that `--orbit` of a command fixes.
-
-        Raises:
-            ValueError: If it names what there is not, or a value is out of range.
-        """
-        return cls(**parsed_orbit(args.orbit, args.orbit_keys))
 
     @property
     def moves(self) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 from drgs.commands.orbits import capture_orbit, scene_orbit
 from drgs.commands.scene_input import SELECTION, SceneInput, ranking_of
 from drgs.commands.semantic_pictures import PICTURE_KINDS, PictureFunction, picture_functions
-from drgs.commands.values import UP, OrbitShape
+from drgs.commands.values import UP
 from drgs.commands.viewpoints import Known, Source, evenly, known_views
 from drgs.data import View as DataView
 from drgs.data.camera_layout import Focus, upright
@@ -274,7 +274,7 @@ def _first_camera(args: View, gaussians: Gaussians, captured: list[Camera]) -> F
     """Where the photographs were taken, towards what they look at; of a bare PLY, so that all of it is seen."""
     if not len(gaussians):
         raise ValueError(f"{args.scene}: there must be at least one Gaussian, got none; fit longer, or name another")
-    fixed = OrbitShape.of(args)
+    fixed = args.orbit_shape
     distance_of = seen_distance(gaussians)
     captured = sorted(captured, key=lambda camera: camera.name)  # an active run has them as they were picked
     width, height = _FIRST_SIZE

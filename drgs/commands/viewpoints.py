@@ -213,7 +213,7 @@ def _orbit_to_render(
     captured = captured_cameras(given)
     shape = captured[0].height / captured[0].width if captured else 0.75
     width, height = frame_size(*size, shape)
-    fixed = OrbitShape.of(args)
+    fixed = args.orbit_shape
     how = {"width": width, "height": height, "fixed": fixed, "returns": returns}
     cameras, source = capture_orbit(captured, frames, distance_of=seen_distance(given.gaussians), **how)
     if cameras:
@@ -377,9 +377,9 @@ def views_to_compare(
             f"take {option} dome or orbit, which need none"
         )
     if source.kind == "orbit":
-        return _compared_orbit(OrbitShape.of(args), given, known, args.count), f"orbit of {args.count}"
+        return _compared_orbit(args.orbit_shape, given, known, args.count), f"orbit of {args.count}"
     if source.kind == "dome":
-        fixed = OrbitShape.of(args)
+        fixed = args.orbit_shape
         if fixed.span is not None:
             raise ValueError(f"--orbit span must have {option} orbit, a dome goes all the way round; drop it")
         circle = dataclasses.replace(fixed, elevation=0.0, span=360.0)
