@@ -18,7 +18,8 @@ for seeds 31, 32 and 33, and in the same way with two starts each
         --policy fisherrf --policy "geometry+backdrop, v_opt" -o OUT
 
 Named before any fit ran: these rooms, starts and policies (`uniform` is by name, which says nothing here, as `random`).
-Six starts can tell about 0.6 to 1.0 dB, by how much starts in rooms have differed.
+Six starts can tell about 0.6 to 1.0 dB, by how much starts in rooms have differed. Named on 2026-11-29, before they
+ran: `coverage` and `moments` on the same starts, for which the default's rows are those of before.
 
 Named before any fit ran: still lifes 41 and 42 with three starts each, with the same policies; halls 43 and 44,
 kitchens 45 and 46 with two starts each, which were not run yet. Nothing was chosen on them. Still lifes are made and

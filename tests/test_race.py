@@ -94,4 +94,4 @@ def test_units_of_captures(still, tmp_path):  # noqa: F811
     fit = plan.study.config_of(plan.cells[0])
     assert (fit.features.semantics, fit.selection.measure) == ("ignore", (3,))
     with pytest.raises(ValueError, match="--policy must be one of: random; uniform"):
-        plan_of("captures", "tiny", tmp_path, policies=["moments"])
+        plan_of("captures", "tiny", tmp_path, policies=["joint"])

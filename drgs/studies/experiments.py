@@ -116,7 +116,7 @@ _POLICIES: Mapping[str, Mapping[str, Any] | None] = {
     "joint": fisher_policy("eig", *_EVERYTHING),
     **{f"joint, lambda {x}": fisher_policy("eig", *_EVERYTHING, prior=float(x)) for x in ("0", "1e-7", "1e-5")},
     _MOVING_DEFAULT: {"policy": "fisher"},
-    **{name: {"policy": name} for name in ("blur", "renderers")},
+    **{name: {"policy": name} for name in ("blur", "renderers", "coverage")},
     _COLOR_DEFAULT: {"policy": "fisher"},
     "all views": None,
 }
@@ -212,8 +212,8 @@ EXPERIMENTS: Mapping[ExperimentName, Experiment] = {
         "Two views, one more every so many steps until 20; color of held-out views, no features.",
         "captures",
         {
-            **{name: name for name in ("random", "uniform", "farthest", "blur", "renderers")},
-            "fisherrf": "FisherRF",
+            **{name: name for name in ("random", "uniform", "farthest", "blur", "renderers", "coverage")},
+            **{name: _NAMES[name] for name in ("moments", "fisherrf")},
             "geometry": "geometry, eig",
             _COLOR_DEFAULT: "drgs: with backdrop, v_opt",
         },
