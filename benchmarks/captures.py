@@ -51,11 +51,10 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from pages import fill_between
-from studies import PAGE_DATA, ROOT, write_csv
+from studies import PAGE_DATA, ROOT, lead, write_csv
 
 from drgs.studies.rows import read_study
 from drgs.studies.statistics import (
-    FEWEST_UNITS,
     at_views,
     coverage,
     differences,
@@ -89,11 +88,7 @@ ALIKE = {"lego": "Blender's lego at 100x100", "bonsai": "Mip-NeRF 360's bonsai, 
 
 def compared(rows: Rows, other: str) -> str:
     """The default less another policy: mean and interval."""
-    values = differences(rows, "psnr", DEFAULT, other)
-    found = estimate(values)
-    mean = f"{found.mean:+.2f}"
-    is_verdict = found.units >= FEWEST_UNITS and not found.low <= 0 <= found.high
-    return f"{f'**{mean}**' if is_verdict else mean} [{found.low:+.2f}, {found.high:+.2f}]"
+    return lead(differences(rows, "psnr", DEFAULT, other), 2)
 
 
 def section(rows: Rows) -> str:

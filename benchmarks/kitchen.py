@@ -40,12 +40,12 @@ import numpy as np
 import studies
 from pages import fill_between
 from policies import Rows
-from studies import DIFFERENCE, ROOT, difference
+from studies import DIFFERENCE, ROOT, difference, lead
 
 from drgs.studies import experiments
 from drgs.studies.cells import Study
 from drgs.studies.rows import read_study
-from drgs.studies.statistics import FEWEST_UNITS, coverage, differences, estimate, unit_of, values_of
+from drgs.studies.statistics import coverage, differences, estimate, unit_of, values_of
 from drgs.studies.tables import markdown_table, paragraph
 
 PAGE = ROOT / "docs" / "next-views.md"
@@ -101,16 +101,6 @@ def report(study: Study, rows: Rows) -> str:
             cells.append(lead(found, metrics[key].digits) if found and label != DEFAULT else "–")
         lines.append([f"`{label}`", *cells])
     return "\n\n".join([paragraph(told(rows)), markdown_table(heads, lines)])
-
-
-def lead(found: dict, digits: int) -> str:
-    """A mean difference and its interval; bold where there is a verdict."""
-    one = estimate(found)
-    if one.units == 1:
-        return f"{one.mean:+.{digits}f}"
-    sure = one.units >= FEWEST_UNITS and not one.low <= 0 <= one.high
-    mean = f"{one.mean:+.{digits}f}"
-    return f"{f'**{mean}**' if sure else mean} [{one.low:+.{digits}f}, {one.high:+.{digits}f}]"
 
 
 def told(rows: Rows) -> str:

@@ -33,7 +33,7 @@ from drgs.fitting.trainer import Trainer  # noqa: E402
 from drgs.sfm.points import initial_points  # noqa: E402
 from drgs.studies.cells import Metric, Study, run_cells  # noqa: E402
 from drgs.studies.rows import append_row, read_study  # noqa: E402
-from drgs.studies.statistics import differences, estimate, unit_of, values_of  # noqa: E402
+from drgs.studies.statistics import FEWEST_UNITS, differences, estimate, unit_of, values_of  # noqa: E402
 
 __all__ = [
     "DATA",
@@ -206,6 +206,16 @@ def difference(
         detectable = "" if one.detectable is None else f"{one.detectable:.{metric.digits}f}"
         better = one.positive if metric.larger else one.negative
         yield [*named, *numbers, detectable, str(better), str(one.units), str(one.scenes)]
+
+
+def lead(found: dict, digits: int) -> str:
+    """A mean difference and its interval; bold where there is a verdict."""
+    one = estimate(found)
+    if one.units == 1:
+        return f"{one.mean:+.{digits}f}"
+    sure = one.units >= FEWEST_UNITS and not one.low <= 0 <= one.high
+    mean = f"{one.mean:+.{digits}f}"
+    return f"{f'**{mean}**' if sure else mean} [{one.low:+.{digits}f}, {one.high:+.{digits}f}]"
 
 
 def study_sheets(study: Study, rows: Sequence[Mapping[str, Any]]) -> dict[str, list[list[str]]]:
