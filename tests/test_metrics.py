@@ -139,13 +139,14 @@ def test_uncovered_is_a_share_of_the_mask(rng, monkeypatch):
 @pytest.mark.parametrize(
     ("installed", "expected"), [(True, "--lpips-weights FILE"), (False, "pip install 'drgs[lpips]'")]
 )
-def test_what_lpips_needs(rng, monkeypatch, installed, expected):
+def test_what_lpips_and_flip_need(rng, monkeypatch, installed, expected):
     """Weights are asked for where the package is installed, else the package; docs/install.md names both."""
     a, b = images(rng)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: name if installed else None)
-    reason = evaluate(monkeypatch, b, [frame(a)])["reasons"]["lpips"]
-    assert expected in reason
-    assert installed == ("--lpips-weights" in reason)
+    result = evaluate(monkeypatch, b, [frame(a)])
+    assert expected in result["reasons"]["lpips"]
+    assert installed == ("--lpips-weights" in result["reasons"]["lpips"])
+    assert installed == (result["mean"]["flip"] is not None) == ("flip" not in result["reasons"])
 
 
 def test_lpips_is_spoken_of_where_it_was_asked_for(rng, monkeypatch, capsys):

@@ -88,6 +88,7 @@ _STEPS_A_VIEW = 16
 VIEW_PICTURES = ("png", "semantics.png")
 """Of a view: that of its colors and, of a run with features, that of its labels; what follows the view's file name."""
 _NO_LPIPS = "needs the package lpips: pip install 'drgs[lpips]', and the weights that docs/install.md names"
+_NO_FLIP = "needs the package flip-evaluator, which Python 3.14 has no wheel of: pip install flip-evaluator compiles it"
 _NO_WEIGHTS = "needs the weights of a backbone: pass --lpips-weights FILE (torchvision's AlexNet or VGG16)"
 _COVERED = 0.5  # opacity from which on more of a pixel is Gaussians than background
 _LPIPS_MIN_SIDE = 64  # pixels: the AlexNet backbone pools smaller images to nothing
@@ -361,7 +362,7 @@ def _view_metrics(
     lpips: Lpips | None,
     moving: frozenset[int],
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """Name, size and metrics of one view, and the reasons of what is None because the view is small.
+    """Name, size and metrics of one view, and the reasons of what is None.
 
     Args:
         out: The rendering.
@@ -381,7 +382,10 @@ def _view_metrics(
     counted = frame.mask if weights is None or not bool((weights > 0).any()) else weights
     row["uncovered"] = uncovered(out.alpha.cpu(), counted)
     row["ssim_padded"] = float(_ssim_map(shown, target).mean())
-    row["flip"] = flip(shown, target)
+    if importlib.util.find_spec("flip_evaluator"):
+        row["flip"] = flip(shown, target)
+    else:
+        reasons["flip"] = _NO_FLIP
     if min(height, width) >= _SSIM_MIN_SIDE:
         row["ssim"] = ssim(shown, target)
     else:
