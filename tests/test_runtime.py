@@ -338,6 +338,23 @@ def test_cuda_backend():
     assert done.stdout.startswith("2.0 "), done.stderr
 
 
+def test_a_missing_system_library_is_named(tmp_path):
+    """Where Dr.Jit's extension cannot be loaded, a command says in one line which library to install."""
+    package = tmp_path / "drjit"
+    package.mkdir()
+    (package / "__init__.py").write_text("""
+try:
+    raise ImportError("libatomic.so.1: cannot open shared object file")
+except ImportError:
+    undefined
+""")
+    environ = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    done = subprocess.run([sys.executable, "-m", "drgs", "info"], env=environ, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr.startswith("drgs info: Dr.Jit must find the libraries that it needs, got: libatomic.so.1")
+    assert "Traceback" not in done.stderr
+
+
 def test_info_is_json():
     """`info()` survives a JSON round trip and names backend, library, threads and packages."""
     report = json.loads(json.dumps(runtime.info()))

@@ -280,7 +280,7 @@ def _started(variant: str | None, threads: int | None) -> Backend:
     if wanted == "llvm_ad_rgb" and "drjit" not in sys.modules:
         require_llvm()
     prepare()
-    import drjit as dr
+    dr = _imported_drjit()
 
     if wanted is None:
         wanted = "cuda_ad_rgb" if cuda_status()[0] and _torch_has_cuda() else "llvm_ad_rgb"
@@ -307,6 +307,22 @@ def _started(variant: str | None, threads: int | None) -> Backend:
         llvm_version=version,
         threads=dr.thread_count(),
     )
+
+
+def _imported_drjit() -> ModuleType:
+    """The `drjit` module.
+
+    Raises:
+        FileNotFoundError: If a library of the system that it needs is missing.
+    """
+    try:
+        import drjit
+    except (ImportError, NameError) as error:  # Dr.Jit 1.5 itself answers a missing library with a NameError
+        raise FileNotFoundError(
+            f"drgs: Dr.Jit must find the libraries that it needs, got: {error.__context__ or error}; install that one "
+            "(libatomic.so.1 is in the system's package libatomic1)"
+        ) from error
+    return drjit
 
 
 def _torch_has_cuda() -> bool:
@@ -358,8 +374,7 @@ def mitsuba() -> ModuleType:
 def cuda_status() -> tuple[bool, str | None]:
     """Whether Dr.Jit can run on a CUDA device and, if not, why."""
     prepare()
-    import drjit as dr
-
+    dr = _imported_drjit()
     if dr.has_backend(dr.JitBackend.CUDA):
         return True, None
     try:
@@ -441,7 +456,7 @@ def info() -> dict:
     chosen, error = None, None
     try:
         chosen = _active or _started(None, None)
-    except (ValueError, OSError, ImportError) as problem:
+    except (ValueError, OSError) as problem:
         error = str(problem)
     report["backend"] = {"variant": chosen.variant if chosen else None, "error": error}
     llvm = chosen.llvm_version if chosen else None
@@ -461,9 +476,8 @@ def info() -> dict:
     for key, status in (("cuda", cuda_status), ("optix", optix_status)):
         try:
             usable, reason = status()
-        except ImportError as problem:
-            usable = False
-            reason = f"drjit cannot be imported ({problem})"
+        except FileNotFoundError as problem:
+            usable, reason = False, str(problem)
         report[key] = {"available": usable, "reason": reason}
     report["cuda"]["device"] = machine.gpu_name() if report["cuda"]["available"] else None
     return report
