@@ -17,7 +17,7 @@ import sys
 from typing import Any, TextIO
 
 import drgs
-from drgs.checks.records import nearest
+from drgs.checks.records import nearest, options_in
 from drgs.commands.command_line import command_list, help_page, parsed_options
 from drgs.commands.options import COMMANDS, Common
 from drgs.display.progress import Bar
@@ -109,7 +109,7 @@ def _parse_arguments(argv: list[str]) -> Any:
     if _HELP.intersection(argv):
         print(help_page(name, COMMANDS[name], words) if name in COMMANDS else command_list(COMMANDS), end="")
         raise SystemExit(0)
-    return parsed_options(COMMANDS[name], words)
+    return parsed_options(COMMANDS[name], words, COMMANDS)
 
 
 class _Stderr(logging.StreamHandler):
@@ -134,4 +134,8 @@ def _complain(command: str | None, message: str) -> None:
     """One line on stderr: `drgs COMMAND: message`; functions that are called as the command name it themselves."""
     where = f"drgs {command}" if command else "drgs"
     message = " ".join(message.removeprefix("drgs: ").removeprefix(f"{command}: ").split())
+    name, must, rest = message.partition(" must ")
+    option = options_in(COMMANDS[command]).get(name) if command else None
+    if must and option and not option.spec.positional:  # what a function calls by its argument's name
+        message = f"{f'-{option.spec.short}' if option.spec.short else option.flag} must {rest}"
     print(f"{where}: {message}", file=sys.stderr)

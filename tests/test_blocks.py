@@ -167,7 +167,9 @@ def test_a_criterion_of_a_module(world, tmp_path, monkeypatch):
     own = select(g, cams[2:], cams[:2], 1, scoring=scoring)
     eig = select(g, cams[2:], cams[:2], 1, settings=FAST, criterion="eig")
     assert own.scores == pytest.approx([score / 2 for score in eig.scores], rel=1e-12)
-    with pytest.raises(ValueError, match="^select my_criteria:none: my_criteria must have a function none, has none$"):
+    with pytest.raises(
+        ValueError, match="^select my_criteria:none: my_criteria must have a function none, has halved$"
+    ):
         select(g, cams[2:], cams[:2], 1, settings=FAST, criterion="my_criteria:none")
     with pytest.raises(ValueError, match="^select: criterion must be one of v_opt, eig, .*got 'best'; choose one$"):
         Scoring("best")

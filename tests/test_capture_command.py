@@ -274,8 +274,7 @@ def test_next_photographs_come_with_the_advice_of_the_capture(captured, tmp_path
     for words in (["photos"], []):
         told = refused(["--more", *words, "-o", tmp_path / "none"], capsys)
         assert told.endswith(
-            "-o must be the run of a capture with --more, found none; make it first by drgs capture "
-            f"PHOTOS -o {tmp_path / 'none'}"
+            f"-o must be a run with --more, found none; make it first by drgs capture PHOTOS -o {tmp_path / 'none'}"
         )
     assert not (tmp_path / "none").exists()
 

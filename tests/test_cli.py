@@ -89,6 +89,25 @@ def test_version(capsys):
     assert "drgs --version" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("capture photos -o x --max-steps 9", "options must be those of the command, got --max-steps (of drgs fit"),
+        ("fisher x --max-pixels 9", "got --max-pixels (of drgs view, fit"),
+        ("fit data -o x --max-steps -1", "drgs fit: --max-steps must be a whole number in [1, 1000000000], got -1"),
+        ("prune scene.ply -o small.ply --keep 2", "drgs prune: --keep must be a share above 0 and below 1, got 2"),
+        ("cite nowhere", "drgs cite: nowhere: must be a run folder, nothing is there; check the path"),
+        ("fit scene.ply -o x", "drgs view, fisher, select and prune take a fitted scene"),
+    ],
+)
+def test_messages_name_what_was_typed(line, expected, capsys, monkeypatch, tmp_path):
+    """Options as they are typed, the commands that have one, and what is where a path leads."""
+    monkeypatch.chdir(tmp_path)
+    Path("scene.ply").write_bytes(b"ply\n")
+    assert cli.main(line.split()) == 2
+    assert expected in capsys.readouterr().err
+
+
 @pytest.mark.core
 @pytest.mark.parametrize(
     ("line", "expected"),

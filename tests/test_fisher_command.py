@@ -296,7 +296,7 @@ def test_picture_is_logarithmic():
         ("run --limit 0", "--limit must be in [1, 10000], got 0"),
         ("run --cameras cameras.json --split test", "--split test must have --cameras DATA"),
         ("run --prior nan", "lambda (value) must be in [0, inf), got nan"),
-        ("nowhere.ply", "nowhere.ply: must be a file of Gaussians, found none"),
+        ("nowhere.ply", "nowhere.ply: must be a file of Gaussians or a run, nothing is there"),
         ("early", "must hold state.safetensors or point_cloud.ply, found none"),
     ],
 )

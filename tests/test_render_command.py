@@ -221,7 +221,7 @@ def test_lens(scene, gaussians, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        ("nowhere.ply", "nowhere.ply: must be a file of Gaussians, found none"),
+        ("nowhere.ply", "nowhere.ply: must be a file of Gaussians or a run, nothing is there"),
         ("{dir}", "must be a run folder, found no config.json"),
         ("{scene} --set sigma=3", "--set: must be a render setting, got 'sigma=3'"),
         ("{scene} --format gif", "--format must be a list of png, jpg, exr, webm, mp4, ply, got 'gif'"),

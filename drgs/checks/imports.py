@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 
@@ -41,16 +43,20 @@ def imported_function(option: str, text: str, or_else: str = "") -> Callable[...
     """
     module, colon, attribute = text.partition(":")
     if not (colon and module and attribute):
-        raise ValueError(f"{option} {text}: must be {or_else}package.module:function")
+        own = f"; say {Path(text).stem}:FUNCTION in the folder of {Path(text).name}" if text.endswith(".py") else ""
+        raise ValueError(f"{option} {text}: must be {or_else}package.module:function{own}")
     if "" not in sys.path:  # a function beside the user, also when `drgs` is an installed script
         sys.path.insert(0, "")
     try:
-        found = getattr(importlib.import_module(module), attribute, None)
+        code = importlib.import_module(module)
     except Exception as error:
         raise ValueError(
             f"{option} {text}: must be importable, got {type(error).__name__}: {error}; correct it, or run drgs in the "
-            "folder that holds the module"
+            "folder that holds the module; its name is without .py"
         ) from error
+    found = getattr(code, attribute, None)
     if not callable(found):
-        raise ValueError(f"{option} {text}: {module} must have a function {attribute}, has none")
+        own = [value for value in vars(code).values() if inspect.isfunction(value) and value.__module__ == module]
+        names = ", ".join(value.__name__ for value in own if not value.__name__.startswith("_"))
+        raise ValueError(f"{option} {text}: {module} must have a function {attribute}, has {names or 'none'}")
     return found

@@ -103,7 +103,7 @@ def load_gaussians(path: str | os.PathLike, *, as_stored: bool = False) -> Gauss
             )
         path = found
     elif not path.is_file():
-        raise FileNotFoundError(f"{path}: must be a file of Gaussians, found none; check the path")
+        raise FileNotFoundError(f"{path}: must be a file of Gaussians or a run, nothing is there; check the path")
     with path.open("rb") as file:
         head = file.read(_HEAD)
     codec = _codec_of(path, head)

@@ -56,8 +56,8 @@ def _print_next(args: Capture) -> None:
     """Which photographs to take next, below what the capture itself has advised."""
     if not is_run(args.output):
         raise ValueError(
-            f"{args.output}: -o must be the run of a capture with --more, found none; make it first by drgs capture "
-            f"PHOTOS -o {shlex.quote(str(args.output))}"
+            f"{args.output}: -o must be a run with --more, found none; make it first by drgs capture PHOTOS "
+            f"-o {shlex.quote(str(args.output))}"
         )
     if args.paths:
         raise ValueError(f"--more must have no photographs, got {args.paths[0]}; drop one or the other")

@@ -18,6 +18,7 @@ import typing
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 from drgs.checks.records import Option, hints_of, nearest, nested, options_in, stated, ways_of
@@ -40,18 +41,21 @@ _PRESET = "fast"  # as a fit has it
 # ------------------------------------------------------------------------------------------------ words to options
 
 
-def parsed_options(kind: type[Common], words: Sequence[str]) -> Any:
+def parsed_options(
+    kind: type[Common], words: Sequence[str], commands: Mapping[str, type[Common]] = MappingProxyType({})
+) -> Any:
     """The options of a command.
 
     Args:
         kind: Their dataclass.
         words: What follows the command's name on the command line.
+        commands: All commands, to say which has an option that this one lacks.
     Raises:
         ValueError: If an option is unknown, has no value or a wrong one, or is missing; and as the dataclass says.
         OSError: If the file of --config cannot be read.
     """
     options = options_in(kind)
-    line = _read(options, words)
+    line = _read(options, words, commands)
     given = _of_file(kind, line)
     for name, value in line.items():
         given[name] = (*given.get(name, ()), *value) if options[name].spec.repeat else value
@@ -61,7 +65,7 @@ def parsed_options(kind: type[Common], words: Sequence[str]) -> Any:
     return nested(kind, None, kind.values(given, line))
 
 
-def _read(options: Mapping[str, Option], words: Sequence[str]) -> dict[str, Any]:
+def _read(options: Mapping[str, Option], words: Sequence[str], commands: Mapping[str, type[Common]]) -> dict[str, Any]:
     """Name of an option -> its value, of those that words name."""
     places = [option for option in options.values() if option.spec.positional]
     flags = {option.flag: option for option in options.values() if not option.spec.file_only and option not in places}
@@ -87,7 +91,9 @@ def _read(options: Mapping[str, Option], words: Sequence[str]) -> dict[str, Any]
         option = flags["--" + flag[5:]] if is_no else option
         if option is None or (is_no and option.hint is not bool):
             near = nearest(flag.lstrip("-"), [x[2:] for x in flags]).replace("did you mean ", "did you mean --")
-            raise ValueError(f"options must be those of the command, got {flag}; {near}")
+            owners = [name for name, other in commands.items() if flag in (x.flag for x in options_in(other).values())]
+            of_others = f" (of drgs {', '.join(owners)})" if owners else ""
+            raise ValueError(f"options must be those of the command, got {flag}{of_others}; {near}")
         if option.hint is bool:
             if equals:
                 opposite = option.flag if is_no else f"--no-{option.flag[2:]}"

@@ -69,7 +69,7 @@ def run(args: Fisher) -> None:
         if args.cameras in (None, "orbit", "dome"):
             raise ValueError(
                 "a file of Gaussians has no record of its views: --train or --cameras must name a data set, a run or a "
-                "cameras.json"
+                "cameras.json, e.g. --train FOLDER, the photographs and poses that it was trained on"
             )
         text = args.cameras
     known = known_views(text, args, given, given.keeps_lenses(args.undistort), args.info_pixels)

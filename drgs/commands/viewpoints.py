@@ -287,7 +287,8 @@ def known_views(
     """
     if text is None and given.run is None:
         raise ValueError(
-            "a file of Gaussians has no record of its views: --train must name a data set, a run or a cameras.json"
+            "a file of Gaussians has no record of its views: --train must name a data set, a run or a cameras.json, "
+            "e.g. the photographs and poses that it was trained on"
         )
     known = _known_views(text, args, given, lenses, pixels)
     if text is not None:

@@ -194,7 +194,9 @@ def _located(path: Path) -> tuple[str, Path]:
             if form.suffix and form.suffix == path.suffix:
                 return name, path
         refuse_foreign(path, "a data set")
-        raise ValueError(f"{path}: must be a folder, a transforms .json or an LLFF .npy; name one of these")
+        is_splat = path.suffix in (".ply", ".spz", ".splat", ".sog")
+        advice = "drgs view, fisher, select and prune take a fitted scene" if is_splat else "name one of these"
+        raise ValueError(f"{path}: must be a folder, a transforms .json or an LLFF .npy; {advice}")
     if lacking:
         return "colmap", path  # whose loader says what is missing
     below = [] if any(path.glob(f"*/{POSES}")) else _data_sets_below(path)

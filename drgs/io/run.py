@@ -80,6 +80,8 @@ class Run:
             ValueError: If the file is damaged or of another schema version.
         """
         path = self.path / "config.json"
+        if not self.path.exists():
+            raise FileNotFoundError(f"{self.path}: must be a run folder, nothing is there; check the path")
         if not path.is_file():
             raise FileNotFoundError(f"{self.path}: must be a run folder, found no config.json; run `drgs fit` first")
         config = read_json(path, "a run's config.json", "fit again in another folder")
