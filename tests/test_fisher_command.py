@@ -275,6 +275,14 @@ def test_a_splat_of_nerfstudio_is_brought_to_the_cameras(place, tmp_path, capsys
         assert capsys.readouterr().err.count("\n") == 1
 
 
+def test_many_pixels_are_said(place, monkeypatch, capsys):
+    """Where there are many, how to have fewer; else nothing."""
+    line = "scene.ply --train cameras.json --limit 1 --preset fast"
+    assert "--info-pixels" not in run(line, place, monkeypatch, capsys)[1]
+    monkeypatch.setattr("drgs.commands.fisher._MANY_PIXELS", 100)
+    assert "--info-pixels 48 takes half of the time or less" in run(line, place, monkeypatch, capsys)[1]
+
+
 def test_picture_is_logarithmic():
     """Each decade takes the same part of the bar, zero is gray, and the largest value is brightest."""
     values = np.array([[0.0, 1.0, 10.0, 100.0]] * 50)

@@ -53,6 +53,7 @@ from drgs.io.outputs import LockedFolder, write_json
 from drgs.settings import RenderSettings
 
 KINDS = ("variance", "share")  # of maps
+_MANY_PIXELS = 2_000_000  # pixels of all views from which on a smaller size is advised: about half a minute; chosen
 _log = logging.getLogger(__name__)
 
 
@@ -79,6 +80,11 @@ def run(args: Fisher) -> None:
         views, source = views_to_compare("--cameras", args.cameras, args, given, known, fresh=False)
     views = evenly(with_times(views, args, given), args.limit)
     check_lenses("fisher", settings, [*known.cameras, *views])
+    pixels = [camera.width * camera.height for camera in (*known.cameras, *views)]
+    if sum(pixels) > _MANY_PIXELS:
+        args.say(
+            f"{sum(pixels) / 1e6:.1f} million pixels: --info-pixels {max(pixels) // 10} takes half of the time or less"
+        )
     scoring = given.scoring(args.scoring, settings)
     region = region_of("fisher", args, given, Source.known(text, given), known.cameras, settings)
     shown = None if region is None else region.shares(given.scene, views, settings, "fisher")
@@ -445,7 +451,7 @@ def _print(args: Fisher, known: Known, groups: dict[str, GroupSummary], views: l
             (name, shape, f"{row.sum:.4g}", f"{row.median_of_positive or 0:.4g}", share, *_shares(row.blocks, several))
         )
     title = f"information of {len(known.cameras)} views ({known.source})"
-    tables.show(title, ("group", "shape", "sum", "median > 0", "nothing known", *_percent(several)), rows)
+    tables.show(title, ("group", "shape", "sum", "median\n> 0", "nothing\nknown", *_percent(several)), rows)
     rows = []
     for row in views:
         values = row.pose.eigenvalues if row.pose else []
