@@ -111,7 +111,7 @@ def test_a_score_of_empty_pixels_is_told(tmp_path, capsys):
     selection = Selection(picks, [2.0] * 5, blocks=["geometry", "backdrop"])
     print_picks({**report, "seconds": 1.0}, selection, tmp_path / "x.json")
     told = (
-        "note: most of the score of a, c, d and 1 more is of pixels where no Gaussian is (backdrop); --blocks geometry"
+        "note: most of the score of a, c, d and 1 more is of pixels where no Gaussian is (backdrop): right for a whole"
     )
     assert told in capsys.readouterr().out
     selection.combine = "zscore"

@@ -163,7 +163,7 @@ def print_picks(report: dict, selection: Selection, output: Path) -> None:
         more = f" and {len(empty) - _SHOWN} more" if len(empty) > _SHOWN else ""
         print(
             f"note: most of the score of {', '.join(empty[:_SHOWN])}{more} is of pixels where no Gaussian is "
-            "(backdrop); --blocks geometry scores what Gaussians show alone"
+            "(backdrop): right for a whole scene; where only what is modeled counts, add --blocks geometry"
         )
     for note in selection.notes:
         print(f"note: {note}")
