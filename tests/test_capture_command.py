@@ -475,6 +475,7 @@ def test_folders_of_others(captured, photographs, tmp_path, capsys):
     assert "--add must have a capture to add to" in refused([more, "-o", tmp_path / "new", "--add"], capsys)
     assert "not in the capture yet, got none" in refused([first, "-o", captured, "--add"], capsys)
     assert "it holds a capture; add --resume to go on with it" in refused(["-o", captured], capsys)
+    assert "--resume must have a capture to go on with" in refused(["-o", tmp_path / "none", "--resume"], capsys)
     assert "must be a new folder, or that of a capture" in refused(
         [first, "-o", _fit_alone(captured, tmp_path)], capsys
     )

@@ -71,6 +71,8 @@ def run_capture(options: CaptureOptions, config: FitConfig, say: Callable[[str],
             f"{options.output}: there must be photographs or --resume, got none, and it holds a capture; add --resume "
             "to go on with it"
         )
+    if not options.paths and options.resume:
+        raise ValueError(f"{options.output}: --resume must have a capture to go on with, found none; check -o")
     if not options.paths:
         raise ValueError(
             "there must be photographs, videos or a data set, got none; name them, e.g. drgs capture photos -o RUN"

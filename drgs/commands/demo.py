@@ -230,6 +230,7 @@ class _Demo:
         with self.timed("comparison"), Bar("presets compared", show=self.progress):
             images, rows = _compare(g, frames, self.plan.repeats)
         self.say(f"3. The same Gaussians by the rules of other renderers ({len(frames)} held-out views)")
+        self.say("   They are fitted for fast alone; drgs fit without --for fits for all of them.")
         if self.progress:
             _table(rows)
         return images, rows

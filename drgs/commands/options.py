@@ -419,9 +419,7 @@ class Fit(Workers, Data):
     views: Literal["all", "active"] = of_views(
         "all", "Fit to all training views, or start with a few and choose more during the fit (active; options below)."
     )
-    report: bool = option(
-        True, "Write report.html into the run folder at the end, unless --no-report is given.", rare=True
-    )
+    report: bool = option(True, "Leave out report.html, which a fit ends with.", rare=True)
     fit: FitConfig = part(FitConfig())
     preset: Preset | None = option(
         None,
@@ -525,9 +523,7 @@ class Share(Views, Common):
         None,
         "Photographs to take next, a file that drgs select wrote; default those of the run, if it chose its views.",
     )
-    uncertainty: bool = option(
-        True, "Add a layer of the expected error (docs/uncertainty.md), unless --no-uncertainty is given."
-    )
+    uncertainty: bool = option(True, "Leave out the layer of the expected error (docs/uncertainty.md).")
     moments: int = option(
         12, "Dynamic scenes: number of times to store; the page interpolates linearly between them.", within=(2, 200)
     )
@@ -730,9 +726,7 @@ class Crossval(SampledViews):
     preset: Literal["auto", Preset] = option(
         "auto", "Model that the rasterizer implements; auto: the preset with the nearest image.", heading="Rendering"
     )
-    ladder: bool = option(
-        True, "Measure which approximations of that model cause its difference from exact, unless --no-ladder is given."
-    )
+    ladder: bool = option(True, "Leave out which approximations of the model cause its difference from exact.")
     strict: bool = option(
         False, "Fail also for other conventions, known deviations and missing images of a data set.", heading="Data"
     )
@@ -851,7 +845,7 @@ class Teach(Common, TimedData):
         "0.75,1,1.5", "Scales of the photographs to average over; at 1 the short side is twice the model's image size."
     )
     flip: bool = option(
-        True, "Average with the mirrored photographs, unless --no-flip is given, which takes half the time."
+        True, "Leave out the mirrored photographs, whose maps are averaged with the others; takes half the time."
     )
 
 
@@ -895,10 +889,8 @@ class Scene(Common):
     wall: Literal["white", "paper"] | None = option(
         None, "Wall behind the table (capture): white without texture (default), or papered."
     )
-    shadow: bool = option(
-        True, "Add the photographer's shadow to some photographs (capture), unless --no-shadow is given."
-    )
-    passer_by: bool = option(True, "Add a passer-by to some photographs (capture), unless --no-passer-by is given.")
+    shadow: bool = option(True, "Leave out the photographer's shadow, which is in some photographs (capture).")
+    passer_by: bool = option(True, "Leave out the passer-by, who is in some photographs (capture).")
     pose_error: str | None = option(
         None, "DEGREES,METERS of simulated errors of training poses (capture); default 0.4,0.006; 0,0 for none."
     )
@@ -945,7 +937,7 @@ class Reproduce(Workers):
     config: Path | None = option(
         None, "Configuration that replaces that of --scale: a TOML or JSON file, or a run (docs/configuration.md)."
     )
-    figures: bool = option(True, "Draw the comparison sheet and the maps at the end, unless --no-figures is given.")
+    figures: bool = option(True, "Leave out the comparison sheet and the maps at the end.")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
