@@ -95,6 +95,14 @@ def test_depth_modes_that_are_refused_or_of_another_shape(scene):
     assert (rows["depth RGB+D"].status, result.verdict) == ("wrong", "model difference")
     assert rows["depth RGB+D"].why == "its image must have shape (1, 24, 32, 4), got (1, 24, 32, 3)"
 
+    def of_one_camera(means, **arguments):
+        image, alpha, info = torch_rasterizer.rasterization(means=means, **arguments)
+        return image[0], alpha[0], info
+
+    result, rows = _rows(of_one_camera, scene)
+    assert (rows["several cameras in a call"].status, result.verdict) == ("wrong", "model difference")
+    assert rows["several cameras in a call"].why == "its image must have shape (2, 24, 32, 3), got (24, 32, 3)"
+
 
 def test_ours_has_every_path(scene):
     """drgs.rasterization agrees on all that an image plane has."""

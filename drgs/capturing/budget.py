@@ -212,7 +212,7 @@ def plan_poses(
     """
     largest = max(image_size(folder / names[0]))
     chosen = [names[len(names) // 3], names[min(len(names) // 3 + 1, len(names) - 1)]]
-    with Bar("how long poses will take"):
+    with Bar("estimating the time of poses"):
         features, pair = _timed_pair([decode(folder / name) for name in chosen])
     measured = min(_MEASURED_SIZE, largest)
     sizes = [size for size in _IMAGE_SIZES if size < largest]
@@ -232,7 +232,7 @@ def plan_frames(video: Path, photographs: int, most: int, budget: float) -> int:
     """
     read = read_video(video)
     first = read.count // 3
-    with Bar("how long poses will take"):
+    with Bar("estimating the time of poses"):
         features, pair = _timed_pair([VideoFrame(video, min(first + k, read.count - 1)).read() for k in (0, 10)])
     largest = max(read.width, read.height)
     scale = min(_IMAGE_SIZES[-1], largest) / min(_MEASURED_SIZE, largest)

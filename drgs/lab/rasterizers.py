@@ -242,7 +242,11 @@ def function(call: Callable, name: str, along_rays: bool = False) -> Rasterizer:
         try:
             returned = call(**(given | changed))
         except Exception as error:
-            raise ValueError(f"--rasterizer {name}: raised {type(error).__name__}: {one_line(error)}") from error
+            takes_any = "; who takes **arguments gets all of gsplat's: name those that it knows"
+            advice = takes_any if open_ended and isinstance(error, TypeError) else ""
+            raise ValueError(
+                f"--rasterizer {name}: raised {type(error).__name__}: {one_line(error)}{advice}"
+            ) from error
         image, alpha = _checked(name, returned, cameras[0], len(raws), len(cameras), channels)
         if "backgrounds" not in given:
             behind = torch.tensor(backgrounds, dtype=image.dtype, device=image.device)[:, None, None]
