@@ -34,6 +34,19 @@ def test_lines_of_a_silent_stage(soon, capsys):
     assert (progress._bars, progress._output) == ([], None)
 
 
+def test_lines_become_rarer(monkeypatch):
+    """Every 2 s in the first 10 s of a stage, also late in a command of a minute; later up to 30 s apart."""
+    for name, seconds in (("FIRST", 1.0), ("EVERY", 2.0), ("LEAST_OFTEN", 30.0)):
+        monkeypatch.setattr(progress, name, seconds)
+    now = [0.0]
+    monkeypatch.setattr(progress, "time", types.SimpleNamespace(monotonic=lambda: now[0]))
+    with Bar("fisher", show=True):
+        now[0] = 40.0
+        with Bar("residuals", 20) as bar:
+            pauses = [progress._output.pause(bar, 40.0 + seconds) for seconds in (0, 10, 50, 1000)]
+    assert pauses == pytest.approx([2, 2.5, 10, 30])
+
+
 def test_lines_of_steps(soon, capsys):
     """Steps, their number, what else is known and the time that is left; the last line says that it is done."""
     with Bar("features", 4, show=True) as bar:

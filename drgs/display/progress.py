@@ -16,8 +16,9 @@ from collections.abc import Iterator
 from typing import Any
 
 FIRST = 1.0  # seconds after which a stage is worth its first line
-EVERY = 10.0  # seconds between two lines at first; they become rarer, up to LEAST_OFTEN
+EVERY = 2.0  # seconds between two lines at first; they become rarer, up to LEAST_OFTEN
 LEAST_OFTEN = 30.0  # seconds between two lines of a long stage
+_OF_STAGE, _OF_COMMAND = 0.2, 0.05  # of the time since a stage, and the command, began: between two lines. Chosen
 _STEADY_AFTER = 24  # steps after which a rate is believed: kernels are compiled in a fit's first ones. Chosen
 _bars: list[Bar] = []  # that are open, the innermost last
 _output: _Lines | _Terminal | Any = None  # None while none of them is shown
@@ -170,11 +171,15 @@ class _Lines:
     def _run(self) -> None:
         while not self._is_over.wait(min(0.25, FIRST)):
             now = time.monotonic()
-            pause = min(LEAST_OFTEN, max(EVERY, 0.05 * (now - self._began)))
             for bar in [bar for bar in _bars if bar.is_shown][-1:]:
-                if now - self._last >= pause or (not bar.is_reported and now - bar.began >= FIRST):
+                is_due = now - self._last >= self.pause(bar, now)
+                if is_due or (not bar.is_reported and now - bar.began >= FIRST):
                     bar.is_reported = True
                     self.note(bar.line())
+
+    def pause(self, bar: Bar, now: float) -> float:
+        """Seconds from the last line to the next: short early in a stage, so that no new work seems to stand still."""
+        return min(LEAST_OFTEN, max(EVERY, _OF_STAGE * (now - bar.began), _OF_COMMAND * (now - self._began)))
 
     def draw(self, bar: Bar) -> None:
         """The thread does."""
