@@ -134,8 +134,9 @@ def _complain(command: str | None, message: str) -> None:
     """One line on stderr: `drgs COMMAND: message`; functions that are called as the command name it themselves."""
     where = f"drgs {command}" if command else "drgs"
     message = " ".join(message.removeprefix("drgs: ").removeprefix(f"{command}: ").split())
-    name, must, rest = message.partition(" must ")
-    option = options_in(COMMANDS[command]).get(name) if command else None
-    if must and option and not option.spec.positional:  # what a function calls by its argument's name
-        message = f"{f'-{option.spec.short}' if option.spec.short else option.flag} must {rest}"
+    options = options_in(COMMANDS[command]) if command else {}
+    typed = {name: option.typed for name, option in options.items() if not option.spec.positional}
+    subject, must, rest = message.partition(" must ")
+    if must and {*typed, "either", "or"}.issuperset(subject.split()):  # what a function calls by its arguments' names
+        message = " ".join(typed.get(word, word) for word in subject.split()) + must + rest
     print(f"{where}: {message}", file=sys.stderr)

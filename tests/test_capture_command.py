@@ -28,6 +28,7 @@ from drgs.capturing import fit as capture_fit
 from drgs.capturing.budget import FEWEST_STEPS, Pacer
 from drgs.capturing.capture import Photographs
 from drgs.capturing.record import CaptureRecord
+from drgs.commands import values
 from drgs.commands.capture import capture_photographs, run
 from drgs.commands.options import Capture
 from drgs.data import load
@@ -676,10 +677,10 @@ def test_frames_are_planned(tmp_path):
 
 @pytest.mark.parametrize(("text", "seconds"), [("90s", 90), ("10min", 600), ("1.5h", 5400), (" 2 m ", 120)])
 def test_budgets(text, seconds):
-    assert budget.seconds_of_budget(text) == seconds
+    assert values.seconds_of_budget(text) == seconds
 
 
 @pytest.mark.parametrize("text", ["10", "ten minutes", "5s", "-3min", "1e9h", ""])
 def test_bad_budgets(text):
     with pytest.raises(ValueError, match="--budget must be"):
-        budget.seconds_of_budget(text)
+        values.seconds_of_budget(text)

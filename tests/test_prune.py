@@ -367,8 +367,8 @@ def test_command_by_views_that_show_nothing(place, monkeypatch, capsys):
     ("arguments", "word"),
     [
         (("scene.ply", "--keep", "0.5"), "--data must name a data set"),
-        (("scene.ply", "--data", "data"), "either keep or loss must say"),
-        (("scene.ply", "--data", "data", "--keep", "0"), "keep must be a share above 0 and below 1, got 0"),
+        (("scene.ply", "--data", "data"), "either --keep or --loss must say"),
+        (("scene.ply", "--data", "data", "--keep", "0"), "--keep must be a share above 0 and below 1, got 0"),
         (("scene.ply", "--data", "data", "--keep", "1"), "leave the scene as it is"),
         (("scene.ply", "--data", "data", "--loss", "much"), "--loss must be a number of decibels"),
         (("scene.ply", "--data", "cameras.json", "--loss", "1"), "--loss must have photographs"),

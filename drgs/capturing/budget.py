@@ -12,7 +12,6 @@ import contextlib
 import dataclasses
 import logging
 import math
-import re
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -44,8 +43,7 @@ _GROWTH_ENDS = 0.5  # share of the steps from which on Gaussians do not grow in 
 _LEAST_CHANGE = 0.03  # share of the steps; a smaller change would reschedule rates for less than the clock's noise
 _MOST_STEPS = 4.0  # times the planned steps, however fast they are: a plan timed beside other programs is too short
 
-_SECONDS = {"s": 1.0, "sec": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
-_LEAST_BUDGET = 30.0  # seconds: less is not enough to start all libraries
+_LEAST_REST = 30.0  # seconds after poses: fewer are not enough for a fit. Chosen
 
 # Poses: what two photographs take says what all of them take.
 _MEASURED_SIZE = 800  # pixels of the longer side at which two photographs are timed: a second or two
@@ -185,21 +183,6 @@ class Pacer:
         )
 
 
-def seconds_of_budget(text: str) -> float:
-    """Seconds of `90s`, `10min`, `1.5h`.
-
-    Raises:
-        ValueError: If it is no such time, or less than half a minute.
-    """
-    matched = re.fullmatch(r"\s*(\d+(?:\.\d+)?|\.\d+)\s*([a-z]+)\s*", text.lower())
-    if matched is None or matched[2] not in _SECONDS:
-        raise ValueError(f"--budget must be a time with its unit, e.g. 90s, 10min or 1.5h, got {text!r}; correct it")
-    seconds = float(matched[1]) * _SECONDS[matched[2]]
-    if not _LEAST_BUDGET <= seconds <= 1e7:
-        raise ValueError(f"--budget must be at least {_LEAST_BUDGET:.0f}s, got {text}; allow more time")
-    return seconds
-
-
 def plan_poses(
     folder: Path, names: Sequence[str], budget: float, decode: Callable[[Path], np.ndarray] = read_image
 ) -> PosePlan:
@@ -271,7 +254,7 @@ def planned_poses(plan: PosePlan, count: int, left: float, budget: float) -> str
         budget: Seconds of the whole capture.
     """
     size, rest = plan.max_image_size, left - plan.seconds
-    if rest >= _LEAST_BUDGET:
+    if rest >= _LEAST_REST:
         return (
             f"plan for {duration(budget)}: {count} photographs at {size} pixels for poses, about "
             f"{duration(plan.seconds)}; then a fit as large as the {duration(rest)} after it allow, by timed steps"

@@ -128,6 +128,11 @@ class Option:
             return self.spec.metavar or self.name.upper()
         return "--" + (self.spec.flag or self.name).replace("_", "-")
 
+    @property
+    def typed(self) -> str:
+        """`flag`, or the short form of those that have one: -k."""
+        return f"-{self.spec.short}" if self.spec.short else self.flag
+
 
 @functools.cache
 def options_in(kind: type) -> Mapping[str, Option]:
@@ -170,6 +175,7 @@ def _default(field: dataclasses.Field) -> Any:
 
 def check_ranges(record: Any) -> None:
     """Raise ValueError unless the numbers of a command's options are in the ranges that their fields declare."""
+    kind: Any = type(record)
     for field in dataclasses.fields(record):
         spec = field.metadata.get(_OPTION)
         if spec is None or spec.within is None:
@@ -177,7 +183,7 @@ def check_ranges(record: Any) -> None:
         value = getattr(record, field.name)
         low, high = spec.within
         if value is not None and not low <= value <= high:
-            flag = f"-{field.name}" if spec.short == field.name else "--" + (spec.flag or field.name).replace("_", "-")
+            flag = options_in(kind)[field.name].typed
             raise ValueError(f"{flag} must be in [{low:.15g}, {high:.15g}], got {value:.15g}; correct it")
 
 

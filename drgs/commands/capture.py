@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import shlex
 
-from drgs.capturing.budget import seconds_of_budget
 from drgs.capturing.capture import CaptureOptions
 from drgs.capturing.next_views import rank_next
 from drgs.capturing.record import FOLDER, CaptureRecord
 from drgs.capturing.steps import run_capture
 from drgs.commands.options import Capture
 from drgs.commands.report import report_of
+from drgs.commands.values import seconds_of_budget
 from drgs.fitting.config import FitConfig
 from drgs.fitting.records import is_run
 from drgs.viewing.installation import view_command
@@ -36,7 +36,7 @@ def capture_photographs(args: Capture, config: FitConfig) -> None:
         args: Options.
         config: What the fit of the first photographs does where no budget says so.
     Raises:
-        FileNotFoundError, ValueError, KeyboardInterrupt: As `run_capture`, or the budget is no time.
+        FileNotFoundError, ValueError, KeyboardInterrupt: As `run_capture`.
     """
     options = CaptureOptions(
         paths=args.paths,
@@ -61,8 +61,6 @@ def _print_next(args: Capture) -> None:
         )
     if args.paths:
         raise ValueError(f"--more must have no photographs, got {args.paths[0]}; drop one or the other")
-    if args.k < 1:
-        raise ValueError(f"-k must be at least 1, got {args.k}; ask for some")
     picks = rank_next(args.output, args.k, args.length, not args.quiet, args.region)
     if args.quiet:
         return

@@ -18,8 +18,19 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from drgs.checks.records import check_ranges, option, options_in, part, same_option
 from drgs.cluster.options import check_options
-from drgs.commands.values import ORBIT_KEYS, OrbitShape, check_color, parsed, parsed_orbit
-from drgs.fitting.config import COUNT, SEED, FitConfig, SelectionConfig, UndistortUse
+from drgs.commands.values import (
+    ORBIT_KEYS,
+    OrbitShape,
+    check_color,
+    parsed,
+    parsed_cells,
+    parsed_decibels,
+    parsed_formats,
+    parsed_orbit,
+    parsed_scales,
+    seconds_of_budget,
+)
+from drgs.fitting.config import COUNT, SEED, FitConfig, SelectionConfig, UndistortUse, check_amount
 from drgs.fitting.renderers import AUTO, own_preset
 from drgs.information.choices import POLICIES, check_named
 from drgs.information.region import RegionText
@@ -370,6 +381,11 @@ class Render(Settings, Orbits, Views, SceneTimes, Lenses):
     split: Split = of_views("all", "Which views of a data set to take.", rare=True)
     limit: int | None = of_views(None, "At most this many views.", within=COUNT)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.format is not None:
+            parsed_formats(self.format)
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class View(Information, Orbits, Views):
@@ -486,6 +502,7 @@ class Eval(Common, Data):
         1.0,
         "Factor of width and height of the images over those of the fit, up to the size of the photographs.",
         heading="Rendering",
+        within=(1, 1000),
     )
     lpips_weights: Path | None = option(
         None,
@@ -538,7 +555,7 @@ class Select(ComparedViews, Workers):
         " or dome.",
         metavar="dome|orbit|PATH",
     )
-    k: int = of_views(1, "Number of views to pick, one after the other.", short="k")
+    k: int = of_views(1, "Number of views to pick, one after the other.", short="k", within=COUNT)
     halving: bool = of_views(
         True,
         "Score all candidates by all of their pixels, also those that a quarter of them tells from the best "
@@ -699,6 +716,12 @@ class Prune(Settings, Views, Lenses):
         heading="Rendering",
     )
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_amount("prune", self.keep, None if self.loss is None else parsed_decibels(self.loss))
+        if self.region is not None:
+            RegionText.of(self.region, "prune")
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Mesh(Settings, Views, Lenses):
@@ -799,6 +822,13 @@ class Capture(Common):
     )
     seed: int = option(0, "Random seed.", within=SEED)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.budget is not None:
+            seconds_of_budget(self.budget)
+        if self.region is not None:
+            RegionText.of(self.region, "capture")
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Sfm(Common):
@@ -847,6 +877,12 @@ class Teach(Common, TimedData):
     flip: bool = option(
         True, "Leave out the mirrored photographs, whose maps are averaged with the others; takes half the time."
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        parsed_scales(self.scales)
+        if self.size is not None:
+            parsed_cells(self.size)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

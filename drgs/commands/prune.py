@@ -15,6 +15,7 @@ from drgs.codecs import check_suffix, origin_file, save_gaussians
 from drgs.commands.options import Prune
 from drgs.commands.regions import region_of
 from drgs.commands.scene_input import SELECTION, SceneInput
+from drgs.commands.values import parsed_decibels
 from drgs.commands.viewpoints import Source, check_lenses, warn_of_unseen
 from drgs.data import View
 from drgs.display import tables
@@ -28,13 +29,13 @@ from drgs.fitting.metrics import TRAIN_VIEWS, through_renderers
 from drgs.fitting.networks import saved_networks
 from drgs.fitting.records import fitted_views, is_run, of_some
 from drgs.fitting.renderers import renderers_to_measure
-from drgs.information.region import Region, RegionText
+from drgs.information.region import Region
 from drgs.integrator import Output
 from drgs.io.checkpoint import load_state, save_state
 from drgs.io.journal import SCHEMA
 from drgs.io.outputs import lock_folder, write_json, write_whole
 from drgs.io.run import Run
-from drgs.pruning import ROUNDS, Pruned, check_amount, fit_on, prune
+from drgs.pruning import ROUNDS, Pruned, fit_on, prune
 from drgs.settings import RenderSettings
 
 _NOTED = 0.1  # dB lost in some renderer from which on it is said how to win them back: what can be seen; chosen
@@ -48,10 +49,7 @@ def _copied() -> tuple[str, ...]:
 def run(args: Prune) -> None:
     """`drgs prune SCENE -o FILE`, or of a run `-o FOLDER`."""
     settings = args.settings()
-    loss = None if args.loss is None else _decibels(args.loss)
-    check_amount("prune", args.keep, loss)
-    if args.region is not None:
-        RegionText.of(args.region, "prune")
+    loss = None if args.loss is None else parsed_decibels(args.loss)
     output = _Output.of(args)
     with lock_folder(output.report.parent, "prune", output.names, [args.scene, args.data or ""]):
         with Bar("reading", show=not args.quiet):
@@ -105,14 +103,6 @@ def run(args: Prune) -> None:
             write_json(output.report, _record(args, pruned, views, settings, costs))
     if not args.quiet:
         _print(args, pruned, views, costs, output)
-
-
-def _decibels(text: str) -> float:
-    """The number of `0.1dB`, `0.1 dB` or `0.1`."""
-    try:
-        return float(text.strip().lower().removesuffix("db"))
-    except ValueError:
-        raise ValueError(f"--loss must be a number of decibels above 0, e.g. 0.1dB, got {text!r}; correct it") from None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -39,6 +39,7 @@ from drgs.commands.films import (
 from drgs.commands.options import Render
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.semantic_pictures import PICTURE_KINDS, PictureFunction, picture_functions
+from drgs.commands.values import parsed_formats
 from drgs.commands.viewpoints import captured_cameras, check_lenses, views_to_render
 from drgs.data.camera_layout import middle_camera
 from drgs.data.camera_lists import camera_to_json, save_cameras_json
@@ -57,7 +58,6 @@ _log = logging.getLogger(__name__)
 
 _FORECAST_PIXELS = 500_000  # pixels of all views; for fewer, a forecast takes as long as rendering
 _LONG_SECONDS = 10.0  # seconds from which on the forecast is printed; chosen
-_FORMATS = ("png", "jpg", "exr", "webm", "mp4", "ply")
 _FILMS: Mapping[str, Any] = {"webm": pictures.Video, "mp4": Mp4}
 _PICTURES = ("png", "jpg", "exr")
 _EXTRA_PICTURES = ("depth", "features", "labels", "overlay", "moving")  # options that write more files than one
@@ -71,7 +71,7 @@ def run(args: Render) -> None:
     single = single_file(args)
     if single is not None:
         args = dataclasses.replace(args, output=single.folder, format=single.format)
-    formats = _formats("png" if args.format is None else args.format)
+    formats = parsed_formats("png" if args.format is None else args.format)
     _check(args, settings, formats)
     film = film_of(args)
     views = _views_of(args)
@@ -309,15 +309,6 @@ def _report(settings: RenderSettings, views: list[dict[str, Any]], movies: list[
 
 
 # ------------------------------------------------------------------------------------------ inputs
-
-
-def _formats(text: str) -> tuple[str, ...]:
-    names = tuple(dict.fromkeys(part.strip().lower() for part in text.split(",") if part.strip()))
-    unknown = [name for name in names if name not in _FORMATS]
-    if unknown or not names:
-        got = unknown[0] if unknown else text
-        raise ValueError(f"render: --format must be a list of {', '.join(_FORMATS)}, got {got!r}")
-    return names
 
 
 def _movie_of(video: str, kind: str, end: str) -> str:

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from drgs import data
-from drgs.commands.values import parsed_size
+from drgs.commands.values import parsed_cells, parsed_scales
 from drgs.data.semantics import CLASS_FILES, read_class_names
 from drgs.data.sidecars import EMBEDDINGS, LABEL_FOLDERS, TEACHER_FOLDERS
 from drgs.display.progress import Bar
@@ -38,15 +38,12 @@ _FOLDER = TEACHER_FOLDERS[0]
 _RECORD = f"{_FOLDER}/teach.json"
 _CLASSES = CLASS_FILES[0]
 _LONGER_SIDE = 80  # cells of the longer side of a map, by default; chosen
-_MOST_CELLS = 4096  # cells of a side, at most: more is a typing error
 
 
 def run(args: Teach) -> None:
     """`drgs teach DATA`."""
-    size = None if args.size is None else parsed_size("--size", args.size)
-    if size is not None and not all(1 <= side <= _MOST_CELLS for side in size):
-        raise ValueError(f"--size must be 1x1 to {_MOST_CELLS}x{_MOST_CELLS} cells, got {args.size}; correct it")
-    scales = _scales(args.scales)
+    size = None if args.size is None else parsed_cells(args.size)
+    scales = parsed_scales(args.scales)
     if not args.data.exists():
         raise FileNotFoundError(f"{args.data}: must be a data set, found no such file or folder; check the path")
     folder = args.data if args.data.is_dir() else args.data.parent
@@ -87,17 +84,6 @@ def run(args: Teach) -> None:
     if not args.quiet:
         print(_summary(folder, len(files), len(left), encoder.channels, names))
         print(f"next: drgs fit {shlex.quote(str(args.data))} -o RUN")
-
-
-def _scales(text: str) -> list[float]:
-    """The numbers of --scales."""
-    try:
-        scales = [float(part) for part in text.split(",")]
-    except ValueError:
-        scales = []
-    if not scales or not all(0.1 <= scale <= 8 for scale in scales):
-        raise ValueError(f"--scales must be numbers from 0.1 to 8 with commas between, got {text!r}; correct it")
-    return scales
 
 
 def _check_no_other_files(output: LockedFolder) -> None:

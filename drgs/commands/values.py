@@ -1,4 +1,4 @@
-"""Values that are written as text: `--set KEY=VALUE`, `--orbit KEY=VALUE`, WIDTHxHEIGHT. Imports nothing heavy."""
+"""Values that are written as text: `--set KEY=VALUE`, `--orbit KEY=VALUE`, sizes, times. Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -31,6 +31,11 @@ ORBIT_KEYS = {
     "fov": "horizontal field of view in degrees; default the photographs', else 45",
 }
 """Key -> its meaning, for help."""
+
+_FORMATS = ("png", "jpg", "exr", "webm", "mp4", "ply")  # that `drgs render` writes
+_MOST_CELLS = 4096  # cells of a side of a feature map, at most: more is a typing error
+_SECONDS = {"s": 1.0, "sec": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
+_LEAST_BUDGET = 30.0  # seconds: less is not enough to start all libraries
 
 
 def parsed(texts: Sequence[str]) -> dict[str, Any]:
@@ -74,6 +79,57 @@ def parsed_size(option: str, text: str) -> tuple[int, int]:
     if not sides:
         raise ValueError(f"{option}: must be WIDTHxHEIGHT, got {text!r}; say e.g. 320x240")
     return int(sides[1]), int(sides[2])
+
+
+def parsed_cells(text: str) -> tuple[int, int]:
+    """Width and height of a feature map, by `--size` of `drgs teach`; else ValueError, as of the next ones."""
+    size = parsed_size("--size", text)
+    if not all(1 <= side <= _MOST_CELLS for side in size):
+        raise ValueError(f"--size must be 1x1 to {_MOST_CELLS}x{_MOST_CELLS} cells, got {text}; correct it")
+    return size
+
+
+def parsed_scales(text: str) -> list[float]:
+    """The numbers of `--scales` of `drgs teach`."""
+    try:
+        scales = [float(part) for part in text.split(",")]
+    except ValueError:
+        scales = []
+    if not scales or not all(0.1 <= scale <= 8 for scale in scales):
+        raise ValueError(f"--scales must be numbers from 0.1 to 8 with commas between, got {text!r}; correct it")
+    return scales
+
+
+def parsed_formats(text: str) -> tuple[str, ...]:
+    """The formats of `--format` of `drgs render`."""
+    names = tuple(dict.fromkeys(part.strip().lower() for part in text.split(",") if part.strip()))
+    unknown = [name for name in names if name not in _FORMATS]
+    if unknown or not names:
+        got = unknown[0] if unknown else text
+        raise ValueError(f"--format must be a list of {', '.join(_FORMATS)}, got {got!r}; correct it")
+    return names
+
+
+def parsed_decibels(text: str) -> float:
+    """The number of `0.1dB`, `0.1 dB` or `0.1`, of `--loss` of `drgs prune`."""
+    try:
+        loss = float(text.strip().lower().removesuffix("db"))
+    except ValueError:
+        loss = math.nan
+    if not 0 < loss < math.inf:
+        raise ValueError(f"--loss must be a number of decibels above 0, e.g. 0.1dB, got {text!r}; correct it")
+    return loss
+
+
+def seconds_of_budget(text: str) -> float:
+    """Seconds of `90s`, `10min`, `1.5h`, of `--budget` of `drgs capture`; at least half a minute."""
+    matched = re.fullmatch(r"\s*(\d+(?:\.\d+)?|\.\d+)\s*([a-z]+)\s*", text.lower())
+    if matched is None or matched[2] not in _SECONDS:
+        raise ValueError(f"--budget must be a time with its unit, e.g. 90s, 10min or 1.5h, got {text!r}; correct it")
+    seconds = float(matched[1]) * _SECONDS[matched[2]]
+    if not _LEAST_BUDGET <= seconds <= 1e7:
+        raise ValueError(f"--budget must be at least {_LEAST_BUDGET:.0f}s, got {text}; allow more time")
+    return seconds
 
 
 def _setting(key: str, hint: Any, text: str) -> Any:

@@ -7,6 +7,7 @@ longer to say stands in the docstring of its record.
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any, ClassVar, Literal
 
 from drgs.checks.records import Record, first_difference, one_of, option, part
@@ -44,6 +45,9 @@ RATE = (0.0, 1e6)  # learning rates; larger ones are typing errors, and stay fin
 FADING = (1e-30, 1e6)  # of rates whose logarithms are interpolated
 WEIGHT = (0.0, 1e6)  # of a term of the loss, likewise
 OPACITY = (1e-6, 1 - 1e-6)  # its logit is finite in float32
+
+ROUNDS = 5
+"""Rounds of `drgs.prune`; docs/prune.md has what one, ten and twenty reach."""
 
 _FAST = RenderSettings.preset("fast")
 
@@ -657,3 +661,19 @@ def _check_lenses(config: FitConfig) -> None:
             f"fit: undistort off must have renderers along rays alone, got {', '.join(drawn)}; use --for drgs, or "
             "--undistort on"
         )
+
+
+def check_amount(where: str, keep: float | None, loss: float | None, rounds: int = ROUNDS) -> None:
+    """Raise ValueError unless exactly one of `keep` and `loss` is given, and numbers are as `prune` takes them."""
+    if (keep is None) == (loss is None):
+        raise ValueError(
+            f"{where}: either keep or loss must say how many Gaussians are removed, got "
+            f"{'none' if keep is None else 'both'}; e.g. keep 0.5, or loss 0.1 dB"
+        )
+    if keep is not None and not 0 < keep < 1:
+        hint = "to remove nothing, leave the scene as it is" if keep == 1 else "0.5 keeps half of the Gaussians"
+        raise ValueError(f"{where}: keep must be a share above 0 and below 1, got {keep:g}; {hint}")
+    if loss is not None and not 0 < loss < math.inf:
+        raise ValueError(f"{where}: loss must be above 0 dB and finite, got {loss:g}; try 0.1")
+    if not (isinstance(rounds, int) and rounds >= 1):
+        raise ValueError(f"{where}: rounds must be a whole number >= 1, got {rounds!r}; try {ROUNDS}")

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import math
 from collections.abc import Callable, Sequence
 from typing import Generic, Literal, TypeVar
 
@@ -26,7 +25,7 @@ from drgs.display.progress import Bar
 from drgs.ellipsoids import Gaussians, Scene, check_gaussians, colors_only
 from drgs.fisher import removal_error
 from drgs.fitting.components.base import Component
-from drgs.fitting.config import FitConfig, RateConfig
+from drgs.fitting.config import ROUNDS, FitConfig, RateConfig, check_amount
 from drgs.fitting.frames import Frame
 from drgs.fitting.losses import psnr
 from drgs.fitting.rows import GaussianRows
@@ -41,9 +40,6 @@ from drgs.settings import RenderSettings
 Unseen = Literal["keep", "remove"]
 
 _S = TypeVar("_S", Gaussians, DynamicGaussians)
-
-ROUNDS = 5
-"""Rounds of `prune`; docs/prune.md has what one, ten and twenty reach."""
 
 POWER = 1.5
 """Power of `drgs.fisher.removal_error` that `prune` ranks by: of three that were tried near the best on every scene."""
@@ -194,22 +190,6 @@ def _pruned(
     kept = torch.zeros(len(gaussians), dtype=torch.bool)
     kept[left] = True
     return Pruned(gaussians.take(left), kept, int((~ever_seen).sum()), tuple(done), start)
-
-
-def check_amount(where: str, keep: float | None, loss: float | None, rounds: int = ROUNDS) -> None:
-    """Raise ValueError unless exactly one of `keep` and `loss` is given, and numbers are as `prune` takes them."""
-    if (keep is None) == (loss is None):
-        raise ValueError(
-            f"{where}: either keep or loss must say how many Gaussians are removed, got "
-            f"{'none' if keep is None else 'both'}; e.g. keep 0.5, or loss 0.1 dB"
-        )
-    if keep is not None and not 0 < keep < 1:
-        hint = "to remove nothing, leave the scene as it is" if keep == 1 else "0.5 keeps half of the Gaussians"
-        raise ValueError(f"{where}: keep must be a share above 0 and below 1, got {keep:g}; {hint}")
-    if loss is not None and not 0 < loss < math.inf:
-        raise ValueError(f"{where}: loss must be above 0 dB and finite, got {loss:g}; try 0.1")
-    if not (isinstance(rounds, int) and rounds >= 1):
-        raise ValueError(f"{where}: rounds must be a whole number >= 1, got {rounds!r}; try {ROUNDS}")
 
 
 @dataclasses.dataclass(frozen=True)
