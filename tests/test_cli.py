@@ -98,12 +98,14 @@ def test_version(capsys):
         ("prune scene.ply -o small.ply --keep 2", "drgs prune: --keep must be a share above 0 and below 1, got 2"),
         ("cite nowhere", "drgs cite: nowhere: must be a run folder, nothing is there; check the path"),
         ("fit scene.ply -o x", "drgs view, fisher, select and prune take a fitted scene"),
+        ("fit scene.spz -o x", "drgs view, fisher, select and prune take a fitted scene"),
     ],
 )
 def test_messages_name_what_was_typed(line, expected, capsys, monkeypatch, tmp_path):
     """Options as they are typed, the commands that have one, and what is where a path leads."""
     monkeypatch.chdir(tmp_path)
-    Path("scene.ply").write_bytes(b"ply\n")
+    for name in ("scene.ply", "scene.spz"):
+        Path(name).write_bytes(b"ply\n" if name == "scene.ply" else b"NGSP")
     assert cli.main(line.split()) == 2
     assert expected in capsys.readouterr().err
 

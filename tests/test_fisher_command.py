@@ -265,6 +265,7 @@ def test_a_splat_of_nerfstudio_is_brought_to_the_cameras(place, tmp_path, capsys
     assert f"splat.ply: is in another frame, brought to that of {place / 'data'} by {splat.parent}" in caplog.text
     (splat.parent / "dataparser_transforms.json").unlink()
     assert cli.main([*line, str(tmp_path / "two")]) == 0
+    assert "what follows says nothing of it; name the data set that it was fitted to (of nerfstudio" in caplog.text
     assert re.search(r"[5-9] of 9 known views show nothing of the scene: do the cameras belong to it", caplog.text)
     capsys.readouterr()
     reports = [json.loads((tmp_path / name / "fisher.json").read_text()) for name in ("one", "two")]

@@ -104,7 +104,7 @@ def test_one_file(tmp_path):
             continue
         with pytest.raises(ValueError, match=r"x.json: must not be replaced, `drgs select` did not make it"):
             check_file(tmp_path / "x.json", "select")
-    with pytest.raises(ValueError, match="must be a file, is a folder"):
+    with pytest.raises(ValueError, match="must be a JSON file, is a folder; name a file in it, e.g. .*/select.json"):
         check_file(tmp_path, "select")
     with pytest.raises(ValueError, match="x.json: -o must be a folder that can be written, got"):
         check_file(tmp_path / "x.json" / "y.json", "select")

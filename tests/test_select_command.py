@@ -219,7 +219,7 @@ def test_dome_is_even(count):
         ),
         ("run --candidates none.json", "or take --candidates dome or orbit, which need none"),
         ("run --candidates data -k 6", "k must be a whole number in 1..5 candidates, got 6"),
-        ("run --candidates data -k 0", "k must be a whole number in 1..5 candidates, got 0"),
+        ("run --candidates data -k 9", "-k must be a whole number in 1..5 candidates, got 9"),
         ("run --candidates run --train data", "must hold a view that is not known yet, all 9 of split all are"),
         ("scene.ply --candidates orbit", "a file of Gaussians has no record of its views: --train must name"),
         ("run --candidates data --policy best", "random, or package.module:function, got 'best'"),
@@ -238,7 +238,7 @@ def test_dome_is_even(count):
             "early --candidates orbit",
             "must hold state.safetensors or point_cloud.ply, found none; the fit has not reached",
         ),
-        ("run --candidates data -o data", "data: must be a file, is a folder; name a file in it"),
+        ("run --candidates data -o data", "must be a JSON file, is a folder; name a file in it, e.g. data/select.json"),
         ("run --candidates data --method best", "--method"),
     ],
 )

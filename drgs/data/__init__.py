@@ -193,8 +193,9 @@ def _located(path: Path) -> tuple[str, Path]:
         for name, form in LOADERS.items():
             if form.suffix and form.suffix == path.suffix:
                 return name, path
-        refuse_foreign(path, "a data set")
         is_splat = path.suffix in (".ply", ".spz", ".splat", ".sog")
+        if not is_splat:  # which another file of Gaussians would be no more
+            refuse_foreign(path, "a data set")
         advice = "drgs view, fisher, select and prune take a fitted scene" if is_splat else "name one of these"
         raise ValueError(f"{path}: must be a folder, a transforms .json or an LLFF .npy; {advice}")
     if lacking:

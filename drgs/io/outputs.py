@@ -259,7 +259,8 @@ def check_file(
     """
     path = Path(path)
     if path.is_dir():
-        raise ValueError(f"{path}: must be a file, is a folder; name a file in it")
+        kind, example = ("", "") if is_ours else ("JSON ", f", e.g. {path / f'{command}.json'}")
+        raise ValueError(f"{path}: must be a {kind}file, is a folder; name a file in it{example}")
     if os.path.lexists(path):
         _refuse_inputs(path, [Path(os.path.realpath(x)) for x in inputs if os.path.exists(x)])
         if path.is_symlink() or not (is_ours(path) if is_ours else _author_of(path) == command):
