@@ -17,7 +17,10 @@ from drgs.commands.options import Eval
 from drgs.ellipsoids import semi_axes
 from drgs.files import load_state, save_state
 from drgs.fitting.components.filter_3d import VARIANCES, Filter3D, filtered, sampling_rates
+from drgs.fitting.evaluation import evaluate_run
 from drgs.fitting.records import check_checkpoint, load_run
+from drgs.fitting.resume import lock_run
+from drgs.io.run import Run
 from drgs.train import Trainer, fit
 
 
@@ -189,5 +192,8 @@ def test_eval_measures_larger_pictures(dataset, tmp_path, monkeypatch):  # noqa:
     assert after["renderers"]["width"] == 32
     with pytest.raises(ValueError, match="eval: scale must be at most 2, since photograph 0 has 32x32 pixels, got 3"):
         run_eval(Eval(run=tmp_path / "run", scale=3.0))
+    with pytest.raises(ValueError, match=r"--scale must be in \[1, 1000\], got 0.5"):
+        Eval(run=tmp_path / "run", scale=0.5)
+    run = Run(tmp_path / "run")
     with pytest.raises(ValueError, match="eval: scale must be at least 1, got 0.5"):
-        run_eval(Eval(run=tmp_path / "run", scale=0.5))
+        evaluate_run(run, lock_run(run, "eval"), scale=0.5)
