@@ -134,7 +134,8 @@ def _complain(command: str | None, message: str) -> None:
     """One line on stderr: `drgs COMMAND: message`; functions that are called as the command name it themselves."""
     where = f"drgs {command}" if command else "drgs"
     message = " ".join(message.removeprefix("drgs: ").removeprefix(f"{command}: ").split())
-    options = options_in(COMMANDS[command]) if command else {}
+    kind: Any = COMMANDS.get(command or "")
+    options = options_in(kind) if kind else {}
     typed = {name: option.typed for name, option in options.items() if not option.spec.positional}
     subject, must, rest = message.partition(" must ")
     if must and {*typed, "either", "or"}.issuperset(subject.split()):  # what a function calls by its arguments' names

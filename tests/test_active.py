@@ -631,7 +631,7 @@ def test_command(still, tmp_path, capsys, caplog):
         ("--views active --initial 2 --add 5 --every 1", "--initial 2 and --add 5 must be at most the 6 views"),
         ("--views active --add 4 --every 5", "must be there before step 20, the last one would come at 20"),
         ("--views active --prior -1", "lambda (value) must be in [0, inf), got -1"),
-        ("--views active --info-pixels 0", "info_pixels must be a whole number in [1, 1000000000], or None, got 0"),
+        ("--views active --info-pixels 0", "--info-pixels must be a whole number in [1, 1000000000], or None, got 0"),
         (
             "--views active --add 2 --every 4 --measure 2 4",
             "--measure must be numbers of views that one more is added to",

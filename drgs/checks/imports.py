@@ -56,7 +56,7 @@ def imported_function(option: str, text: str, or_else: str = "") -> Callable[...
         ) from error
     found = getattr(code, attribute, None)
     if not callable(found):
-        own = [value for value in vars(code).values() if inspect.isfunction(value) and value.__module__ == module]
-        names = ", ".join(value.__name__ for value in own if not value.__name__.startswith("_"))
+        functions = [value for value in vars(code).values() if inspect.isfunction(value) and value.__module__ == module]
+        names = ", ".join(value.__name__ for value in functions if not value.__name__.startswith("_"))
         raise ValueError(f"{option} {text}: {module} must have a function {attribute}, has {names or 'none'}")
     return found
