@@ -134,7 +134,7 @@ def test_gaussians_alone_are_no_run(run, tmp_path, capsys):  # noqa: F811
             assert cli.main([command, str(path)]) == 2
             assert capsys.readouterr().err == (
                 f"drgs {command}: {path}: must be a run folder, holds Gaussians alone; drgs fisher {path} --train DATA "
-                "-o OUT says what error to expect of these, and drgs render and drgs share show them\n"
+                "-o OUT says what error to expect of these, drgs render --cameras DATA -o OUT their PSNR\n"
             )
     other = tmp_path / "views.json"
     other.write_text("[]")

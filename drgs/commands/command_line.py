@@ -36,6 +36,8 @@ _MOST_COLUMNS = 100  # columns of help, at most, in a wider terminal: longer lin
 _INDENT = 26  # columns of an option's name, before its text; chosen
 _ADVICE = "correct the file"
 _PRESET = "fast"  # as a fit has it
+_ALSO_CALLED = {"--data": "--train", "--train": "--data", "--iterations": "--max-steps", "--iters": "--max-steps"}
+"""Options of other commands and of other trainers -> what they are called where only that is known."""
 
 
 # ------------------------------------------------------------------------------------------------ words to options
@@ -90,7 +92,7 @@ def _read(options: Mapping[str, Option], words: Sequence[str], commands: Mapping
         is_no = option is None and flag.startswith("--no-") and "--" + flag[5:] in flags
         option = flags["--" + flag[5:]] if is_no else option
         if option is None or (is_no and option.hint is not bool):
-            near = nearest(flag.lstrip("-"), [x[2:] for x in flags]).replace("did you mean ", "did you mean --")
+            near = _nearest_option(flag, list(flags), [option.flag for option in places])
             owners = [name for name, other in commands.items() if flag in (x.flag for x in options_in(other).values())]
             of_others = f" (of drgs {', '.join(owners)})" if owners else ""
             raise ValueError(f"options must be those of the command, got {flag}{of_others}; {near}")
@@ -111,6 +113,15 @@ def _read(options: Mapping[str, Option], words: Sequence[str], commands: Mapping
         known = " ".join(option.flag for option in places) or "none"
         raise ValueError(f"words without an option must be {known}, got {alone[0]!r}, too; drop it, or quote spaces")
     return given
+
+
+def _nearest_option(flag: str, flags: Sequence[str], places: Sequence[str]) -> str:
+    """Advice for an unknown option: what it is called here, what stands alone, or the name that is most like it."""
+    if (name := flag[2:].upper()) in places:
+        return f"{name} has no option: it stands alone"
+    if _ALSO_CALLED.get(flag) in flags:
+        return f"did you mean {_ALSO_CALLED[flag]}?"
+    return nearest(flag.lstrip("-"), [x[2:] for x in flags]).replace("did you mean ", "did you mean --")
 
 
 def _is_flag(word: str) -> bool:

@@ -465,6 +465,8 @@ def _print(args: Fisher, known: Known, groups: dict[str, GroupSummary], views: l
         print("pose: information about the least and the best known of its six directions; fisher.json has all six")
     files = sum(len(row.files) for row in views)
     print(f"information.safetensors, fisher.json and {files} maps: {args.output}")
+    if any(view.error for view in views):
+        print(f"where views are expected to be wrong: {args.output / '*.error.png'}")
 
 
 def _percent(several: tuple[str, ...]) -> tuple[str, ...]:

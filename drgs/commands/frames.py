@@ -102,10 +102,10 @@ def in_frame_of_data(gaussians: Gaussians, scene: Path, data: Path) -> Gaussians
             moved = candidate.of(gaussians)
             if (psnr := _psnr(moved, photographs)) > max(best, own + _BETTER):
                 best, found, similarity = psnr, moved, candidate
-    if similarity is not None:
-        _said(similarity, scene, data)
     flat = _psnr_of_mean(photographs)
     if best > flat:
+        if similarity is not None:
+            _said(similarity, scene, data)
         _log.info("%s: %.1f dB at %d photographs of %s", scene, best, len(photographs), data)
     else:
         _log.warning(

@@ -355,7 +355,7 @@ def fit_record(run: Run) -> FitRecord:
     if not is_run(run.path) and _is_of_gaussians(run.path):
         raise FileNotFoundError(
             f"{run.path}: must be a run folder, holds Gaussians alone; drgs fisher {shlex.quote(str(run.path))} "
-            "--train DATA -o OUT says what error to expect of these, and drgs render and drgs share show them"
+            "--train DATA -o OUT says what error to expect of these, drgs render --cameras DATA -o OUT their PSNR"
         )
     config = run.config()
     where = f"{run.path / 'config.json'}"
