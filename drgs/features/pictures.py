@@ -145,17 +145,16 @@ def overlay(image: np.ndarray, labels: np.ndarray, count: int, strength: float =
     return np.rint(np.where(edge[..., None], (1 - _BORDER_DARKENING) * mixed, mixed)).astype(np.uint8)
 
 
-def mask_picture(image: np.ndarray, mask: np.ndarray, color: tuple[int, int, int] = (255, 120, 0)) -> np.ndarray:
-    """The picture with the pixels of a mask in a color, and the rest darker and gray.
+def mask_picture(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """The picture with the pixels of a mask in orange, and the rest darker and gray.
 
     Args:
         image: (H, W, 3) picture, uint8 or float in [0, 1].
-        mask: (H, W) bool, what is shown in the color.
-        color: RGB that is mixed in.
+        mask: (H, W) bool, what is shown in orange.
     """
     photo = (image if image.dtype == np.uint8 else to_bytes(image)).astype(np.float32)
     gray = 0.7 * photo.mean(2, keepdims=True).repeat(3, 2)
-    shown = 0.55 * photo + 0.45 * np.array(color, np.float32)
+    shown = 0.55 * photo + 0.45 * np.array([255, 120, 0], np.float32)
     return np.rint(np.where(mask[..., None], shown, gray)).astype(np.uint8)
 
 

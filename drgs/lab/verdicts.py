@@ -542,7 +542,6 @@ def central(
     background: tuple,
     cotangent: torch.Tensor,
     entries: dict[str, list[int]],
-    noise: float | None = None,
 ) -> Differences:
     """Central differences at chosen entries, four steps each, accumulated in float64.
 
@@ -552,12 +551,11 @@ def central(
         camera, background: The view.
         cotangent: (H, W, 3) weights of the image's values.
         entries: Group -> flat indices of the parameters that are moved.
-        noise: Rounding of the rasterizer's image; default by its precision.
     """
     slopes: dict[str, list[list[torch.Tensor]]] = {}
     steps: dict[str, list[list[float]]] = {}
     kept = torch.ones(cotangent.shape[:2], dtype=torch.bool)
-    noise = noise or _IMAGE_ROUNDING[rasterizer.dtype]
+    noise = _IMAGE_ROUNDING[rasterizer.dtype]
     for group, indices in entries.items():
         slopes[group] = []
         steps[group] = []

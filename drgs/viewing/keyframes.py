@@ -37,7 +37,6 @@ class KeyframeFolder:
         here: Function that returns where the browser's camera is, in the world, as a keyframe at 0 seconds.
         go: Function that moves the browser's camera, and its time, to a keyframe; and whether it is the last one.
         origin: Function that returns (3,) world coordinates of the browser's 0.
-        expanded: Whether the folder is open at first.
     """
 
     def __init__(
@@ -46,7 +45,6 @@ class KeyframeFolder:
         here: Callable[[], Keyframe],
         go: Callable[[Keyframe, bool], None],
         origin: Callable[[], np.ndarray],
-        expanded: bool = False,
     ) -> None:
         self.client = client
         self.keyframes: list[Keyframe] = []
@@ -56,7 +54,7 @@ class KeyframeFolder:
         self._line: Any = None
         self._preview: asyncio.Task | None = None
         gui = client.gui
-        with gui.add_folder("flight", expand_by_default=expanded):
+        with gui.add_folder("flight", expand_by_default=False):
             self._text = gui.add_html("")
             self._step = gui.add_number(
                 "seconds to the next",
