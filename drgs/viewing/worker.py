@@ -6,22 +6,19 @@ between two of its steps another one may come first, or it may no longer be want
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections.abc import Callable, Hashable, Iterator
-
-_log = logging.getLogger(__name__)
 
 
 class Worker:
     """A thread that runs jobs, a step of each in turn; those that can wait only where no other is left.
 
     Args:
-        failed: Function that is called with a job's key and what it raised, which has ended it; default the log.
+        failed: Function that is called with a job's key and what it raised, which has ended it.
     """
 
-    def __init__(self, failed: Callable[[Hashable, Exception], None] | None = None) -> None:
-        self._failed = failed or (lambda key, error: _log.warning("view: %s", error))
+    def __init__(self, failed: Callable[[Hashable, Exception], None]) -> None:
+        self._failed = failed
         self._jobs: dict[Hashable, Iterator[None]] = {}
         self._waiting: dict[Hashable, Iterator[None]] = {}
         self._changed = threading.Condition()
