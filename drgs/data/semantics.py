@@ -174,7 +174,7 @@ class Semantics:
     def _table(self) -> np.ndarray:
         """Label of each number that a pixel can say: -1 for those that are no class."""
         table = np.full(_NUMBERS, -1, np.int64)
-        table[[0, *(number for number in self._void if 0 <= number < _NUMBERS)]] = 0
+        table[[0, *(number for number in self._named[1] if 0 <= number < _NUMBERS)]] = 0
         for label, number in enumerate(self._numbers, 1):
             if 0 <= number < _NUMBERS:
                 table[number] = label
@@ -192,10 +192,6 @@ class Semantics:
     @property
     def _numbers(self) -> dict[int, str]:
         return self._named[0]
-
-    @property
-    def _void(self) -> set[int]:
-        return self._named[1]
 
     @functools.cached_property
     def _embeddings(self) -> torch.Tensor | None:

@@ -77,7 +77,10 @@ def initial_points(
         points (P,3) float64, colors (P,3) float32 in [0,1], and where they come from, one line.
     """
     rng = np.random.default_rng(seed)
-    views = _all_at_first(data) if isinstance(data, Dataset) else _at_first(list(data))
+    if isinstance(data, Dataset):
+        views = _at_first(data.split()[0] if data.camera_names else data.views)  # not of cameras that are held out
+    else:
+        views = _at_first(list(data))
     if not views:
         raise ValueError("initial_points: there must be at least one view, got none; pass the training views")
     if isinstance(data, Dataset) and data.points is not None and len(data.points):
@@ -243,11 +246,6 @@ def shared_points(
 def triangulated_count(views: list[View], matches: Matches, progress: Progress | None = None) -> int:
     """The third value of `triangulated_points` alone."""
     return len(_triangulated(views, matches, progress).points)
-
-
-def _all_at_first(data: Dataset) -> list[View]:
-    """The views of a data set that points may come from: where cameras are held out, the others."""
-    return _at_first(data.split()[0] if data.camera_names else data.views)
 
 
 def _at_first(views: list[View]) -> list[View]:

@@ -134,7 +134,7 @@ def _table(study: Study, experiment: Experiment, labels: Sequence[str], rows: Re
         cells = [_mean(metric, values_of(own, metric.key, label)) for metric in study.metrics]
         cells.append(str(len({unit_of(row) for row in own})))
         cells.append("–" if label == _UPPER else str(wins[label]))
-        cells += [_digits(_cost(own, key)) for key in costs]
+        cells += ["none" if (x := _cost(own, key)) is None else f"{x:.2f}" for key in costs]
         cells += [f"{x:.2f}" if (x := experiment.paper.get(label, {}).get(key)) else "–" for key in papers]
         lines.append([experiment.policies[label], *cells])
     return markdown_table(heads, lines)
@@ -158,7 +158,3 @@ def _one_cost(row: Mapping[str, Any], key: str) -> float | None:
         return (row["seconds"] + len(row.get("picks") or ()) * (row.get("pick_seconds") or 0.0)) / 60
     value = row.get(key)
     return value / 1e9 if key == "peak_memory" and value is not None else value
-
-
-def _digits(value: float | None) -> str:
-    return "none" if value is None else f"{value:.2f}"
