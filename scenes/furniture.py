@@ -184,9 +184,10 @@ def cabinet(rng, wood, clay):
         z += size[2]
 
 
-def floor_lamp(rng, at_height=1.5):
+def floor_lamp():
     """A lamp of a foot, a pole and a shade that glows."""
     foot = revolve(np.array([(0.15, 0), (0.15, 0.02), (0.02, 0.035), (0.014, 0.05)]), segments=48)
+    at_height = 1.5
     pole = tube(np.array([(0, 0, 0.03), (0, 0, 0.7), (0, 0, at_height)]), 0.013)
     yield "lamp", join([foot, pole]), METAL, (64, 54, 44)
     shade = revolve(

@@ -133,7 +133,7 @@ def parts(seed):
     colors = rng.permutation(np.array(_ACCENTS))[:3]
     mesh = slab((2.3, 1.6, 0.012), (0, 0, 0.006), 1, fit=True)
     yield from put([("rug", mesh, MATTE, fabrics.rug(rng, *colors))], cozy, 0.5 * away, 1.4)
-    yield from put(furniture.floor_lamp(rng), cozy, -0.95 * away, 0.32)
+    yield from put(furniture.floor_lamp(), cozy, -0.95 * away, 0.32)
     for k, kind in enumerate(rng.permutation(["hills", "shapes", "flower"])[:2]):
         w, h = rng.uniform((0.55, 0.42), (0.75, 0.55))
         yield from put(furniture.picture(rng, kind, w, h, 1.6), cozy, (0.5 + 0.85 * (k - 0.5)) * away)

@@ -126,7 +126,7 @@ def subject_of(args: View, given: SceneInput, before: Subject | None = None) -> 
     notes: list[str] = []
     known = _known_views(args, given, notes)
     ranking = ranking_of(args.selection, given)
-    placed_views = _placed_views(args, given, ranking, notes)
+    placed_views = _placed_views(args, given, ranking)
     found = [shown for shown in (_expected_error(args, given, known), _uncertainty(args, given, known)) if shown]
     maps = {shown.name: shown for shown in found}
     origin = np.array(given.gaussians.origin, np.float64)
@@ -202,7 +202,7 @@ def _known_views(args: View, given: SceneInput, notes: list[str]) -> Known | Non
         return None
 
 
-def _placed_views(args: View, given: SceneInput, ranking: Ranking | None, notes: list[str]) -> tuple[PlacedView, ...]:
+def _placed_views(args: View, given: SceneInput, ranking: Ranking | None) -> tuple[PlacedView, ...]:
     """Where photographs were taken or could be."""
     if args.train is None and given.run is None:
         return placed_views_of([], (), ranking)
