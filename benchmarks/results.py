@@ -74,7 +74,7 @@ def tables() -> str:
             seconds = values_of(rows, second, label)
             means = [f"{estimate(psnr).mean:.2f}", f"{estimate(seconds).mean:.{3 if second == 'miou' else 2}f}"]
             lines.append([f"`{label}`", *means, lead(found, 2) if found else "–", there])
-        if lines:
+        if len(lines) > 1:
             units, scenes = {unit_of(row) for row in rows}, {row["scene"] for row in rows}
             commits = ", ".join(sorted({row["commit"] for row in rows}))
             size = f"{len(rows)} fits, {len(units)} starts of {len(scenes)} scenes, commit {commits}"
