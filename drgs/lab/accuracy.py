@@ -39,21 +39,22 @@ def rotation(vector: np.ndarray) -> np.ndarray:
 
 def random_camera(
     rng: np.random.Generator,
-    size: tuple[int, int],
+    size: tuple[int, int] = (24, 22),
+    distance: float = 4.0,
     focal: float | None = None,
     turn: float = 0.2,
     center: tuple[float, float] | None = None,
     skew: float = 0.0,
 ) -> Camera:
-    """A camera that looks at the origin from 4 units away, off its axis, with an off-center principal point.
+    """A camera that looks at the origin from `distance` away, off its axis, with an off-center principal point.
 
     The focal length keeps 2 world units around the origin in the image unless it is given; `skew` is a multiple of it.
     """
     width, height = size
-    focal = focal or max(width, height, 6)
+    focal = focal or 0.5 * max(width, height, 6) * distance / 2
     w2c = np.eye(4)
     w2c[:3, :3] = rotation(turn * rng.normal(size=3))
-    w2c[:3, 3] = [0.1, -0.1, 4.0]
+    w2c[:3, 3] = [0.1, -0.1, distance]
     cx, cy = center or (width * rng.uniform(0.3, 0.7), height * rng.uniform(0.3, 0.7))
     K = np.array([[focal, skew * focal, cx], [0, 1.04 * focal, cy], [0, 0, 1]])
     pose = torch.tensor(w2c, dtype=torch.float64).requires_grad_()
