@@ -276,12 +276,13 @@ def test_a_splat_of_nerfstudio_is_brought_to_the_cameras(place, tmp_path, capsys
         assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_many_pixels_are_said(place, monkeypatch, capsys):
-    """Where there are many, how to have fewer; else nothing."""
+def test_large_views_are_said(place, monkeypatch, capsys):
+    """Where views are large, how to have smaller ones; nothing where they are small, or their size was chosen."""
     line = "scene.ply --train cameras.json --limit 1 --preset fast"
     assert "--info-pixels" not in run(line, place, monkeypatch, capsys)[1]
-    monkeypatch.setattr("drgs.commands.fisher._MANY_PIXELS", 100)
+    monkeypatch.setattr("drgs.commands.fisher._LARGE_VIEW", 100)
     assert "--info-pixels 48 takes half of the time or less" in run(line, place, monkeypatch, capsys)[1]
+    assert "takes half" not in run(f"{line} --info-pixels 300", place, monkeypatch, capsys)[1]
 
 
 def test_picture_is_logarithmic():

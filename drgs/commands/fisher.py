@@ -53,7 +53,7 @@ from drgs.io.outputs import LockedFolder, write_json
 from drgs.settings import RenderSettings
 
 KINDS = ("variance", "share")  # of maps
-_MANY_PIXELS = 2_000_000  # pixels of all views from which on a smaller size is advised: about half a minute; chosen
+_LARGE_VIEW = 100_000  # pixels of a view from which on a smaller size is advised: photographs, not fits. Chosen
 _log = logging.getLogger(__name__)
 
 
@@ -80,11 +80,9 @@ def run(args: Fisher) -> None:
         views, source = views_to_compare("--cameras", args.cameras, args, given, known, fresh=False)
     views = evenly(with_times(views, args, given), args.limit)
     check_lenses("fisher", settings, [*known.cameras, *views])
-    pixels = [camera.width * camera.height for camera in (*known.cameras, *views)]
-    if sum(pixels) > _MANY_PIXELS:
-        args.say(
-            f"{sum(pixels) / 1e6:.1f} million pixels: --info-pixels {max(pixels) // 10} takes half of the time or less"
-        )
+    pixels = max((camera.width * camera.height for camera in (*known.cameras, *views)), default=0)
+    if args.info_pixels is None and pixels > _LARGE_VIEW:
+        args.say(f"views of {pixels} pixels: --info-pixels {pixels // 10} takes half of the time or less")
     scoring = given.scoring(args.scoring, settings)
     region = region_of("fisher", args, given, Source.known(text, given), known.cameras, settings)
     shown = None if region is None else region.shares(given.scene, views, settings, "fisher")
