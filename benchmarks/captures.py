@@ -39,6 +39,10 @@ arcs (benchmarks/kitchen.py; max_steps = 1500 and semantics = "ignore" in fit.to
         --data kitchen46 --policy random --policy farthest --policy fisherrf --policy "joint+backdrop, v_opt" \
         --no-figures -o OUT
 
+Named on 2026-11-29, before they ran: on all of these starts, farthest point sampling of positions and directions
+(benchmarks/farthest_poses.py); in the rooms, views of one object with `region` (benchmarks/regions.py). Of halls and
+kitchens one start each is run first.
+
 As starts in the rooms have differed (a standard deviation of 0.6 to 1.5 dB of the average over numbers of views, by the
 other policy), a paired t test finds 0.8 to 2.1 dB with six starts and 0.7 to 1.7 dB with eight, in 4 of 5 studies; four
 starts would find 1.2 to 3.2 dB. Two still lifes say nothing about others, whatever their starts say.

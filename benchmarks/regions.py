@@ -2,9 +2,10 @@
 
     python benchmarks/regions.py [--scenes room51 statue ...] [--starts 2] [--runs runs/regions] [--page]
 
-Units, policies, sizes and what is compared are on docs/active-region.md, and were there before any fit ran. Appends a
-row a fit to benchmarks/regions.jsonl as it ends, leaves out what is there; with --page it writes tables, picture and
-data of that page. A fit that fails is a row with its error. One thread; captures are in $DRGS_DATA.
+Units, policies, sizes and what is compared are on docs/active-region.md, and were there before any fit ran; so were,
+on 2026-11-29, free31, free32 and free33 with two starts: free poses, of which 1 to 6 held-out ones show an object.
+Appends a row a fit to benchmarks/regions.jsonl as it ends, leaves out what is there; with --page it writes tables,
+picture and data of that page. A fit that fails is a row with its error. One thread; captures are in $DRGS_DATA.
 """
 
 from __future__ import annotations
@@ -77,6 +78,10 @@ LIGHT_PATHS = 16  # a pixel
 CLEARANCE = 0.5  # meters between a camera and the nearest surface, at least
 
 
+FREE = {"free31": 31, "free32": 32, "free33": 33}
+"""Name -> seed of a room whose 200 candidates and 25 held-out views are free poses (docs/next-views.md)."""
+
+
 def _parts(seed: int) -> list[tuple]:
     """The parts of a room, those of an object called as it, all others `other`."""
     parts = [list(part) for part in room.parts(seed)]
@@ -121,8 +126,7 @@ def made_room(seed: int, folder: Path) -> Path:
     if (folder / "boxes.json").exists():
         return folder
     parts = _parts(seed)
-    built, table = labelled.build(parts, ("other", *OBJECTS))
-    table = np.maximum(table, 1) - 1
+    built, table = _built(parts)
     K = labelled.intrinsics(*SIZE, FOV_X)
     poses = _drawn_poses(built, room.Layout(seed).size, np.random.default_rng([seed, 55]))
 
@@ -148,12 +152,23 @@ def made_room(seed: int, folder: Path) -> Path:
                 folder / name, built, K, np.stack(some), *SIZE, spp=LIGHT_PATHS, max_depth=3, exposure=1.8,
                 seed=2 * seed + k, progress=bar.update,
             )  # fmt: skip
+    (folder / "boxes.json").write_text(json.dumps(_boxes(parts), indent=1) + "\n")
+    return folder
+
+
+def _built(parts: list[tuple]) -> tuple[Any, np.ndarray]:
+    """A room's Mitsuba scene, and a table from its shapes to objects: 0 none, k the k-th object."""
+    built, table = labelled.build(parts, ("other", *OBJECTS))
+    return built, np.maximum(table, 1) - 1
+
+
+def _boxes(parts: list[tuple]) -> dict[str, list[list[float]]]:
+    """Object -> corners of its box."""
     boxes = {}
     for name in OBJECTS:
         points = np.concatenate([np.asarray(part[1][0]) for part in parts if part[0] == name])
         boxes[name] = [(points.min(0) - MARGIN).tolist(), (points.max(0) + MARGIN).tolist()]
-    (folder / "boxes.json").write_text(json.dumps(boxes, indent=1) + "\n")
-    return folder
+    return boxes
 
 
 # ----------------------------------------------------------------------------------------------- what is measured
@@ -309,18 +324,59 @@ def made_study(name: str, runs: Path) -> Study:
     config = FIT.replace(test_every=0)
     pool, held_out = (load(folder / part, lazy=True) for part in ("pool", "held_out"))
     frames = frames_for(held_out.views, config.data)
+    seen, shown = (
+        [plain_labels(folder / part / "truth" / f"{view.name}.png") for view in data.views]
+        for part, data in (("pool", pool), ("held_out", held_out))
+    )
+    return Study(name, pool, _subjects(boxes, [view.name for view in pool.views], seen, frames, shown), config)
 
-    def shares(part: str, views: Sequence[View], k: int) -> list[tuple[View, np.ndarray]]:
-        return [(view, plain_labels(folder / part / "truth" / f"{view.name}.png") == k) for view in views]
 
+def free_study(name: str, runs: Path) -> Study:
+    """A room with free poses, as `drgs scene room --free` makes it."""
+    seed = FREE[name]
+    with Bar(f"path tracing {name}", show=True) as bar:
+        folder = room.generate(
+            runs / name, views=225, width=160, height=120, spp=LIGHT_PATHS, seed=seed, teacher_width=8,
+            teacher_height=8, free=True, progress=bar.update,
+        )  # fmt: skip
+    config = FIT.replace(semantics="ignore")
+    dataset = load_dataset(folder, config, lazy=True, points=False)
+    train, test = dataset.split()
+    frames = frames_for(test, config.data)
+    built, table = _built(_parts(seed))
+
+    def labels_of(camera: Camera) -> np.ndarray:
+        return table[scenes.first_hits(built, camera.K, camera.c2w, camera.width, camera.height)[1]]
+
+    seen, shown = [labels_of(view.camera) for view in train], [labels_of(frame.camera) for frame in frames]
+    subjects = _subjects(_boxes(_parts(seed)), [view.name for view in train], seen, frames, shown)
+    return Study(name, dataset, subjects, config)
+
+
+def _subjects(
+    boxes: Mapping[str, Any],
+    pool: Sequence[str],
+    seen: Sequence[np.ndarray],
+    frames: list[Frame],
+    shown: Sequence[np.ndarray],
+) -> tuple[Subject, ...]:
+    """The objects of a room that held-out views show.
+
+    Args:
+        boxes: Object -> corners of its box.
+        pool: Names of the views to choose from.
+        seen: (H, W) of each of them, 0 none, k the k-th object.
+        frames, shown: Held-out photographs, and the same of them.
+    """  # fmt: skip
     subjects = []
-    for k, (name_, box) in enumerate(boxes.items(), 1):
-        seen = frozenset(view.name for view, mask in shares("pool", pool.views, k) if mask.mean() >= SEES)
-        masks = [torch.from_numpy(mask) for _, mask in shares("held_out", held_out.views, k)]
-        shown = [i for i, mask in enumerate(masks) if mask.float().mean() >= SHOWS][:HELD_OUT]
+    for k, (name, box) in enumerate(boxes.items(), 1):
+        sees = frozenset(view for view, labels in zip(pool, seen, strict=True) if (labels == k).mean() >= SEES)
+        masks = [torch.from_numpy(labels == k) for labels in shown]
+        showing = [i for i, mask in enumerate(masks) if mask.float().mean() >= SHOWS][:HELD_OUT]
         region = "box:" + ",".join(f"{x:.3f}" for corner in box for x in corner)
-        subjects.append(Subject(name_, seen, [frames[i] for i in shown], [masks[i] for i in shown], region))
-    return Study(name, pool, tuple(subjects), config)
+        if showing:
+            subjects.append(Subject(name, sees, [frames[i] for i in showing], [masks[i] for i in showing], region))
+    return tuple(subjects)
 
 
 # -------------------------------------------------------------------------------------------------------- captures
@@ -362,6 +418,8 @@ def _write_masks(study: Study, start: int, folder: Path) -> None:
 
 def study_of(name: str, runs: Path) -> Study:
     """A room or a capture."""
+    if name in FREE:
+        return free_study(name, runs)
     return (captured_study if name.partition("-")[0] in CAPTURES else made_study)(name, runs)
 
 
@@ -392,7 +450,7 @@ def fitted(study: Study, start: int, policy: str, subject: Subject | None, folde
 def run(study: Study, starts: int, runs: Path, rows: Path) -> None:
     """All fits of a scene that are not there yet, start by start: what is there at any time is a study of fewer."""
     for start in study.starts(starts):
-        if study.name not in ROOMS:
+        if study.name.partition("-")[0] in CAPTURES:
             _write_masks(study, start, runs / study.name)
         for policy, subject in study.policies():
             key = {"scene": study.name, "start": start, "policy": policy, "object": subject.name if subject else ""}
@@ -413,7 +471,7 @@ PICTURE = ROOT / "docs" / "pictures" / "active-region.png"
 METRICS = (Metric("psnr", "PSNR, dB", 2), Metric("iou", "IoU"))
 REFERENCE = "region"
 SHOWN = (4, 6, 12)  # views
-GROUPS = {"rooms": tuple(ROOMS), "captures": CAPTURES}
+GROUPS = {"rooms": tuple(ROOMS), "free poses": tuple(FREE), "captures": CAPTURES}
 """Name -> scenes whose means are averaged."""
 
 Rows = Sequence[Mapping[str, Any]]
