@@ -43,7 +43,10 @@ def main(argv: list[str] | None = None) -> int:
     if argv == ["--version"]:
         print(f"drgs {drgs.__version__}")
         return 0
-    name = argv[0] if argv and argv[0] in COMMANDS else None
+    if not argv:
+        print(command_list(COMMANDS), end="", file=sys.stderr)
+        return 2
+    name = argv[0] if argv[0] in COMMANDS else None
     try:
         args = _parse_arguments(argv)
     except (ValueError, NotImplementedError, OSError) as error:
@@ -100,11 +103,9 @@ def _parse_arguments(argv: list[str]) -> Any:
         SystemExit: After help.
         ValueError, OSError: On bad usage, and if a file of --config cannot be read.
     """
-    if not argv or (argv[0] not in COMMANDS and argv[0] not in _HELP):
-        got = repr(argv[0]) if argv else "none"
+    if argv[0] not in COMMANDS and argv[0] not in _HELP:
         known = ", ".join(COMMANDS)
-        advice = nearest(argv[0], COMMANDS) if argv else "drgs --help says what each does"
-        raise ValueError(f"the command must be one of {known}, got {got}; {advice}")
+        raise ValueError(f"the command must be one of {known}, got {argv[0]!r}; {nearest(argv[0], COMMANDS)}")
     name, *words = argv
     if _HELP.intersection(argv):
         print(help_page(name, COMMANDS[name], words) if name in COMMANDS else command_list(COMMANDS), end="")

@@ -117,7 +117,6 @@ def test_messages_name_what_was_typed(line, expected, capsys, monkeypatch, tmp_p
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        ("", "drgs: the command must be one of info, render,"),
         ("frobnicate", "got 'frobnicate'; none has a name like it"),
         ("rendr x", "got 'rendr'; did you mean render?"),
         ("fit DATA", "drgs fit: --output must be given, is missing; add --output PATH"),
@@ -136,6 +135,15 @@ def test_bad_usage(line, expected):
     assert done.stderr.count("\n") == 1
     assert expected in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.core
+def test_no_command(capsys):
+    """Without a command its help, on stderr, and exit code 2."""
+    assert cli.main([]) == 2
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err.startswith("usage: drgs COMMAND") and "  fit " in shown.err
 
 
 @pytest.mark.parametrize(

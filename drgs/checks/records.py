@@ -289,7 +289,7 @@ def _renamed(message: str, inner: Any, kind: Any) -> str:
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """Advice for an unknown name: `did you mean max_gaussians?`."""
-    near = difflib.get_close_matches(name, list(known), 1, 0.5)
+    near = difflib.get_close_matches(name, list(known), 1, 0.6)
     return f"did you mean {near[0]}?" if near else "none has a name like it"
 
 
