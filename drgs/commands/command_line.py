@@ -36,7 +36,13 @@ _MOST_COLUMNS = 100  # columns of help, at most, in a wider terminal: longer lin
 _INDENT = 26  # columns of an option's name, before its text; chosen
 _ADVICE = "correct the file"
 _PRESET = "fast"  # as a fit has it
-_ALSO_CALLED = {"--data": "--train", "--train": "--data", "--iterations": "--max-steps", "--iters": "--max-steps"}
+_ALSO_CALLED = {
+    "--data": "--train",
+    "--train": "--data",
+    "--iterations": "--max-steps",
+    "--iters": "--max-steps",
+    "--max-steps": "--budget",
+}
 """Options of other commands and of other trainers -> what they are called where only that is known."""
 
 
