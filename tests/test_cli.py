@@ -143,7 +143,8 @@ def test_no_command(capsys):
     assert cli.main([]) == 2
     shown = capsys.readouterr()
     assert shown.out == ""
-    assert shown.err.startswith("usage: drgs COMMAND") and "  fit " in shown.err
+    assert shown.err.startswith("usage: drgs COMMAND")
+    assert "  fit " in shown.err
 
 
 @pytest.mark.parametrize(
