@@ -79,6 +79,10 @@ POOL_ROWS = ROOT / "benchmarks" / "pools.jsonl"
 DEFAULT = "geometry+backdrop, v_opt"
 OTHERS = ("farthest", "fisherrf", "uniform")
 POOL_OTHERS = ("random", "uniform", "farthest", "fisherrf")
+FREE_OTHERS = ("random", "farthest", "farthest, directions", "fisherrf", "coverage", "moments")
+FREE_KINDS = {"Rooms": "free", "Still lifes": "still", "Halls and kitchens": ("hall", "kitchen")}
+"""Kind of free poses -> how names of its scenes begin."""
+MOVING_DEFAULT = "joint+backdrop, v_opt"
 LEFT = "blur"
 SHOWN = (10, 20)  # views
 
@@ -121,17 +125,35 @@ def section(rows: Rows) -> str:
 
 
 def free_section(rows: Rows) -> str:
-    """The text and the tables of free poses: rooms, and still lifes."""
+    """The text and the tables of free poses: rooms, still lifes, and where things move."""
     parts = []
-    for kind, start in (("rooms", "free"), ("still lifes", "still")):
-        own = [row for row in rows if row["scene"].startswith(start)]
+    for kind, starts in FREE_KINDS.items():
+        own = [row for row in rows if row["scene"].startswith(starts)]
+        if not own:
+            continue
         scenes, commits = (", ".join(sorted({row[key] for row in own})) for key in ("scene", "commit"))
+        commits = f"commit{'s' * (',' in commits)} {commits}"
         head = (
-            f"**{kind.capitalize()}** ({scenes}), named before any fit ran: {len(own)} fits, "
-            f"{len({unit_of(row) for row in own})} starts, commit {commits} ([rows](../benchmarks/free_poses.jsonl))."
+            f"**{kind}** ({scenes}), named before any fit ran: {len(own)} fits, "
+            f"{len({unit_of(row) for row in own})} starts, {commits} ([rows](../benchmarks/free_poses.jsonl))."
         )
-        parts += [textwrap.fill(head, 120), compared_with(own, ("random", "farthest", "fisherrf"))]
+        moving = any(row["policy"] == MOVING_DEFAULT for row in own)
+        parts += [textwrap.fill(head, 120), moving_table(own) if moving else compared_with(own, FREE_OTHERS)]
     return "\n\n".join(parts)
+
+
+def moving_table(rows: Rows) -> str:
+    """The table of policies where things move, after all picks: means, and the default less each of them."""
+    lines = []
+    for label in (MOVING_DEFAULT, *FREE_OTHERS):
+        if not (psnr := values_of(rows, "psnr", label)):
+            continue
+        line = [f"`{label}`", str(len(psnr))]
+        for metric in ("psnr", "psnr_moving"):
+            line += [f"{estimate(values_of(rows, metric, label)).mean:.2f}"]
+            line += ["–" if label == MOVING_DEFAULT else lead(differences(rows, metric, MOVING_DEFAULT, label), 2)]
+        lines.append(line)
+    return markdown_table(["policy", "starts", "PSNR", "default less it", "moving pixels", "default less it"], lines)
 
 
 def pool_section(rows: Rows) -> str:
@@ -151,6 +173,7 @@ def compared_with(rows: Rows, others: Sequence[str]) -> str:
         [f"`{other}`", str(len(differences(over, "psnr", DEFAULT, other))), compared(over, other)]
         + [compared(at_views(rows, count), other) for count in SHOWN]
         for other in others
+        if differences(over, "psnr", DEFAULT, other)
     ]
     return markdown_table(["against", "starts", "3 to 20 views", *(f"{count} views" for count in SHOWN)], lines)
 
