@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 
@@ -16,6 +17,7 @@ from viewing_client import Client
 import drgs
 from drgs import cli
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, look_at
+from drgs.capturing import next_views
 from drgs.capturing.next_views import rank_next
 from drgs.capturing.places import Place, length_in_words, meters_of, places_around
 from drgs.commands.options import View
@@ -107,8 +109,23 @@ def test_the_first_place_looks_at_the_hole(half_seen, capsys):
     scores = [row["score"] for row in found["candidates"]]
     assert first["score"] == max(scores)
     assert len({pick["name"] for pick in found["picks"]}) == 4
-    json_page.check("next.json", found, maps=("parts",), absent=("capture", "select", "--length"))
+    json_page.check("next.json", found, maps=("parts",), absent=("capture", "select", "--length", "--region"))
     assert read_ranking(half_seen / "next.json").picked[0] == first["name"]
+
+
+def test_what_a_place_adds_does_not_depend_on_how_many_are_compared(half_seen, monkeypatch):
+    """Places and photographs have one unit: where each was taken, one adds as much, be there one copy of each or two."""
+
+    def gain(times):
+        def copies(gaussians, cameras, train, settings):
+            named = [dataclasses.replace(x, name=f"{x.name}-{i}") for x in train for i in range(times)]
+            return [Place(camera, "IMG_00", np.zeros(3), (0, 0, 0), 1.0, 0.0) for camera in named]
+
+        monkeypatch.setattr(next_views, "reachable_places", copies)
+        return rank_next(half_seen, 1, None, show=False)[0]["gain"]
+
+    assert 0 < gain(1) < 1
+    assert gain(2) == pytest.approx(gain(1), rel=1e-3)
 
 
 def test_the_report_and_the_viewer_lead_there(half_seen):

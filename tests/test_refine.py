@@ -66,6 +66,12 @@ def test_a_pick_goes_to_the_peak():
     assert pick.camera.name == "c0.0"
 
 
+def test_one_candidate_goes_too():
+    """By the distance to what is known: alone it has no next candidate."""
+    (pick,) = moved(peak((0.3, 0.2, -4.3)), [facing(0.0)], Refine(evaluations=300, box=(-2, -2, -5, 2, 2, -3))).picks
+    assert np.abs(pick.camera.center - (0.3, 0.2, -4.3)).max() < 0.1
+
+
 def test_bounds_hold():
     """A box, an angle, and a number of views."""
     candidates = [facing(x, name=f"c{x}") for x in (-1.0, 0.0, 1.0)]

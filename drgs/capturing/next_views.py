@@ -98,7 +98,7 @@ def rank_next(
             progress=bar.update,
             region=counts,
         )
-        usual = statistics.mean(_gains_of_photographs(loaded, train, scoring, cache, counts))
+        usual = statistics.mean(_gains_of_photographs(loaded, train, places, scoring, cache, counts))
         rows = [{"index": i, "name": place.camera.name} for i, place in enumerate(places)]
         after = [_place_json(place, meters) for place in places]
         picks = [
@@ -124,12 +124,22 @@ def rank_next(
 
 
 def _gains_of_photographs(
-    loaded: LoadedRun, train: list[Camera], scoring: Scoring, cache: Cache, region: Region | None
+    loaded: LoadedRun,
+    train: list[Camera],
+    places: list[Place],
+    scoring: Scoring,
+    cache: Cache,
+    region: Region | None,
 ) -> Iterator[float]:
-    """Information gain of each of a few existing photographs, given all others."""
+    """Information gain of each of a few existing photographs, given all others.
+
+    The places are candidates, too: `v_opt` adds up the variances of all views that it is given, so that gains compare
+    only if these are the same.
+    """
+    cameras = [place.camera for place in places]
     for one in train[:: -(-len(train) // _COMPARED_PHOTOGRAPHS)]:
         others = [camera for camera in train if camera is not one]
-        yield select(loaded.scene, [one], others, 1, scoring=scoring, cache=cache, region=region).scores[0]
+        yield select(loaded.scene, [one, *cameras], others, 1, scoring=scoring, cache=cache, region=region).scores[0]
 
 
 def reachable_places(

@@ -137,7 +137,7 @@ def refined(
         The camera, its gain and its information (None where it has not moved), and how many views were scored.
     """
     bounds = _Bounds.of(scene, [*candidates, *known], start, refine)
-    shift = _shift(candidates)
+    shift = _shift(candidates) or _shift([*candidates, *known])  # one candidate alone has no next one
     best, highest, moved = start, gain, None
     count = 0
     motions = [(kind, axis, sign) for kind in ("go", "turn") for axis in _AXES for sign in (1, -1)]
@@ -163,7 +163,7 @@ def refined(
 
 
 def _shift(cameras: Sequence[Camera]) -> float:
-    """Half of how far candidates are from the next one, the median; 0 where all are in one place."""
+    """Half of how far cameras are from the next one, the median; 0 where all are in one place."""
     centers = np.stack([x.center for x in cameras])
     centers = np.unique(centers.round(decimals(centers)), axis=0)
     if len(centers) < 2:
