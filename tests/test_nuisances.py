@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 
 import dense_jacobian as dense
 import numpy as np
@@ -315,6 +316,19 @@ def test_blocks_score(rng):
     least = torch.linalg.eigvalsh(found)[:, 0] / fisher.blocks(g, cam).diagonal(dim1=1, dim2=2).amax(1).clamp_min(1e-30)
     assert float(least.min()) >= -1e-6
     assert block_gain(found, torch.zeros_like(found)).total > 0
+
+
+def test_blocks_that_a_view_explains_wholly(rng):
+    """One Gaussian that fills the image says nothing but the exposure: rounding is 0, not less than nothing."""
+    g = gaussians(rng, 1, 1, scale=30.0).detach().replace(logit_opacities=torch.full((1,), 9.0))
+    cam = camera(rng, (128, 128))
+    train = fisher.blocks(g, cam)
+    found = fisher.blocks(g, cam, nuisances=Nuisances(eliminate=("exposure",)))
+    size = train.diagonal(dim1=1, dim2=2).amax()
+    assert float(torch.linalg.eigvalsh(found).min()) >= -1e-12 * float(size)
+    colors = slice(10, 13)
+    assert float(found[0, colors, colors].abs().max()) <= 4e-6 * float(train[0, colors, colors].max())
+    assert math.isfinite(block_gain(found, torch.zeros_like(found)).total)
 
 
 def around(rng, count):

@@ -46,6 +46,21 @@ def remaining(whole: torch.Tensor, lost: torch.Tensor) -> torch.Tensor:
     return torch.where(rest > _ROUNDING * whole, rest, 0.0)
 
 
+def remaining_blocks(whole: torch.Tensor, lost: torch.Tensor) -> torch.Tensor:
+    """(N, B, B) blocks less what a view's unknowns explain; of blocks that lose more than rounding, 0 along directions
+    where the rest is rounding, of either sign.
+    """
+    rest = whole - lost
+    before, taken = (x.diagonal(dim1=1, dim2=2) for x in (whole, lost))
+    changed = (taken > _ROUNDING * before).any(1) & rest.flatten(1).isfinite().all(1)
+    size = before[changed].sqrt()
+    inverse = torch.where(size > 0, 1 / size, 0.0)
+    values, vectors = torch.linalg.eigh(inverse[:, :, None] * rest[changed] * inverse[:, None, :])
+    kept = torch.where(values > _ROUNDING, values, 0.0)
+    rest[changed] = size[:, :, None] * ((vectors * kept[:, None, :]) @ vectors.mT) * size[:, None, :]
+    return rest
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Eliminated:
     """The part of a view's rows that its own unknowns explain.

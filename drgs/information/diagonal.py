@@ -21,7 +21,7 @@ import torch
 from drgs.ellipsoids import DeformableScene, Scene
 from drgs.information.choices import METHODS, Method
 from drgs.information.columns import BATCH, jacobian_columns
-from drgs.information.complement import remaining
+from drgs.information.complement import remaining, remaining_blocks
 from drgs.information.elimination import BLOCK_INPUTS, ViewRows
 from drgs.information.gains import DENSE
 from drgs.information.groups import Group, groups_of
@@ -150,7 +150,7 @@ class DenseBlocks(Quantity):
         blocks = view.replay(self.semantics).blocks(self.channel_weights)
         rows = ViewRows.of(view, self.channel_weights, self.semantics, self.nuisances)
         if rows is not None:
-            blocks = blocks - rows.taken_of_blocks(groups_of(gaussians, BLOCK_INPUTS))
+            blocks = remaining_blocks(blocks, rows.taken_of_blocks(groups_of(gaussians, BLOCK_INPUTS)))
         return {DENSE: blocks}
 
 
