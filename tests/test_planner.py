@@ -215,6 +215,21 @@ def test_costs(world):
     assert picks[0].value == pytest.approx(max(first))
 
 
+@pytest.mark.parametrize(
+    ("fields", "got"),
+    [
+        ({"criterion": "block_logdet"}, "criterion block_logdet"),
+        ({"combine": "zscore"}, "combine zscore"),
+        ({"groups": ("means", "scales")}, "groups means, scales"),
+        ({"blocks": ("backdrop",)}, "blocks backdrop"),
+    ],
+)
+def test_scorings_that_cannot_grow(fields, got):
+    """What is kept of views must have a meaning once Gaussians are added."""
+    with pytest.raises(ValueError, match=f"group sh, got {got}"):
+        Planner(scoring=Scoring(**fields))
+
+
 def test_refine(world):
     """A place goes to where its view tells more, within its bounds; what it told before stays known."""
     _, _, candidates = world

@@ -44,6 +44,7 @@ from drgs.ellipsoids import Gaussians
 from drgs.fitting.config import FitConfig
 from drgs.fitting.online import OnlineFit
 from drgs.gain import Information
+from drgs.information.criteria import criterion_named
 from drgs.information.region import NothingOfRegion, Region
 from drgs.planner.file import camera_json, camera_of, read_file, region_of, scene_of, scene_tensors, write_file
 from drgs.select import Scoring, select
@@ -155,7 +156,7 @@ class Planner:
             bound: Largest change of a view's rendering, in [0, 1], up to which its information is not computed again.
             max_bytes: Largest size of the information that is kept, bytes.
         Raises:
-            ValueError: If a number is out of range, or the model moves.
+            ValueError: If a number is out of range, the model moves, or the scoring's information cannot grow with it.
         """
         for name, value in {"info_pixels": info_pixels, "max_views": max_views}.items():
             if type(value) is not int or value < 2:
@@ -168,6 +169,8 @@ class Planner:
         self.max_views = max_views
         self.look = float(look)
         self.notes: Any = None
+        if scoring is not None:
+            _check_scoring(scoring)
         if region is not None:
             must_be("Planner", "region", region, Region, "e.g. drgs.Region.box((0, 0, 0), (1, 1, 1))")
         self._scoring = scoring or _FAST
@@ -672,6 +675,27 @@ class _Typical:
 def _unknown_cost(here: Camera, there: Camera) -> float:
     """Stands for costs that were a function when a planner was saved."""
     raise ValueError("Planner.next: costs were a function, which no file holds; give it to Planner.scores again")
+
+
+def _check_scoring(scoring: Scoring) -> None:
+    """Raise ValueError unless information is of single parameters, colors included.
+
+    What is kept of a view gets zeros for Gaussians that come later; how much a view changes is weighed by what it says
+    of colors; and value = score / cost has a meaning where a score is at least 0.
+    """
+    if criterion_named(scoring.criterion, "Planner").of_blocks:
+        got = f"criterion {scoring.criterion}"
+    elif scoring.combine == "zscore":
+        got = "combine zscore"
+    elif scoring.groups is not None and "sh" not in scoring.groups:
+        got = f"groups {', '.join(scoring.groups)}"
+    elif scoring.blocks is not None and "geometry" not in scoring.blocks:
+        got = f"blocks {', '.join(scoring.blocks)}"
+    else:
+        return
+    raise ArgumentError(
+        f"Planner: scoring must add up the information of single parameters, with group sh, got {got}; leave that out"
+    )
 
 
 def _check_seconds(where: str, seconds: float | None) -> None:
