@@ -74,7 +74,7 @@ class ViewInformation:
 
     Attributes:
         computed: Number of views that were not in the cache.
-        bytes: Bytes that a cache needs to keep all views so far.
+        sizes: (title, pixels it stands for) of each view so far -> bytes that a cache needs to keep it.
         has_any: Group of a network -> whether any view so far has information about it.
     """
 
@@ -88,7 +88,8 @@ class ViewInformation:
         self.pool = pool
         self.quantity = quantity
         self.of_known = of_known or quantity
-        self.computed = self.done = self.bytes = 0
+        self.computed = self.done = 0
+        self.sizes: dict[tuple[str, float], int] = {}
         self._expected = len(pool.train) + len(pool.candidates)
         self.has_any: dict[str, bool] = {}
 
@@ -126,7 +127,7 @@ class ViewInformation:
 
     def _counted(self, quantity: Quantity, view: PoolView, computed: Information) -> Information:
         """The information that adds up over views, of what was computed of one."""
-        self.bytes += size_of(computed)
+        self.sizes[view.title, view.stands_for] = size_of(computed)
         information = quantity.summand(computed, view.camera, view.mask)
         for name, x in information.items():
             if name.rpartition(".")[2] in NETWORK_GROUPS:
@@ -161,8 +162,7 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         unseen=[math.fsum(gain.unseen.values()) for gain in gains],
         left_out=gains[0].left_out,
         prior=dataclasses.replace(prior, lengths={}),  # what is told of it, as of the scoring, are plain numbers
-        evaluations=len(gains),
-        computed=information.computed,
+        evaluations=first.evaluations,
         pixels=first.pixels,
         notes=[
             *_notes(gains, combination.apart),
@@ -191,6 +191,7 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
             pick = dataclasses.replace(pick, score=gain.total, parts=gain.parts, camera=camera, start=pick.score)
             picked = picked if moved is None else moved
         selection.picks.append(pick)
+        selection.computed = information.computed
         if len(selection.picks) == pool.k:
             return selection
         left.remove(best)
@@ -214,6 +215,7 @@ class _FirstRound(NamedTuple):
         gains: Of each candidate.
         kept: Candidate -> its information, where it is wanted again.
         pixels: By how many each candidate was scored; none where all were by all of theirs.
+        evaluations: How often one was scored.
     """
 
     known: dict[str, torch.Tensor]
@@ -223,6 +225,7 @@ class _FirstRound(NamedTuple):
     gains: list[Gain]
     kept: dict[int, Information]
     pixels: list[int]
+    evaluations: int
 
     def scorer(self, combination: Combination) -> Callable[[Information], Gain]:
         """What scores a candidate, given what is known by now."""
@@ -277,12 +280,14 @@ def _first_round(pool: Pool, information: ViewInformation, combination: Combinat
             each = information.each(candidates)
         gains = [score(kept[i] if keeps else next(each)) for i in range(len(candidates))]
     pixels: list[int] = []
+    evaluations = len(gains)
     if everything is not None and any(view.stands_for != 1 for view in candidates):
         scorer = lambda: combination.scorer(H, everything)  # noqa: E731
         full = _score_in_full(information, whole, candidates, gains, scorer, everything, kept)
         used = [(whole if i in full else candidates)[i].camera for i in range(len(whole))]
         pixels = [camera.width * camera.height for camera in used]
-    return _FirstRound(H, pooled, factors, note, gains, kept, pixels)
+        evaluations += len(full)
+    return _FirstRound(H, pooled, factors, note, gains, kept, pixels, evaluations)
 
 
 def _halves(pool: Pool, combination: Combination) -> bool:
@@ -433,11 +438,12 @@ def _silent(has_any: dict[str, bool]) -> list[str]:
 
 def _crowded(cache: Cache | None, information: ViewInformation) -> list[str]:
     """What is worth saying about a cache that cannot hold the views of one call."""
-    if cache is None or information.bytes <= cache.max_bytes:
+    needed = sum(information.sizes.values())
+    if cache is None or needed <= cache.max_bytes:
         return []
     return [
-        f"cache: max_bytes must be at least {information.bytes} for all {information.done} views to be found by the "
-        f"next call, is {cache.max_bytes}; the others are computed again"
+        f"cache: max_bytes must be at least {needed} for all {len(information.sizes)} views to be found by the next "
+        f"call, is {cache.max_bytes}; the others are computed again"
     ]
 
 
