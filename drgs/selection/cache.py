@@ -196,14 +196,6 @@ class Cache:
                 if key in self._kept and _COLORS in computed:
                     self._image_weights[key.camera] = computed[_COLORS][:, 0].sum(-1).float()
 
-    def get(self, scene: Scene, key: Hashable, compute: Callable[[], Information]) -> Information:
-        """The cached quantity, else the result of `compute`, which is then cached."""
-        if (kept := self.find(scene, key)) is not None:
-            return kept
-        computed = compute()
-        self.keep(scene, key, computed)
-        return computed
-
     def _store(self, key: Hashable, kept: _Entry) -> None:
         """Store an entry, and drop the oldest ones that no longer fit."""
         self._forget(key)  # computed twice, by two calls at a time
