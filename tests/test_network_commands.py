@@ -103,8 +103,9 @@ def test_map_of_fisherrf(rng):
     told = fisher.diagonal(g, cam, settings, "fisherrf")
     known = {name: x * torch.rand(x.shape, dtype=torch.float64) for name, x in told.items()}
     assert 0 < int((told["sh"].sum(1) == 0).sum()) < 24
-    prior = gain.Prior(1e-2)
-    found = fisherrf_map(g, cam, known, prior, settings)
+    prior = gain.Prior(1e-2, groups={"means": 0.5})
+    also = dataclasses.replace(prior, groups={**prior.groups, "rotations": 1.0})  # which FisherRF does not have
+    found = fisherrf_map(g, cam, known, also, settings)
     want = gain.information_gain(told, known, "eig", prior).total
     assert float(found.double().sum()) == pytest.approx(want, rel=1e-4)
     assert found.shape == SIZE[::-1]

@@ -114,7 +114,7 @@ def test_the_first_place_looks_at_the_hole(half_seen, capsys):
 
 
 def test_what_a_place_adds_does_not_depend_on_how_many_are_compared(half_seen, monkeypatch):
-    """Places and photographs have one unit: where each was taken, one adds as much, be there one copy of each or two."""
+    """Places and photographs have one unit: a copy of a photograph adds as much, be there one of each or two."""
 
     def gain(times):
         def copies(gaussians, cameras, train, settings):

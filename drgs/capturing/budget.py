@@ -199,7 +199,7 @@ def plan_poses(
         features, pair = _timed_pair([decode(folder / name) for name in chosen])
     measured = min(_MEASURED_SIZE, largest)
     sizes = [size for size in _IMAGE_SIZES if size < largest]
-    sizes = [*sizes[: len(_IMAGE_SIZES)], *([largest] if largest <= _IMAGE_SIZES[0] else [])]
+    sizes += [largest] if largest <= _IMAGE_SIZES[0] else []
     plans = [PosePlan(size, _pose_seconds(len(names), features, pair, size / measured)) for size in sorted(sizes)[::-1]]
     return next((plan for plan in plans if plan.seconds <= _POSES_SHARE * budget), plans[-1])
 

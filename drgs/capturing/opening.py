@@ -111,14 +111,14 @@ def _with_new_batch(options: CaptureOptions, record: CaptureRecord, batch: Batch
     """The record with a new last batch, which replaces one without poses."""
     if len(record.batches) > 1 and _has_no_poses(record):
         record.batches.pop()
+    if any(record.batch.step(name) is None for name in ("fit", "report")):
+        raise ValueError(
+            f"{options.output}: --add must follow a capture that is done, this one is not; go on with --resume first"
+        )
     if not (record.path / SCENE).is_dir():
         raise ValueError(
             f"{options.output}: --add must have a capture of photographs, this one was of a data set with poses; fit "
             "anew to all of it"
-        )
-    if any(record.batch.step(name) is None for name in ("fit", "report")):
-        raise ValueError(
-            f"{options.output}: --add must follow a capture that is done, this one is not; go on with --resume first"
         )
     if batch.options["masks"] is not None or record.batches[0].options.get("masks") is not None:
         raise ValueError(f"{options.output}: --add must have photographs without masks; capture all of them anew")

@@ -430,7 +430,8 @@ def _print(args: Fisher, known: Known, groups: dict[str, GroupSummary], views: l
     for view in views:
         if view.error is not None:
             shares = (f"{share:.0%}" for share in view.error.parts.values())
-            rows.append((view.name, f"{view.error.rmse:.3g}", f"{-20 * math.log10(view.error.rmse):.1f}", *shares))
+            psnr = -20 * math.log10(view.error.rmse) if view.error.rmse > 0 else math.inf
+            rows.append((view.name, f"{view.error.rmse:.3g}", f"{psnr:.1f}", *shares))
     if rows:
         tables.show(f"expected error ({source})", ("view", "of a color", "expected PSNR", *PARTS), rows)
     rows = []

@@ -13,6 +13,7 @@ Reference:
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -82,14 +83,16 @@ def fisherrf_map(
         gaussians: The Gaussians as the camera sees them.
         camera, settings: The same as for `drgs.render`.
         known: `drgs.fisher.diagonal(..., method="fisherrf")` of the known views.
-        prior: lambda.
+        prior: lambda; that of a group which FisherRF does not have is not read.
     """
     g = gaussians.detach().replace(features=None)  # a map is numbers, of colors alone
     weights = {}
+    own = dataclasses.replace(prior, groups={name: x for name, x in prior.groups.items() if name in known})
+    variance = variances(known, own)
     inputs = g.parameters()
     for name, group in groups_of(g).items():
         if name in known and group.fisherrf is not None:
-            weights[name] = variances({name: known[name]}, prior)[name] / group.fisherrf(inputs)
+            weights[name] = variance[name] / group.fisherrf(inputs)
     # A color that is clamped at 0 is no part of the gray, and nothing is known by it. In float64, so that rounding does
     # not decide which these are.
     lit = (_colors(g, camera) > 0).to(g.sh)
