@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
+from pathlib import Path
 
 from where import DATA
 
@@ -15,13 +16,19 @@ from drgs.data import Dataset, View, load
 from drgs.ellipsoids import Gaussians
 from drgs.fitting.config import FitConfig
 from drgs.fitting.frames import Frame, frames_for
-from drgs.fitting.losses import LossTerm
 from drgs.fitting.metrics import through_renderers
-from drgs.fitting.renderers import RendererSchedule
 from drgs.fitting.start import start_plain
 from drgs.settings import RenderSettings
 
-__all__ = ["Fit", "fitted", "psnr_by_renderer", "split_of"]
+__all__ = ["Fit", "fitted", "folder_of", "psnr_by_renderer", "split_of"]
+
+_MADE = ("still0", "still7", "room21", "room22")  # docs/real-data.md has their commands
+_PATHS = {"street": "street/sparse_dev/0"}
+
+
+def folder_of(scene: str, made: Path, data: Path = DATA) -> Path:
+    """The data set of a capture, or of a made scene in a folder of such."""
+    return made / scene if scene in _MADE else data / _PATHS.get(scene, scene)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,27 +60,17 @@ def split_of(dataset: Dataset, config: FitConfig) -> tuple[list[View], list[View
     return dataset.split(config.data.test_every, config.data.test_offset, config.data.test_cameras)
 
 
-def fitted(
-    scene: str,
-    config: FitConfig,
-    terms: Callable[[list[Frame]], Sequence[LossTerm]] = lambda frames: (),
-    cycle: Sequence[RenderSettings] = (),
-) -> Fit:
+def fitted(scene: str, config: FitConfig) -> Fit:
     """Fit Gaussians to a capture, all steps of the configuration.
 
     Args:
         scene: Name of a capture, or a folder.
         config: Configuration of the fit.
-        terms: Training photographs -> terms of the loss, beside those of the configuration.
-        cycle: What steps are rendered with in turn, if not with what the configuration says.
     """
     dataset = load(DATA / scene)
     train, test = split_of(dataset, config)
     frames = frames_for(train, config.data)
     trainer = start_plain(dataset, train, frames, config)
-    trainer.terms = [*trainer.terms, *terms(frames)]
-    if cycle:
-        trainer.renderers = RendererSchedule(tuple(cycle))
     took: list[float] = []
     began = time.process_time()
     while trainer.step_index < config.max_steps:

@@ -27,8 +27,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
-from fits import psnr_by_renderer, split_of  # noqa: E402
-from steps import PATHS, SEEN, lines  # noqa: E402
+from fits import folder_of, psnr_by_renderer, split_of  # noqa: E402
 from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
 
@@ -38,11 +37,12 @@ from drgs.fitting.frames import Frame, frames_for  # noqa: E402
 from drgs.fitting.start import start_plain  # noqa: E402
 from drgs.fitting.trainer import Trainer  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
+from drgs.studies.statistics import Unit, estimate  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "overfitting.jsonl"
 CHOOSING = ("banana", "fern", "office", "still0", "room21")
 SHOWING = ("head", "statue", "lego", "street", "watch", "still7", "room22")
-MADE = ("still0", "still7", "room21", "room22")
+SEEN = ("fast", "exact", "gsplat")
 MEASURED = 12  # views of a fit of few, at most
 ON_THE_WAY, WATCHED = 6, 4  # times, and views at most
 KEY = ("scene", "rule", "views", "trained", "seed", "offset", "max_steps", "max_pixels", "max_gaussians")
@@ -124,10 +124,37 @@ def watched(trainer: Trainer, frames: list[Frame], measured: list[Frame], fast: 
     ]
 
 
+def gains(rows: list[dict], rule: str, scenes: Sequence[str], seen: str) -> tuple[dict[Unit, float], dict[Unit, float]]:
+    """Unit -> dB that a rule adds to the mean, and to the worst view, where fits with it and without were made."""
+    found: tuple[dict[Unit, float], dict[Unit, float]] = ({}, {})
+    for row in rows:
+        other = next((x for x in rows if all(x[k] == (row | {"rule": "none"})[k] for k in KEY)), None)
+        if (row["rule"], row["trained"]) != (rule, "fast") or row["scene"] not in scenes or other is None:
+            continue
+        if seen not in row["psnr"] or seen not in other["psnr"]:
+            continue
+        unit = (row["scene"], (8, row["offset"]), (str(row["seed"]),))
+        now, before = row["psnr"][seen], other["psnr"][seen]
+        found[0][unit] = statistics.mean(now) - statistics.mean(before)
+        found[1][unit] = min(now) - min(before)
+    return found
+
+
 def cells(rows: list[dict], rule: str, scenes: Sequence[str]) -> list[str]:
     """Fits, and what a rule adds in each renderer, with the interval over several scenes; empty where none was made."""
-    found = lines(rows, rule, "fast", scenes, "none")
-    return found if any(found) else []
+    line: list[str] = []
+    for seen in SEEN:
+        mean, worst = gains(rows, rule, scenes, seen)
+        if not mean:
+            line.append("")
+            continue
+        effect = estimate(mean)
+        line.append(f"{effect.mean:+.2f} / {estimate(worst).mean:+.2f}")
+        if effect.scenes > 1:
+            line[-1] += f" [{effect.low:+.2f}, {effect.high:+.2f}]"
+        if seen == SEEN[0]:
+            line.insert(0, str(effect.units))
+    return line if any(line) else []
 
 
 def write_file(rows: list[dict]) -> None:
@@ -170,7 +197,7 @@ def main() -> None:
         key = (scene, rule, views, args.trained, *UNITS[unit], args.steps, args.pixels, args.gaussians)
         if key in done:
             continue
-        row = fit(key, args.seen, (args.made if scene in MADE else args.data) / PATHS.get(scene, scene))
+        row = fit(key, args.seen, folder_of(scene, args.made, args.data))
         add_row(ROWS, row)
         mean = [f"{sum(x) / len(x):.2f}/{min(x):.2f}" for x in row["psnr"].values()]
         way = " ".join(f"{x[2]:.2f}" for x in row["curve"])

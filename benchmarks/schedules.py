@@ -16,7 +16,6 @@ photographs in turns, by renderer and at a half and a quarter of the width and h
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import os
 import statistics
 import sys
@@ -31,24 +30,22 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 import torch  # noqa: E402
-from fits import psnr_by_renderer, split_of  # noqa: E402
+from fits import folder_of, psnr_by_renderer, split_of  # noqa: E402
 from pages import fill_between  # noqa: E402
-from steps import MADE, PATHS  # noqa: E402
 from studies import PAGE_DATA, write_csv  # noqa: E402
-from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
+from where import UNITS, add_row, ran, read_rows  # noqa: E402
 
 from drgs.codecs.ply import load_ply  # noqa: E402
 from drgs.data import load  # noqa: E402
 from drgs.data.resampling import resize_area  # noqa: E402
-from drgs.ellipsoids import Gaussians  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
-from drgs.fitting.frames import Frame, frames_for  # noqa: E402
-from drgs.fitting.losses import LossTerm, Photometric, padded_ssim  # noqa: E402
+from drgs.fitting.frames import frames_for  # noqa: E402
+from drgs.fitting.losses import padded_ssim  # noqa: E402
 from drgs.fitting.renderers import RendererSchedule  # noqa: E402
 from drgs.fitting.resolution import Resolution  # noqa: E402
 from drgs.fitting.start import start_plain  # noqa: E402
 from drgs.fitting.trainer import Trainer  # noqa: E402
-from drgs.integrator import Output, render  # noqa: E402
+from drgs.integrator import render  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.studies.statistics import estimate  # noqa: E402
 from drgs.studies.tables import markdown_table, paragraph  # noqa: E402
@@ -74,18 +71,6 @@ def exact_to(tolerance: float | None) -> Change:
     return change
 
 
-def small(num_downscales: int, until: float) -> Change:
-    """Photographs are halved so many times at first, and have the size of the fit from a share of the steps on."""
-
-    def change(trainer: Trainer) -> None:
-        resolution = Resolution(num_downscales, trainer.config.max_steps)
-        ends = [round(until * trainer.config.max_steps * (k + 1) / num_downscales) for k in range(num_downscales)]
-        resolution._ends = ends
-        trainer.resolution = resolution
-
-    return change
-
-
 def updates(count: int, num_downscales: int = 1) -> Change:
     """Steps of several updates, of small photographs at first, then of quarters."""
 
@@ -95,110 +80,25 @@ def updates(count: int, num_downscales: int = 1) -> Change:
     return change
 
 
-def exact_small(until: float) -> Change:
-    """Steps with `exact` see photographs of half the size until a share of the steps."""
-
-    def change(trainer: Trainer) -> None:
-        schedule, last = trainer.renderers, until * trainer.config.max_steps
-
-        class Sometimes(Resolution):
-            def halvings(self, step: int) -> int:
-                return int(step < last and schedule.settings_at(step).order == "ray")
-
-        trainer.resolution = Sometimes(1, trainer.config.max_steps)
-
-    return change
-
-
-@dataclasses.dataclass(frozen=True)
-class Mixed:
-    """`Photometric`, with a part of its L1 distance replaced by one that grows faster from a share of the steps on."""
-
-    trainer: Trainer
-    before: Photometric
-    since: float
-    distance: Callable[[torch.Tensor], torch.Tensor]
-    name: str = "photometric"
-    outputs: tuple[str, ...] = ()
-
-    def __call__(self, output: Output, frame: Frame, gaussians: Gaussians) -> torch.Tensor:
-        """See `LossTerm`."""
-        if self.trainer.part < self.since:
-            return self.before(output, frame, gaussians)
-        rgb, target = output.rgb, frame.target()
-        if frame.mask is not None:
-            rgb = rgb * frame.mask[..., None]
-        ssim = dataclasses.replace(self.before)(output, frame, gaussians)
-        l1 = (1 - self.before.ssim_weight) * (rgb - target).abs().mean()
-        return ssim - l1 + (1 - self.before.ssim_weight) * self.distance(rgb - target)
-
-
-def loss(since: float, distance: Callable[[torch.Tensor], torch.Tensor]) -> Change:
-    """Another distance than L1 from a share of the steps on."""
-
-    def change(trainer: Trainer) -> None:
-        terms: list[LossTerm] = [
-            Mixed(trainer, x, since, distance) if isinstance(x, Photometric) else x for x in trainer.terms
-        ]
-        trainer.terms = terms
-
-    return change
-
-
-def ssim(weight: float) -> Change:
-    """Another weight of SSIM."""
-
-    def change(trainer: Trainer) -> None:
-        trainer.terms = [Photometric(weight) if isinstance(x, Photometric) else x for x in trainer.terms]
-
-    return change
-
-
-def falls(share: float) -> Change:
-    """All rates fall to 0 over the last `share` of the steps, linear."""
-
-    def change(trainer: Trainer) -> None:
-        def lower(optimizer: torch.optim.Optimizer, *_: object) -> None:
-            for group in optimizer.param_groups:
-                group["lr"] *= min(1.0, (1 - trainer.part) / share)
-
-        trainer.rows.optimizer.register_step_pre_hook(lower)
-
-    return change
-
-
-# Gradients of a mean of squares are those of L1 times twice the error: 10 makes both alike at an error of 0.05.
 CHANGES: dict[str, Change] = {
     "none": lambda trainer: None,
     "exact to 0": exact_to(None),
     "exact to 0.01": exact_to(0.01),
     "exact to 0.1": exact_to(0.1),
-    "exact at half": exact_small(1.0),
-    "exact at half until 0.8": exact_small(0.8),
-    "half until 0.3": small(1, 0.3),
-    "half until 0.5": small(1, 0.5),
-    "half until 0.7": small(1, 0.7),
-    "quarter until 0.5": small(2, 0.5),
     "2 updates": updates(2),
     "3 updates": updates(3),
     "4 updates": updates(4),
     "3 updates, never small": updates(3, 0),
     "3 updates, a quarter at first": updates(3, 2),
-    "L2 in the last third": loss(2 / 3, lambda x: 10 * x.square().mean()),
-    "L2 from the start": loss(0.0, lambda x: 10 * x.square().mean()),
-    "Charbonnier 0.03 in the last third": loss(2 / 3, lambda x: (x.square() + 0.03**2).sqrt().mean()),
-    "SSIM 0": ssim(0.0),
-    "SSIM 0.1": ssim(0.1),
-    "SSIM 0.4": ssim(0.4),
-    "rates fall in the last 0.2": falls(0.2),
 }
+"""Name -> what it changes of a trainer. Rows of other changes are of code that lost and was not kept."""
 
 
 def fit(key: tuple, made: Path) -> dict:
     """The row of one fit; `made` is the folder of the made scenes."""
     named = dict(zip(KEY, key, strict=True))
     scene = named["scene"]
-    dataset = load(made / scene if scene in MADE else DATA / PATHS.get(scene, scene))
+    dataset = load(folder_of(scene, made))
     config = FitConfig().replace(
         renderers=(named["trained"],),
         seed=named["seed"],
@@ -224,10 +124,10 @@ def fit(key: tuple, made: Path) -> dict:
     return {**named, "size": size, "psnr": psnr, "seconds": sum(took.values()), "seconds_by": took, **ran()}
 
 
-def times(scene: str, run: Path, max_pixels: int) -> dict:
+def times(scene: str, run: Path, made: Path, max_pixels: int) -> dict:
     """Medians over two photographs of the seconds of a step's rendering, loss and derivatives."""
     gaussians = load_ply(run / "point_cloud.ply")
-    views = list(load(DATA / PATHS.get(scene, scene)).views)[:16:8]
+    views = list(load(folder_of(scene, made)).views)[:16:8]
     frames = frames_for(views, FitConfig().replace(max_pixels=max_pixels).data)
     settings = {name: RenderSettings.preset(name) for name in SEEN}
     settings |= {f"exact, {x:g}": RenderSettings.preset("exact", tolerance=x) for x in (0.01, 0.1)}
@@ -346,7 +246,7 @@ def main() -> None:
         write_page()
         return
     for scene in args.scenes if args.times else []:
-        row = times(scene, args.times / scene, args.max_pixels)
+        row = times(scene, args.times / scene, args.made, args.max_pixels)
         add_row(TIMES, row)
         print(row, flush=True)
     for seed, offset in [] if args.times else UNITS[: args.units]:

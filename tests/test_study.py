@@ -34,11 +34,11 @@ from drgs.studies.statistics import (
     unit_of,
     view_counts,
 )
-from drgs.studies.tables import explained
+from drgs.studies.tables import comparison_table, explained
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
 
-from pages import draw_curves, fill_between, study_report
+from pages import draw_curves, fill_between
 
 METRICS = (
     Metric("psnr", "PSNR", 2),
@@ -240,10 +240,6 @@ def test_units_of_held_out_cameras(filmed, faked, tmp_path):
     assert [(row["picks"], row["pick_seconds"]) for row in found[:2]] == [(["cam00/0005"], 0.5), ([], None)]
     assert found[0]["initial"] != found[1]["initial"]
     assert len({unit_of(row) for row in found}) == 2
-    text = " ".join(study_report(dataclasses.replace(study, reference="all"), found).split())
-    assert "Units (scene, camera held out): film 2" in text
-    assert "- film 2: cam02 held out; all other cameras at the first time" in text
-    assert "| all | 20.00 | none | 10 | none | 2 |" in text
 
 
 # ---- files
@@ -569,13 +565,15 @@ def test_how_often_intervals_hold_the_truth(rng, sizes, spread, share):
         assert coverage(len(sizes), sum(sizes)) == share
 
 
-def told(rows, **fields):
-    study = dataclasses.replace(small(Path("x")), policies={"p": {}, "Random, 1": {}}, **fields)
-    return study_report(study, rows)
+def told(rows):
+    """How a table of differences is to be read, and the table."""
+    study = dataclasses.replace(small(Path("x")), policies={"p": {}, "Random, 1": {}})
+    pairs = [("p", "Random, 1")]
+    return f"{explained(study, rows, pairs)}\n{comparison_table(study, rows, pairs)}"
 
 
-def test_the_report_says_gain_and_loss(tmp_path):
-    """Larger PSNR is a gain, the same of FLIP a loss; noise is neither; every point is there; few units: no verdict."""
+def test_a_table_says_gain_and_loss():
+    """Larger PSNR is a gain, the same of FLIP a loss; noise is neither; few units: no verdict."""
     rng = np.random.default_rng(0)
     rows = []
     for seed in range(8):
@@ -583,47 +581,29 @@ def test_the_report_says_gain_and_loss(tmp_path):
         rows += [row_of(policy="p", seed=seed, psnr=base + 2 + 0.1 * float(rng.normal()))]
         rows += [row_of(policy="Random, 1", seed=seed, psnr=base)]
     text = told(rows)
-    assert "- `p` against `Random, 1`: gains in PSNR and loses in FLIP." in text
     line = next(line for line in text.splitlines() if line.startswith("| p | +"))
     assert "**gain**, 8 of 8" in line
     assert "**loss**, 0 of 8" in line
-    for row in rows:
-        assert f" {row['metrics']['psnr']:.2f} " in text
-    assert "abcdefg" in text
-    assert "Were all policies equal, about 0.4 of the 3 intervals would exclude it as well." in " ".join(text.split())
-    assert "more than one commit" not in text
-    other = told([*rows[:-1], {**rows[-1], "commit": "9"}])
-    assert "In 1 of 8 units fits are of more than one commit" in " ".join(other.split())
+    assert "Were all policies equal, about 0.4 of the 3 intervals would exclude it as well." in text
     for row in rows[::2]:
         row["metrics"]["psnr"] = row["metrics"]["flip"] = float(rng.normal())
-    assert "- `p` against `Random, 1`: no difference that this study can see." in told(rows)
+    line = next(line for line in told(rows).splitlines() if line.startswith("| p | "))
+    assert "**" not in line
     few = told(rows[:6])
     assert "No verdicts: 3 units" in few
     assert "**gain**" not in few
     single = next(line for line in told(rows[:2]).splitlines() if line.startswith("| p |") and ", 1 unit |" in line)
     assert "[" not in single  # an interval of one unit would have no width
-    assert told([]) == "No cell is finished."
-    leaked = [
-        {**row, "protocol": "paper", "metrics": {**row["metrics"], "psnr": 1 + row["metrics"]["psnr"]}} for row in rows
-    ]
-    text = told([*rows, *leaked[:6]])
-    assert text.count("| p | +1.00 [+1.00, +1.00], 3 of 3 |") == 1
-    assert "### Protocol `paper`: initial points of the whole data set" in text
-    assert "`paper` against `blind`" not in told(rows)
 
+
+def test_text_between_markers(tmp_path):
+    """What stands between the two is replaced; a page without them is refused."""
     page = tmp_path / "page.md"
     page.write_text("a\n<!-- x: begin -->\nold\n<!-- x: end -->\nb\n")
     fill_between(page, "x", "new")
     assert page.read_text() == "a\n<!-- x: begin -->\n\nnew\n\n<!-- x: end -->\nb\n"
     with pytest.raises(ValueError, match="must have <!-- y: begin --> and <!-- y: end -->"):
         fill_between(page, "y", "new")
-
-
-def test_medians_stand_beside_means():
-    """Where rows have them: of test views, on average over units."""
-    rows = [row_of(policy="p", seed=seed, psnr=20.0 + seed) | {"medians": {"psnr": 30.0 + seed}} for seed in range(2)]
-    assert "| p | 20.50 (30.50) |" in told(rows)
-    assert "| p | 20.50 |" in told([{**row, "medians": {"psnr": None}} for row in rows])
 
 
 def test_curves_are_of_the_metrics_of_then(tmp_path):

@@ -81,14 +81,13 @@ def explained(study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]]) -
 
 
 def comparison_table(
-    study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]], named: bool = False, names: Mapping[str, str] = {}
+    study: Study, rows: StudyRows, pairs: Sequence[tuple[str, str]], names: Mapping[str, str] = {}
 ) -> str:
     """Pairs of policies against metrics as a table; below them the smallest difference that is detectable.
 
     Args:
         study, rows: What is compared.
         pairs: (policy, reference) each.
-        named: Name the reference in every line.
         names: Label -> what is printed in its place.
     """
     lines: list[list[str]] = []
@@ -103,8 +102,7 @@ def comparison_table(
             cells.append(difference_text(metric, one) if one else "none")
             if one and one.detectable is not None:
                 sizes[metric.key].append(one.detectable)
-        label = names.get(policy, policy)
-        lines.append([f"{label} against {names.get(reference, reference)}" if named else label, *cells])
+        lines.append([names.get(policy, policy), *cells])
     if not lines:
         return "No pair of policies has a unit in common yet."
     last = [f"{np.median(sizes[m.key]):.{m.digits}f}" if sizes[m.key] else "none" for m in study.metrics]
