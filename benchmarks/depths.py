@@ -4,10 +4,8 @@
                                 [--steps 300] [--page]
 
 Appends one row a fit to benchmarks/depths.jsonl as it ends, leaves out what is there of this machine, then writes
-docs/data/depths.csv and depths-means.csv. Ways are weights of the term, the first and the
-last, and whether what is behind a map counts as much (`both sides`); `relative` are maps m = 0.7 / z + 0.1 of the
-training views in place of z, so that scale and shift have to be found. All ways but `off` are `--depth on`; a row has
-what `auto` found, too.
+docs/data/depths.csv and depths-means.csv. Ways are weights of the term, the first and the last, and whether what is
+behind a map counts as much (`both sides`). All ways but `off` are `--depth on`; a row has what `auto` found, too.
 `--views 6` fits six training views, evenly spaced. Made rooms are COLMAP data sets, whose depth maps this script adds.
 Seconds are those that the process computed in its steps; the ways of a scene take turns. Fits of two machines are not
 compared.
@@ -16,7 +14,6 @@ compared.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import os
 import statistics
 import sys
@@ -35,7 +32,7 @@ from fits import psnr_by_renderer, split_of  # noqa: E402
 from studies import PAGE_DATA, write_csv  # noqa: E402
 from where import DATA, UNITS, add_row, ran, read_rows  # noqa: E402
 
-from drgs.data import Dataset, View, load  # noqa: E402
+from drgs.data import Dataset, load  # noqa: E402
 from drgs.fitting.components.base import Setup  # noqa: E402
 from drgs.fitting.components.table import components_of  # noqa: E402
 from drgs.fitting.config import FitConfig  # noqa: E402
@@ -63,7 +60,6 @@ WEIGHTS = {
 """Way -> the first and the last weight of the term, and the factor of what is behind the map."""
 DEFAULT = WEIGHTS["3 to 0.3"]
 KEY = ("scene", "way", "trained", "views", "steps", "seed", "offset")
-"""Ways and steps of the page's table, of fits of all views; all are in the data file."""
 
 
 def dataset_of(scene: str, data: Path, made: Path) -> Dataset:
@@ -77,23 +73,6 @@ def dataset_of(scene: str, data: Path, made: Path) -> Dataset:
     return dataset
 
 
-class RelativeView(View):
-    """A view whose metric map is known up to scale and shift of its inverse."""
-
-    def relative_depth(self, width: int | None = None, height: int | None = None) -> np.ndarray | None:
-        """See `View`."""
-        z = dataclasses.replace(self, depth_path=self.relative_depth_path).depth(width, height)
-        assert z is not None
-        with np.errstate(divide="ignore"):
-            return np.where(z > 0, 0.7 / z + 0.1, np.nan).astype(np.float32)
-
-
-def relative(view: View) -> View:
-    """The view with a relative map in place of its metric one."""
-    fields = {field.name: getattr(view, field.name) for field in dataclasses.fields(view)}
-    return RelativeView(**(fields | {"relative_depth_path": view.depth_path, "depth_path": None}))
-
-
 def fit(dataset: Dataset, scene: str, way: str, trained: str, views: int, steps: int, seed: int, offset: int) -> dict:
     """The row of one fit."""
     config = FitConfig().replace(
@@ -104,7 +83,7 @@ def fit(dataset: Dataset, scene: str, way: str, trained: str, views: int, steps:
         max_steps=steps,
         skybox="off",
         semantics="ignore",
-        depth="off" if way.startswith("off") else "on",
+        depth="off" if way == "off" else "on",
         depth_weight=WEIGHTS.get(way, DEFAULT)[:2],
         depth_behind=WEIGHTS.get(way, DEFAULT)[2],
         **SIZE,
@@ -112,8 +91,6 @@ def fit(dataset: Dataset, scene: str, way: str, trained: str, views: int, steps:
     train, test = split_of(dataset, config)
     if views:
         train = [train[i] for i in np.linspace(0, len(train) - 1, views).round().astype(int)]
-    if "relative" in way:
-        train = [relative(view) for view in train]
     frames = frames_for(train, config.data)
     setup = Setup(dataset, config, train, test, train, (), components_of(), frames=frames)
     began = time.process_time()
@@ -154,8 +131,7 @@ def gains(rows: list[dict], way: str, scenes: Sequence[str], **chosen: object) -
     for row in rows:
         if row["way"] != way or row["scene"] not in scenes or any(row[key] != x for key, x in chosen.items()):
             continue
-        none = "off, relative" if way == "relative" else "off"
-        other = next((x for x in rows if all(x[k] == (row | {"way": none})[k] for k in (*KEY, "machine"))), None)
+        other = next((x for x in rows if all(x[k] == (row | {"way": "off"})[k] for k in (*KEY, "machine"))), None)
         if other is None:
             continue
         unit = (row["scene"], (8, row["offset"]), (str(row["seed"]),))
@@ -171,7 +147,7 @@ def gains(rows: list[dict], way: str, scenes: Sequence[str], **chosen: object) -
 def lines(rows: list[dict]) -> list[list[str]]:
     """A line a way, trained preset, number of views and of steps, and half of the scenes."""
     found_lines = []
-    kinds = {tuple(row[key] for key in KEY[1:5]) for row in rows if not row["way"].startswith("off")}
+    kinds = {tuple(row[key] for key in KEY[1:5]) for row in rows if row["way"] != "off"}
     for way, trained, views, steps in sorted(kinds, key=lambda kind: (kind[3], kind[2], kind[1], kind[0])):
         for half, scenes in (("tried on", CHOOSING), ("shown on", SHOWING)):
             found = gains(rows, way, scenes, trained=trained, views=views, steps=steps)

@@ -1,8 +1,8 @@
 """Surfaces of made scenes against the true ones: how far off, and how much of them is there.
 
-    python benchmarks/mesh.py [--scenes still_life room] [--page]
+    python benchmarks/mesh.py [--page]
 
-Fits Gaussians to photographs of a made scene, from points that are matched between photographs (what the scene's files
+Fits Gaussians to photographs of a still life, from points that are matched between photographs (what the scene's files
 know of depth is kept from the fit), makes meshes of them in several ways, and compares each with the triangles that the
 photographs were traced from. Appends a row a mesh to benchmarks/mesh.jsonl as it ends, leaves out what is there, then
 writes the paragraph of docs/mesh.md. One thread, one seed.
@@ -17,7 +17,6 @@ whole mesh, with the room around it, whose walls are in the background of photog
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import os
 import sys
@@ -40,84 +39,60 @@ from drgs.fitting.config import FitConfig  # noqa: E402
 from drgs.meshing.depths import depth_views  # noqa: E402
 from drgs.meshing.extraction import TriangleMesh, deviations_of, mesh_of_depths  # noqa: E402
 from drgs.meshing.options import MeshOptions  # noqa: E402
-from drgs.scenes import room, still_life  # noqa: E402
+from drgs.scenes import still_life  # noqa: E402
 from drgs.settings import RenderSettings  # noqa: E402
 from drgs.studies.tables import paragraph  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "mesh.jsonl"
 PAGE = ROOT / "docs" / "mesh.md"
 SIZE = {"max_pixels": 20_000, "max_gaussians": 10_000, "test_every": 0}
-# What is fitted: a scene by its name, how many photographs of it, and for how many steps.
-FITS = (
-    ("still_life", 28, 800),
-    ("still_life", 14, 800),
-    ("still_life", 7, 800),
-    ("still_life", 28, 300),
-    ("room", 75, 800),
-)
-FAR = {"still_life": 0.05, "room": 0.25}  # meters
-NEAR = {"still_life": 0.005, "room": 0.03}
-SPACING = {"still_life": 0.0012, "room": 0.008}
+SCENE = "still_life"
+PHOTOGRAPHS = 28
+STEPS = (800, 300)
+FAR = 0.05  # meters
+NEAR = 0.005  # meters
+SPACING = 0.0012  # meters
 WAYS: dict[str, dict] = {
     "default": {"crop": MeshOptions.crop},
     "no crop": {},
     "expected depth": {"depth": "expected"},
-    "preset fast": {"preset": "fast"},
-    "same weight at every angle": {"weight": "same"},
-    "weight: cosine x alpha": {"weight": "alpha"},
-    "what is not solid is not free": {"empty": 0.0},
     "trunc 2": {"trunc": 2.0},
     "trunc 8": {"trunc": 8.0},
     "voxel / 2": {"voxels": 0.5},
     "voxel x 2": {"voxels": 2.0},
-    "min-views 1": {"min_views": 1},
-    "min-views 3": {"min_views": 3},
     "crop 0.5": {"crop": 0.5},
     "crop 2": {"crop": 2.0},
-    "pieces kept": {"min_piece": 0.0},
 }
-"""Name -> what is done in another way than by default; but for the first, nothing is cut that is uncertain."""
+"""Name -> what is done in another way than by default; but for the first, nothing is cut that is uncertain. The row of
+another way is of code that changed nothing and was not kept.
+"""
 
 
 # ------------------------------------------------------------------------------------------ scenes
 
 
-def data_of(scene: str, views: int, folder: Path) -> Path:
-    """A data set of some of the photographs of a made scene, without its depth; it is made where it is not there."""
-    made = folder / scene
-    if scene == "still_life":
-        still_life.generate(made, views=28, width=240, height=180)
-    elif not (made / "test_views.txt").exists():
-        room.generate(made)
-    out = folder / f"{scene}-{views}"
+def data_in(folder: Path) -> Path:
+    """The still life without its depth; it is made where it is not there."""
+    made, out = folder / SCENE, folder / f"{SCENE}-{PHOTOGRAPHS}"
+    still_life.generate(made, views=PHOTOGRAPHS, width=240, height=180)
     out.mkdir(exist_ok=True)
-    if scene == "still_life":
-        cameras = json.loads((made / "transforms.json").read_text())
-        frames = cameras["frames"]
-        chosen = [frames[k * len(frames) // views] for k in range(views)]
-        plain = [{key: x for key, x in frame.items() if key != "depth_file_path"} for frame in chosen]
-        (out / "transforms.json").write_text(json.dumps({**cameras, "frames": plain}))
-        names = ("images",)
-    else:
-        names = ("images", "sparse")  # points of a COLMAP model, of which each view sees some, with errors
-    for name in names:
-        if not (out / name).exists():
-            (out / name).symlink_to(made / name)
+    cameras = json.loads((made / "transforms.json").read_text())
+    plain = [{key: x for key, x in frame.items() if key != "depth_file_path"} for frame in cameras["frames"]]
+    (out / "transforms.json").write_text(json.dumps({**cameras, "frames": plain}))
+    if not (out / "images").exists():
+        (out / "images").symlink_to(made / "images")
     return out
 
 
-def triangles_of(scene: str) -> np.ndarray:
+def true_triangles() -> np.ndarray:
     """(F, 3, 3) corners of the true surface, in meters."""
     rng = np.random.default_rng(0)
-    # In the order in which the scene draws its numbers.
-    parts = [*still_life._room(rng), *still_life.objects(rng)] if scene == "still_life" else [*room.parts(0)]
+    parts = [*still_life._room(rng), *still_life.objects(rng)]  # in the order in which the scene draws its numbers
     return np.concatenate([np.asarray(mesh[0])[np.asarray(mesh[1])] for _, mesh, *_ in parts]).astype(np.float64)
 
 
-def in_region(scene: str, points: np.ndarray) -> np.ndarray:
-    """Which points are of what is looked at: table top and what stands on it; of a room everything."""
-    if scene == "room":
-        return np.ones(len(points), bool)
+def in_region(points: np.ndarray) -> np.ndarray:
+    """Which points are of what is looked at: table top and what stands on it."""
     return (np.hypot(points[:, 0], points[:, 1]) < 0.6) & (points[:, 2] > -0.02) & (points[:, 2] < 0.7)
 
 
@@ -137,17 +112,14 @@ def sampled(corners: np.ndarray, spacing: float, seed: int = 0) -> np.ndarray:
 class Truth:
     """The true surface of a scene, as the cameras of a fit see it."""
 
-    def __init__(self, scene: str, fit: Fit):
+    def __init__(self, fit: Fit):
         from scipy.spatial import cKDTree
 
-        self.scene = scene
-        corners = triangles_of(scene)
-        self.all = cKDTree(sampled(corners, SPACING[scene]))
-        keep = in_region(scene, corners.mean(1))
-        if scene == "still_life":  # the table's large triangles reach out of the region
-            keep |= (np.abs(corners[..., 2]) < 0.02).all(1)
-        points = sampled(corners[keep], SPACING[scene])
-        points = points[in_region(scene, points)]
+        corners = true_triangles()
+        self.all = cKDTree(sampled(corners, SPACING))
+        keep = in_region(corners.mean(1)) | (np.abs(corners[..., 2]) < 0.02).all(1)  # the table's reach out of it
+        points = sampled(corners[keep], SPACING)
+        points = points[in_region(points)]
         self.tree = cKDTree(points)
         few = points[np.random.default_rng(1).permutation(len(points))[:60_000]]
         self.visible = few[self._seen(corners, few, fit) >= 2]
@@ -182,19 +154,18 @@ class Truth:
         """Accuracy and completeness in millimeters, and shares of what is near enough."""
         from scipy.spatial import cKDTree
 
-        far, near = FAR[self.scene], NEAR[self.scene]
-        points = sampled(mesh.vertices[mesh.faces], SPACING[self.scene], 2)
+        points = sampled(mesh.vertices[mesh.faces], SPACING, 2)
         own = cKDTree(points)
         anywhere = points[np.random.default_rng(4).permutation(len(points))[:60_000]]
-        inside = points[in_region(self.scene, points)]
+        inside = points[in_region(points)]
         inside = inside[np.random.default_rng(3).permutation(len(inside))[:60_000]]
-        off = np.minimum(self.tree.query(inside)[0], far)
-        missing = np.minimum(own.query(self.visible)[0], far)
-        precision, recall = float((off < near).mean()), float((missing < near).mean())
+        off = np.minimum(self.tree.query(inside)[0], FAR)
+        missing = np.minimum(own.query(self.visible)[0], FAR)
+        precision, recall = float((off < NEAR).mean()), float((missing < NEAR).mean())
         return {
             "accuracy_mm": 1e3 * float(off.mean()),
             "completeness_mm": 1e3 * float(missing.mean()),
-            "anywhere_mm": 1e3 * float(np.minimum(self.all.query(anywhere)[0], far).mean()),
+            "anywhere_mm": 1e3 * float(np.minimum(self.all.query(anywhere)[0], FAR).mean()),
             "precision": precision,
             "recall": recall,
             "f": 2 * precision * recall / max(precision + recall, 1e-9),
@@ -213,12 +184,12 @@ class Views:
         self.known: dict = {}
         self.deviations = deviations_of(fit.gaussians, self.cameras, RenderSettings.preset("fast"))
 
-    def of(self, depth: str, preset: str) -> list:
+    def of(self, depth: str) -> list:
         """The depth images of a kind."""
-        if (depth, preset) not in self.known:
-            settings = RenderSettings.preset(preset)
-            self.known[depth, preset] = depth_views(self.fit.gaussians, self.cameras, settings, depth, self.deviations)
-        return self.known[depth, preset]
+        if depth not in self.known:
+            settings = RenderSettings.preset("exact")
+            self.known[depth] = depth_views(self.fit.gaussians, self.cameras, settings, depth, self.deviations)
+        return self.known[depth]
 
 
 def mesh_in(way: dict, views: Views) -> tuple[TriangleMesh, float]:
@@ -227,29 +198,25 @@ def mesh_in(way: dict, views: Views) -> tuple[TriangleMesh, float]:
     from drgs.meshing.depths import footprint
 
     way = dict(way)
-    weight, empty, voxels = way.pop("weight", "cosine"), way.pop("empty", None), way.pop("voxels", 1.0)
-    shown = views.of(way.get("depth", MeshOptions.depth), way.pop("preset", "exact"))
+    voxels = way.pop("voxels", 1.0)
+    shown = views.of(way.get("depth", MeshOptions.depth))
     options = MeshOptions(**{"crop": 0.0, **way})
-    if weight == "same":
-        shown = [dataclasses.replace(view, weight=np.ones_like(view.weight)) for view in shown]
-    if weight == "alpha":
-        shown = [dataclasses.replace(view, weight=view.weight * view.alpha) for view in shown]
     if voxels != 1.0:
         options = options.replace(voxel=voxels * footprint(shown) * extraction.FINENESS)
     began = time.process_time()
-    mesh = mesh_of_depths(shown, options, empty=1.0 if empty is None else empty)
+    mesh = mesh_of_depths(shown, options)
     return mesh, time.process_time() - began
 
 
-def measure(scene: str, count: int, steps: int, ways: list[str], folder: Path) -> None:
+def measure(steps: int, ways: list[str], folder: Path) -> None:
     """Rows of one fit."""
-    key = {"scene": scene, "photographs": count, "steps": steps}
+    key = {"scene": SCENE, "photographs": PHOTOGRAPHS, "steps": steps}
     there = {row["way"] for row in read_rows(ROWS) if all(row[name] == x for name, x in key.items())}
     ways = [way for way in ways if way not in there]
     if not ways:
         return
-    fit = fitted(str(data_of(scene, count, folder)), FitConfig().replace(max_steps=steps, **SIZE))
-    truth = Truth(scene, fit)
+    fit = fitted(str(data_in(folder)), FitConfig().replace(max_steps=steps, **SIZE))
+    truth = Truth(fit)
     views = Views(fit)
     for way in ways:
         mesh, seconds = mesh_in(WAYS[way], views)
@@ -266,17 +233,15 @@ def measure(scene: str, count: int, steps: int, ways: list[str], folder: Path) -
 
 
 def in_order(rows: list[dict]) -> list[dict]:
-    """As `FITS` and `WAYS` have them."""
-    order = {fit: k for k, fit in enumerate(FITS)}
-    ranks = {way: k for k, way in enumerate(WAYS)}
-    return sorted(rows, key=lambda row: (order[row["scene"], row["photographs"], row["steps"]], ranks[row["way"]]))
+    """As `STEPS` and `WAYS` have them, other ways last."""
+    ways = [*WAYS]
+    rank = lambda way: ways.index(way) if way in WAYS else len(ways)  # noqa: E731
+    return sorted(rows, key=lambda row: (STEPS.index(row["steps"]), rank(row["way"])))
 
 
 def summary(rows: list[dict]) -> str:
-    """What docs/mesh.md says, of the longest fit of the still life."""
-    own = [row for row in rows if row["scene"] == "still_life"]
-    steps = max(row["steps"] for row in own)
-    found = {row["way"]: row for row in own if row["steps"] == steps}
+    """What docs/mesh.md says, of the longer fit."""
+    found = {row["way"]: row for row in rows if row["steps"] == max(STEPS)}
     told = {
         way: f"{row['accuracy_mm']:.1f} and {row['completeness_mm']:.1f} mm, {row['seconds']:.0f} s"
         for way, row in found.items()
@@ -316,17 +281,14 @@ def sheet(rows: list[dict]) -> list[list[str]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--scenes", nargs="*", default=["still_life", "room"])
-    parser.add_argument("--photographs", nargs="*", type=int, help="only fits of so many")
     parser.add_argument("--ways", nargs="*", default=list(WAYS))
     parser.add_argument("--folder", type=Path, default=Path("out/mesh"), help="where made scenes are put")
     parser.add_argument("--page", action="store_true", help="only write the page")
     args = parser.parse_args()
     if not args.page:
         args.folder.mkdir(parents=True, exist_ok=True)
-        for scene, count, steps in FITS:
-            if scene in args.scenes and (not args.photographs or count in args.photographs):
-                measure(scene, count, steps, args.ways, args.folder.resolve())
+        for steps in STEPS:
+            measure(steps, args.ways, args.folder.resolve())
     rows = read_rows(ROWS)
     fill_between(PAGE, "rows", summary(rows))
     write_csv(PAGE_DATA / "mesh.csv", sheet(rows))

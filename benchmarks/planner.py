@@ -2,7 +2,6 @@
 
     python benchmarks/planner.py DATA --frames 500           rows as they come, kept: benchmarks/planner.jsonl
     python benchmarks/planner.py DATA --frames 200 --bounds
-    python benchmarks/planner.py DATA --frames 200 --memory
     python benchmarks/planner.py --page                      docs/planner.md and its data files
 
 DATA is a sequence with depth: `drgs scene room --views 560 --size 120x90 --test-every 10 -o DATA`, or a capture. Its
@@ -11,16 +10,11 @@ scored within a second and three are picked; of a third of the held-out views PS
 
 With `--bounds` nothing else is measured but every tenth photograph: planners with other bounds are asked the same about
 the same model, without a limit of time. What is right is the answer of bound 0, which asks every view anew.
-
-With `--memory` the loop is the same, but rows hold no seconds: what the process holds after every tenth photograph, in
-pages (`resident`), in memory that it asked the allocator for (`used`, where glibc tells), and in compiled kernels.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
-import ctypes
 import os
 import sys
 import time
@@ -42,7 +36,7 @@ from where import add_row, ran, read_rows  # noqa: E402
 
 import drgs  # noqa: E402
 from drgs.runtime.machine import peak_memory  # noqa: E402
-from drgs.studies.tables import markdown_table, paragraph  # noqa: E402
+from drgs.studies.tables import paragraph  # noqa: E402
 
 ROWS = ROOT / "benchmarks" / "planner.jsonl"
 PAGE = ROOT / "docs" / "planner.md"
@@ -54,8 +48,8 @@ COMPARED_EVERY = 10
 WINDOW = 100  # photographs of a line of the data file
 
 
-def measure(path: Path, frames: int, bounds: bool, memory: bool) -> None:
-    """Rows of the photographs of a data set, of the bounds that are compared on the way, or of memory alone."""
+def measure(path: Path, frames: int, bounds: bool) -> None:
+    """Rows of the photographs of a data set, or of the bounds that are compared on the way."""
     dataset = drgs.load_data(path)
     train, held_out = dataset.split()
     train = train[:frames]
@@ -82,17 +76,6 @@ def measure(path: Path, frames: int, bounds: bool, memory: bool) -> None:
             continue
         plan = planner.scores(places, seconds=SECONDS)
         picked = planner.next(min(3, len(places)), seconds=0)
-        if memory:
-            if number % COMPARED_EVERY == COMPARED_EVERY - 1:
-                row = {
-                    "what": "memory",
-                    "number": number,
-                    "known": len(planner.views),
-                    "memory": peak_memory(),
-                } | held()
-                add_row(ROWS, row | where)
-                print(row, flush=True)
-            continue
         row = {
             "what": "photograph",
             "number": number,
@@ -112,34 +95,6 @@ def measure(path: Path, frames: int, bounds: bool, memory: bool) -> None:
             row["psnr"] = psnr(scene, measured[:12], 12_000)
         add_row(ROWS, row | where)
         print({k: round(v, 3) if isinstance(v, float) else v for k, v in row.items()}, flush=True)
-
-
-class _Mallinfo(ctypes.Structure):
-    """What glibc's mallinfo2 returns."""
-
-    _fields_ = [(name, ctypes.c_size_t) for name in (
-        "arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "uordblks", "fordblks", "keepcost",
-    )]  # fmt: skip
-
-
-def held() -> dict[str, int]:
-    """Bytes that this process holds now, on Linux with glibc: all its pages, what was allocated, and kernels' code."""
-    pages = kernels = 0
-    is_code = False
-    for line in Path("/proc/self/smaps").read_text().splitlines():
-        words = line.split()
-        if not words[0].endswith(":"):
-            is_code = "x" in words[1] and (len(words) < 6 or "memfd" in words[5])
-        elif words[0] == "Rss:":
-            pages += 1024 * int(words[1])
-            kernels += 1024 * int(words[1]) * is_code
-    found = {"resident": pages, "kernels": kernels}
-    with contextlib.suppress(OSError, AttributeError):
-        library = ctypes.CDLL(None)
-        library.mallinfo2.restype = _Mallinfo
-        told = library.mallinfo2()
-        found |= {"used": told.uordblks + told.hblkhd, "free": told.fordblks}
-    return found
 
 
 def compared(
@@ -223,37 +178,19 @@ def bounds_sheet(rows: list[dict]) -> list[list[str]]:
     return lines
 
 
-def memory_table(rows: list[dict]) -> list[str]:
-    """What the process held, at every fiftieth photograph; nothing where that was not measured."""
-    if not rows:
-        return []
-    lines = [
-        [str(row["number"] + 1), *(f"{row[k] / 1e6:.0f}" for k in ("resident", "memory", "used", "free", "kernels"))]
-        for row in rows
-        if row["number"] % 50 == 49
-    ]
-    told = (
-        f"Memory after a number of photographs, MB, one more run of the same, {rows[0]['date']}, commit "
-        f"{rows[0]['commit'][:7]}: pages now and at most, allocated and free in them, code of kernels."
-    )
-    heads = ["photographs", "pages", "at most", "allocated", "free", "kernels"]
-    return [paragraph(told), markdown_table(heads, lines)]
-
-
 def main() -> None:
     """The program."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", nargs="?", type=Path)
     parser.add_argument("--frames", type=int, default=500)
     parser.add_argument("--bounds", action="store_true", help="compare bounds")
-    parser.add_argument("--memory", action="store_true", help="measure memory alone")
     parser.add_argument("--page", action="store_true", help="write what is there to the page and its data files")
     args = parser.parse_args()
     if args.data is not None:
-        measure(args.data, args.frames, args.bounds, args.memory)
+        measure(args.data, args.frames, args.bounds)
     rows = read_rows(ROWS)
     text = summary(rows)
-    print("\n\n".join([text, *memory_table([row for row in rows if row["what"] == "memory"])]))
+    print(text)
     if args.page:
         fill_between(PAGE, "planner", text)
         write_csv(PAGE_DATA / "planner.csv", photographs(rows))

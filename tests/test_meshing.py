@@ -107,8 +107,6 @@ def test_what_hits_nothing_is_free():
     beside = 0.6 * up[None] / np.linalg.norm(up)  # in the image, outside of the ball
     values, weights = distances([view], beside, 0.1)
     assert (values[0], weights[0]) == (1.0, 1.0)
-    _, weights = distances([view], beside, 0.1, empty=0.0)
-    assert weights[0] == 0
 
 
 def test_no_surface_across_an_edge():

@@ -136,7 +136,6 @@ def mesh_of_depths(
     views: Sequence[DepthView],
     options: MeshOptions,
     advance: Callable[[str, int, int], None] | None = None,
-    empty: float = 1.0,
 ) -> TriangleMesh:
     """The surface of depth images: fusion, colors, and cuts where views do not determine it.
 
@@ -145,14 +144,13 @@ def mesh_of_depths(
             voxels from there: cameras far from 0 are moved there first (`Camera.relative_to`).
         options: How it is made.
         advance: Called with a label, the steps done and their number.
-        empty: Weight of a pixel that hits nothing solid, as free space along its whole ray.
     Raises:
         ValueError: If no view sees a surface, the lattice would have more than `max_voxels` points, or nothing is left.
     """
     voxel, bricks = _lattice(views, options)
     trunc = options.trunc * voxel
     advance_bricks = (lambda done: advance("fusion", done, len(bricks))) if advance else None
-    vertices, faces = surface(views, voxel, trunc, bricks=bricks, empty=empty, advance=advance_bricks)
+    vertices, faces = surface(views, voxel, trunc, bricks=bricks, advance=advance_bricks)
     colors, seen, spread = _attributes(views, vertices, trunc)
     mesh = TriangleMesh(vertices, faces, colors, seen, spread, voxel, trunc)
     is_kept = seen >= options.min_views

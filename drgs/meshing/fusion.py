@@ -120,16 +120,13 @@ def sampled(view: DepthView, points: np.ndarray, trunc: float) -> tuple[np.ndarr
     return signed, weight, pixels
 
 
-def distances(
-    views: Sequence[DepthView], points: np.ndarray, trunc: float, empty: float = 1.0
-) -> tuple[np.ndarray, np.ndarray]:
-    """The fused truncated signed distance.
+def distances(views: Sequence[DepthView], points: np.ndarray, trunc: float) -> tuple[np.ndarray, np.ndarray]:
+    """The fused truncated signed distance. The whole ray of a pixel that hits nothing solid is free, with weight 1.
 
     Args:
         views: Depth images.
         points: (P, 3) float64 world.
         trunc: Truncation in scene units.
-        empty: Weight of a pixel that hits nothing solid.
     Returns:
         (P,) float64 in [-1, 1], in units of `trunc`, positive in front of the surface, and (P,) the sum of the weights,
         0 where no view says anything.
@@ -139,7 +136,7 @@ def distances(
         signed, weight, _ = sampled(view, points, trunc)
         with np.errstate(invalid="ignore"):
             counts = signed >= -trunc  # not NaN, and not hidden
-        weight = np.where(np.isinf(signed), empty, weight) * counts
+        weight = np.where(np.isinf(signed), 1.0, weight) * counts
         total += weight * np.where(counts, np.minimum(signed / trunc, 1.0), 0.0)
         weights += weight
     return np.where(weights > 0, total / np.maximum(weights, 1e-300), 1.0), weights
@@ -151,7 +148,6 @@ def surface(
     trunc: float,
     *,
     bricks: np.ndarray | None = None,
-    empty: float = 1.0,
     advance: Callable[[int], None] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) float64, world, and triangles (F, 3) int64 of the fused surface, seen from outside in
@@ -162,7 +158,6 @@ def surface(
         voxel: Distance of neighboring points of the lattice in scene units.
         trunc: Truncation in scene units.
         bricks: What `bricks_of` gives; None: it is called here.
-        empty: Weight of a pixel that hits nothing solid.
         advance: Called with the number of bricks that were done.
     """
     bricks = bricks_of(views, voxel, trunc) if bricks is None else bricks
@@ -174,7 +169,7 @@ def surface(
         points = (brick * BRICK + offsets) * float(voxel)
         middle, reach = points.mean(0), float(np.linalg.norm(np.ptp(points, axis=0)) / 2)
         near = [seen.view for seen in cones if seen.may_see(middle, reach)]
-        values, weights = distances(near, points, trunc, empty)
+        values, weights = distances(near, points, trunc)
         found = _triangles(values, weights > 0)
         if found is not None:
             local, triangles = found
