@@ -23,7 +23,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: tor
 
 import torch  # noqa: E402
 from clocks import interleaved  # noqa: E402
-from where import ran  # noqa: E402
+from where import DATA, ran  # noqa: E402
 
 import drgs  # noqa: E402
 from drgs.cameras import Camera, orbit  # noqa: E402
@@ -107,8 +107,7 @@ def main() -> None:
     row = errors(made.detach(), view, (0, 0, min(40, view.width), min(40, view.height)))
     result["rows"]["`drgs.testing.random_scene(0, aspect=1)`"] = row | {"cost": costs(made.detach(), view, 5)}
     if not args.quick:
-        folder = Path(os.environ.get("DRGS_DATA") or ROOT.parent / "shared" / "data")
-        wolf = drgs.load_gaussians(folder / "splats/wolf/wolf.ply")
+        wolf = drgs.load_gaussians(DATA / "splats/wolf/wolf.ply")
         middle = tuple(wolf.means.median(0).values.tolist())
         camera = orbit(middle, float(wolf.means.std(0).norm()) * 3, 8, width=160, height=160)[1]
         row = errors(wolf, camera, (60, 60, 40, 40))

@@ -1,14 +1,14 @@
 """What exact order costs on scenes that people have: `exact` against `fast`, on fits, a splat and the cube.
 
     python benchmarks/exact.py [--fits FOLDER] [--turns 7]      a part of docs/benchmarks.md, benchmarks/exact.json
-    python benchmarks/exact.py --parts oracle torch             these parts again, the others as they are
+    python benchmarks/exact.py --parts memory torch             these parts again, the others as they are
     python benchmarks/exact.py --page                           that part, of the results that there are
 
-Fits are made once, in FOLDER (default runs/exact), of the captures `office`, `banana` and (for the oracle) `statue` in
-DRGS_DATA and of a still life made here; the splat is `wolf` there. What is not there is left out, and the page says so.
-Presets take turns in one process for each scene and number of threads; figures are medians. The same frames are timed
-against Mitsuba's `volprim_rf_basic` (shapes `ellipsoids` and `ellipsoidsmesh`), and beside two processes that never
-rest; a smaller cube against gsplat's own torch code, by examples/gsplat_torch.py.
+Fits are made once, in FOLDER (default runs/exact), of the captures `office` and `banana` in DRGS_DATA and of a still
+life made here; the splat is `wolf` there. What is not there is left out, and the page says so. Presets take turns in
+one process for each scene and number of threads; figures are medians. The same frames are timed against Mitsuba's
+`volprim_rf_basic` (shapes `ellipsoids` and `ellipsoidsmesh`); a smaller cube against gsplat's own torch code, by
+examples/gsplat_torch.py.
 """
 
 from __future__ import annotations
@@ -35,17 +35,15 @@ from where import DATA, ran  # noqa: E402
 
 import drgs  # noqa: E402
 from drgs import data, fisher  # noqa: E402
-from drgs.cameras.sizes import at_most, cropped  # noqa: E402
+from drgs.cameras.sizes import at_most  # noqa: E402
 from drgs.runtime.machine import peak_memory  # noqa: E402
 from drgs.studies.tables import paragraph  # noqa: E402
 from drgs.train import FitConfig, fit  # noqa: E402
 
 PIXELS = 76_800  # of a view: 320x240
-FITTED = ("office", "banana", "still life", "statue")
+FITTED = ("office", "banana", "still life")
 SCENES = ("office", "banana", "still life", "wolf", "cube")
-CHECKED = (*SCENES, "statue")  # against the oracle
 KINDS = ("forward", "forward + backward", "Fisher diagonal")
-CROP = (48, 36)  # pixels that the oracle looks at
 MESH = {"type": "ellipsoidsmesh", "extent_adaptive_clamping": True}
 TORCH = 10_000, 128  # Gaussians, and pixels along a side: what torch code can do
 TORCH_ROWS = ("gsplat's torch code", "preset gsplat")
@@ -105,7 +103,6 @@ def task_scene(name: str, folder: Path, turns: int) -> dict | None:
         runs[preset, KINDS[0]] = forward(g, cam, s)
         runs[preset, KINDS[1]] = backward(g, cam, s)
         runs[preset, KINDS[2]] = lambda s=s: fisher.diagonal(g, cam, s)
-    runs["exact", "with depth"] = forward(g, cam, Preset("exact"), ("depth",))
     seconds = interleaved(runs, turns)
     hits, few = (drgs.render(g, cam, Preset(x), outputs="count").count.float().mean() for x in ("exact", "fast"))
     return {
@@ -118,23 +115,6 @@ def task_scene(name: str, folder: Path, turns: int) -> dict | None:
     }
 
 
-def task_oracle(name: str, folder: Path, turns: int) -> dict | None:
-    """The middle of the view against the float64 oracle: largest difference of a color where nothing is near a tie."""
-    found = scene(name, folder)
-    if found is None:
-        return None
-    g, cam = found
-    crop = cropped(cam, cam.width // 2 - CROP[0] // 2, cam.height // 2 - CROP[1] // 2, *CROP)
-    g = g.detach()
-    s = Preset("exact")
-    with torch.no_grad():
-        true = drgs.reference.render(g, crop, s)
-        out = drgs.render(g, crop, s, outputs=())
-    clear = ~true.ambiguous
-    error = (out.rgb - true.rgb).abs().amax(-1)
-    return {"near a tie": int((~clear).sum()), "error": float(error[clear].max()), "pixels": clear.numel()}
-
-
 def task_memory(name: str, folder: Path, turns: int) -> dict:
     """Peak memory of a frame forward and backward, and of a Fisher diagonal: 1,000,000 Gaussians at 1024 x 1024."""
     g, cam = cubes.cube(1_000_000), cubes.camera(1024)
@@ -145,7 +125,7 @@ def task_memory(name: str, folder: Path, turns: int) -> dict:
 
 
 def task_peers(name: str, folder: Path, turns: int) -> dict:
-    """The cube against Mitsuba's integrator on both of its shapes, on a machine at rest and on a busy one."""
+    """The cube against Mitsuba's integrator on both of its shapes."""
     g, cam = cubes.cube(), cubes.camera()
     runs = {
         "volprim, ellipsoids": volprim(g, cam, False),
@@ -153,15 +133,7 @@ def task_peers(name: str, folder: Path, turns: int) -> dict:
         "fast": forward(g, cam, Preset("fast")),
         "exact": forward(g, cam, Preset("exact")),
     }
-    result = {"rest": interleaved(runs, turns, warm=True)}
-    load = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
-    try:
-        result["busy"] = interleaved(runs, turns, warm=True)
-    finally:
-        for process in load:
-            process.kill()
-            process.wait()
-    return result
+    return {"rest": interleaved(runs, turns, warm=True)}
 
 
 def task_torch(name: str, folder: Path, turns: int) -> dict:
@@ -191,18 +163,16 @@ def task_torch(name: str, folder: Path, turns: int) -> dict:
 
     runs = {"gsplat's torch code, forward": alone, "preset gsplat, forward": forward(g, cam, s)}
     runs |= {"gsplat's torch code, both": differentiated, "preset gsplat, both": backward(g, cam, s)}
-    difference = (alone() - forward(g, cam, s)().rgb).abs()
-    return {"seconds": interleaved(runs, turns), "difference": float(difference.quantile(0.999))}
+    return {"seconds": interleaved(runs, turns)}
 
 
 TASKS = {
     "scene": task_scene,
-    "oracle": task_oracle,
     "memory": task_memory,
     "peers": task_peers,
     "torch": task_torch,
 }
-PARTS = ("scenes", "oracle", "memory", "peers", "torch")
+PARTS = ("scenes", "memory", "peers", "torch")
 
 
 def child(task: str, name: str, threads: int, args: argparse.Namespace) -> dict | None:
@@ -220,7 +190,7 @@ def child(task: str, name: str, threads: int, args: argparse.Namespace) -> dict 
 def ratios(found: dict, kind: str) -> list[float]:
     """Times of `exact` over those of `fast`, by scene."""
     every = [row["seconds"] for row in found.values() if row]
-    return [t[f"exact, {kind}"] / t[f"fast, {kind if kind in KINDS else KINDS[0]}"] for t in every]
+    return [t[f"exact, {kind}"] / t[f"fast, {kind}"] for t in every]
 
 
 def between(values: list[float]) -> str:
@@ -291,8 +261,6 @@ def main() -> None:
         result["scenes"] = {
             str(threads): {name: child("scene", name, threads, args) for name in SCENES} for threads in (1, 2)
         }
-    if "oracle" in parts:
-        result["oracle"] = {name: child("oracle", name, 2, args) for name in CHECKED}
     for task in ("memory", "peers", "torch"):
         if task in parts:
             result[task] = child(task, "", 2, args)

@@ -24,7 +24,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as for every command: tor
 
 import numpy as np  # noqa: E402
 from pages import fill_between  # noqa: E402
-from where import ran  # noqa: E402
+from where import DATA, ran  # noqa: E402
 
 import drgs  # noqa: E402
 from drgs.cameras import Camera, intrinsics_from_fov, look_at  # noqa: E402
@@ -104,8 +104,7 @@ def main() -> None:
         g = drgs.testing.random_scene(0)[0].detach()
         size = (24, 16)
     else:
-        folder = Path(os.environ.get("DRGS_DATA") or ROOT.parent / "shared" / "data")
-        g = drgs.load_gaussians(folder / "splats/wolf/wolf.ply")
+        g = drgs.load_gaussians(DATA / "splats/wolf/wolf.ply")
         size = (220, 147)
     cameras = around(g, size, KNOWN + CANDIDATES + NEW * PICKS)
     result: dict = {**ran(), "gaussians": len(g), "size": f"{size[0]}x{size[1]}", "rows": {}}

@@ -20,10 +20,9 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 import cubes  # noqa: E402
-import torch  # noqa: E402
 from clocks import interleaved  # noqa: E402
 from fisher import fitted  # noqa: E402
-from studies import write_csv  # noqa: E402
+from studies import rank_correlation, write_csv  # noqa: E402
 from where import ran  # noqa: E402
 
 import drgs  # noqa: E402
@@ -84,7 +83,7 @@ def picks(name: str, g: drgs.Gaussians, cameras: list[Camera]) -> list[dict]:
                 "scene": name,
                 "candidates": len(candidates),
                 "eliminated": kind,
-                "spearman": spearman(plain, scores),
+                "spearman": rank_correlation(plain, scores),
                 "same first pick": first == order[0],
                 "rank of the pick": order.index(first) + 1,
                 "lost": {g: 1 - float(x.sum()) / float(told["none"][g].sum()) for g, x in told[kind].items()},
@@ -92,12 +91,6 @@ def picks(name: str, g: drgs.Gaussians, cameras: list[Camera]) -> list[dict]:
         )
         print(rows[-1], flush=True)
     return rows
-
-
-def spearman(a: list[float], b: list[float]) -> float:
-    """Correlation of the ranks."""
-    ranks = torch.stack([torch.tensor(x).argsort().argsort().double() for x in (a, b)])
-    return float(torch.corrcoef(ranks)[0, 1])
 
 
 def write(found: dict) -> None:

@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 import studies
 from pages import draw_curves, fill_between
-from studies import ROOT
+from studies import ROOT, lead
 
 from drgs.fitting.config import FitConfig
 from drgs.studies.cells import Metric, Study
 from drgs.studies.rows import read_study
-from drgs.studies.statistics import FEWEST_UNITS, at_views, differences, estimate, unit_of, values_of, view_counts
+from drgs.studies.statistics import at_views, differences, unit_of, values_of, view_counts
 from drgs.studies.tables import markdown_table
 
 Rows = Sequence[dict[str, Any]]
@@ -102,13 +102,10 @@ def table(rows: Rows) -> str:
     heads = ["against", "units (scenes)", *(f"{count} views" for count in SHOWN)]
     lines = []
     for other in SIMPLE:
-        found = [estimate(differences(at_views(blind, count), "psnr", DEFAULT, other)) for count in SHOWN]
-        cells = []
-        for one in found:
-            sure = one.units >= FEWEST_UNITS and not one.low <= 0 <= one.high
-            mean = f"**{one.mean:+.2f}**" if sure else f"{one.mean:+.2f}"
-            cells.append(f"{mean} [{one.low:+.2f}, {one.high:+.2f}]")
-        lines.append([f"`{other}`", f"{found[-1].units} ({found[-1].scenes})", *cells])
+        found = [differences(at_views(blind, count), "psnr", DEFAULT, other) for count in SHOWN]
+        scenes = {unit[0] for unit in found[-1]}
+        cells = [lead(one, 2) for one in found]
+        lines.append([f"`{other}`", f"{len(found[-1])} ({len(scenes)})", *cells])
     return markdown_table(heads, lines)
 
 

@@ -31,7 +31,7 @@ import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from pages import draw_curves, fill_between  # noqa: E402
-from studies import PAGE_DATA, write_csv  # noqa: E402
+from studies import PAGE_DATA, lead, write_csv  # noqa: E402
 from where import DATA, add_row, ran, read_rows  # noqa: E402
 
 from drgs import scenes  # noqa: E402
@@ -505,11 +505,7 @@ def study_rows(rows: Rows) -> list[dict[str, Any]]:
 
 def compared(rows: Rows, metric: Metric, other: str) -> str:
     """`region` less another policy: mean and interval; bold where that excludes 0."""
-    found = estimate(differences(rows, metric.key, REFERENCE, other))
-    mean = f"{found.mean:+.{metric.digits}f}"
-    interval = f"[{found.low:+.{metric.digits}f}, {found.high:+.{metric.digits}f}]"
-    is_clear = found.units >= FEWEST_UNITS and not found.low <= 0 <= found.high
-    return f"{f'**{mean}**' if is_clear else mean} {interval}"
+    return lead(differences(rows, metric.key, REFERENCE, other), metric.digits)
 
 
 def main_lines(rows: Rows) -> list[list[str]]:

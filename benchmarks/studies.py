@@ -46,6 +46,7 @@ __all__ = [
     "dataset",
     "difference",
     "folder",
+    "lead",
     "made",
     "rank_correlation",
     "read_rows",
