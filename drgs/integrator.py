@@ -261,18 +261,21 @@ def render_rays(
     """Render arbitrary rays on the `bvh` traversal: fisheye, panoramas, lidar, thin lenses.
 
     Args:
-        origins, directions: (..., 3) world frame; directions need not be normalized. Differentiable torch tensors or
-            arrays.
+        origins, directions: (..., 3) world frame, of shapes that broadcast; directions need not be normalized.
+            Differentiable torch tensors or arrays. With SH of degree 1 to 3 and `sh_direction="gaussian"`, which gives
+            a Gaussian one color for all rays, all origins are the same.
         settings: Settings with traversal `bvh`; default `exact`. `order="center"` sorts by the distance to the first
             origin.
         outputs, couple_features: Arguments of `render`.
     Returns:
         An `Output` with the leading shape of the rays instead of (H, W).
     Raises:
-        ValueError: If a ray is not finite, a direction is 0, or settings are about a camera's axis (`near`, `z`).
+        ValueError: If a ray is not finite, a direction is 0, shapes do not broadcast, origins differ where they must
+            not, or settings are about a camera's axis (`near`, `z`).
         NotImplementedError: If the traversal is not `bvh`.
     Gradients:
-        Those of `render`, with respect to origins and directions in place of the pose.
+        Those of `render`, with respect to origins and directions in place of the pose. Of origins that are the same,
+        what colors say by SH is shared among all evenly.
     """
     if isinstance(gaussians, Scene) and not isinstance(gaussians, Gaussians):
         raise ArgumentError(

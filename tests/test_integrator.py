@@ -436,6 +436,26 @@ def test_rays(rng):
             assert relative(a.double(), b.double()) < GRADIENT
 
 
+def test_rays_from_one_place(rng):
+    """Colors by SH of a Gaussian's direction are seen from there, with their derivative; several places have none."""
+    g = gaussians(rng, 20, 4, 5)
+    o = torch.tensor([0.1, -0.2, -3.0], dtype=torch.float64, requires_grad=True)
+    d = torch.tensor(rng.normal(size=(7, 9, 3)) * 0.3 + (0, 0, 1.0))
+    settings = RenderSettings(order="ray", traversal="bvh", sh_direction="gaussian", extent=4.0)
+    out, ref = render_rays(g, o, d, settings), reference.render(g, None, settings, rays=(o.expand(d.shape), d))
+    good = ~ref.ambiguous
+    _equal(out, ref_like(ref), good, IMAGE)
+    u = torch.tensor(rng.normal(size=(7, 9, 3))) * good[..., None]
+    (ours,) = torch.autograd.grad((out.rgb.double() * u).sum(), o)
+    (want,) = torch.autograd.grad((ref.rgb * u).sum(), o)
+    assert relative(ours, want) < GRADIENT
+    apart = o.detach() + torch.tensor([[0.0, 0, 0], [1, 0, 0]])
+    with pytest.raises(ValueError, match="origins must be one and the same with SH .*sh_direction='ray'"):
+        render_rays(g, apart, d[0, :2], settings)
+    with pytest.raises(ValueError, match=r"shapes that broadcast, got \(2, 3\) and \(9, 3\)"):
+        render_rays(g, apart, d[0], settings)
+
+
 def ref_like(ref):
     """The oracle's output with the renderer's precision."""
     for name in FIELDS:

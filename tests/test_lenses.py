@@ -318,6 +318,7 @@ def test_what_has_no_derivative_by_the_lens(rng):
     ("fields", "focal", "distortion"),
     [
         ({"order": "ray", "sh_direction": "ray"}, 18.0, (-1.5, 2.3, -0.6, 3.7, -35.6, 17.7, -12.2, -25.0)),
+        ({"order": "ray", "traversal": "bvh"}, 18.0, (-1.5, 2.3, -0.6, 3.7, -35.6, 17.7, -12.2, -25.0)),
         (CUTS, 30.0, (-11.8, -9.1, -9.3, 2.1, 0.3, 2.2, -7.6, 3.7)),
     ],
 )

@@ -129,6 +129,8 @@ class Call:
         self.table: FreeRays | None = None
         self.holes: UInt32 | None = None
         self.home = torch.device("cuda") if runtime.backend().name == "cuda" else torch.device("cpu")
+        if rays is not None:
+            rays = checked_rays(*rays, settings)
         self._check_memory(gaussians, rays)
         gaussians.validate("render")
         self.device = gaussians.means.device
@@ -172,13 +174,21 @@ class Call:
         """
         camera, settings = self.camera, self.settings
         if rays is not None:
-            o, d = checked_rays(*rays, settings)
+            o, d = rays
             self.shape = tuple(d.shape[:-1])
-            o = o.expand(d.shape).reshape(-1, 3)
-            d = torch.nn.functional.normalize(d.reshape(-1, 3), dim=1)
-            pose = torch.eye(4, dtype=torch.float64)
-            # Rays have no camera: depth keys and colors are of the first origin, whose derivative is not theirs.
-            pose[:3, 3] = -(o[0].detach() if len(o) else torch.zeros(3))
+            o, d = o.reshape(-1, 3), torch.nn.functional.normalize(d.reshape(-1, 3), dim=1)
+            # Rays have no camera: depth keys are of the first origin, and so are colors that are the same for all rays.
+            seen_from = o[0].detach() if len(o) else torch.zeros(3, dtype=torch.float64)
+            if self.coefficients > 1 and settings.sh_direction == "gaussian" and len(o):
+                if bool((o != seen_from).any()):
+                    raise ValueError(
+                        "render_rays: origins must be one and the same with SH of degree 1 to 3 and "
+                        "sh_direction='gaussian', which has one color for all rays, got several; use "
+                        "settings.replace(sh_direction='ray')"
+                    )
+                seen_from = o.mean(0)
+            pose = torch.cat([torch.eye(3, dtype=torch.float64), -seen_from.double()[:, None]], 1)
+            pose = torch.cat([pose, torch.eye(4, dtype=torch.float64)[3:]])
             self._set_rays(o - self.origin, d)
             return pose
         self.shape = (camera.height, camera.width)
@@ -187,15 +197,23 @@ class Call:
         if self.free:
             return self._set_free_rays(pose, local)
         if settings.traversal == "bvh" or settings.sh_direction == "ray":
-            d = (self.local_directions() if local is None else local) @ pose[:3, :3]
+            local_rays, known = self._local_rays_and_mask()
+            d = (local_rays if local is None else local) @ pose[:3, :3]
             center = -(pose[:3, 3] @ pose[:3, :3]) - self.origin
             self._set_rays(center.expand(d.shape), d)
+            if settings.traversal == "bvh":  # tiles know them by the lens
+                self._set_holes(unwrapped(known, lambda x: x.cpu().numpy()))
         return pose
+
+    def _set_holes(self, known: np.ndarray) -> None:
+        """Mark the pixels without a ray, by (P, 1) bool of those that have one."""
+        if not known.all():
+            self.holes = self.lib.UInt32(known[:, 0].astype(np.uint32))
 
     def _check_memory(self, gaussians, rays):
         """Refuse what cannot fit before anything is allocated for it."""
         camera = self.camera
-        pixels = torch.as_tensor(rays[1]).numel() // 3 if rays is not None else camera.width * camera.height
+        pixels = rays[1].numel() // 3 if rays is not None else camera.width * camera.height
         size = f"{pixels} rays" if rays is not None else f"an image of {camera.width}x{camera.height} pixels"
         width = 0 if gaussians.features is None else gaussians.features.shape[1]
         gradients = torch.is_grad_enabled() and any(x.requires_grad for x in gaussians.parameters().values())
@@ -251,8 +269,8 @@ class Call:
         # Where rays are is a number: lists have no derivative.
         seen_from = shifted(pose, self.origin).reshape(3, 4)
         o, d, known, seen_from = (unwrapped(x.detach(), lambda x: x.cpu().numpy()) for x in (o, d, known, seen_from))
-        if not known.all():
-            self.holes = self.lib.UInt32(known[:, 0].astype(np.uint32))
+        self._set_holes(known)
+        if self.holes is not None:
             d = np.where(known, d, np.nan)
         if self.settings.traversal == "tiles":
             self.table = FreeRays(self.lib, camera, TILE, o, d, seen_from, self.holes)
@@ -459,7 +477,7 @@ def checked_pixel_rays(x: torch.Tensor, camera: Camera) -> tuple[torch.Tensor, t
 
 
 def checked_rays(origins, directions, settings: RenderSettings) -> tuple[torch.Tensor, torch.Tensor]:
-    """Float64 tensors of rays that can be traced."""
+    """Float64 tensors of rays that can be traced, broadcast to one shape."""
     o, d = (numbers("render_rays", n, x) for n, x in (("origins", origins), ("directions", directions)))
     for name, x in (("origins", o), ("directions", d)):
         if x.ndim == 0 or x.shape[-1] != 3:
@@ -469,6 +487,13 @@ def checked_rays(origins, directions, settings: RenderSettings) -> tuple[torch.T
             at = tuple(bad.nonzero()[0].tolist())
             must = "finite" if name == "origins" else "finite and not 0"
             raise ValueError(f"render_rays: {name} must be {must}, got {x[at].tolist()} at index {list(at)}; drop them")
+    try:
+        o, d = torch.broadcast_tensors(o, d)
+    except RuntimeError:
+        raise ValueError(
+            "render_rays: origins and directions must have shapes that broadcast, got "
+            f"{tuple(o.shape)} and {tuple(d.shape)}; give one of each a ray, or one origin"
+        ) from None
     if settings.near > 0 or (settings.order == "center" and settings.depth_key == "z"):
         raise ValueError(
             "render_rays: near and depth_key='z' are about a camera's axis, rays have none, got "
