@@ -159,7 +159,8 @@ def rasterization(
         near_plane, far_plane: Means outside of (near_plane, far_plane] in camera z are left out, in distance with
             `with_eval3d` and `global_z_order=False`.
         radius_clip: Gaussians whose radius (`meta["radii"]`) is at most this many pixels in both axes are left out.
-        eps2d: Added to the diagonal of the projected covariance, in px^2.
+        eps2d: Added to the diagonal of the projected covariance, in px^2. Along rays nothing is; the boxes of `with_ut`
+            have 0.3.
         sh_degree: 0 to 3, or None for plain colors.
         backgrounds: (..., C, D) or None for black; behind a depth there is 0.
         render_mode: RGB; D (sum w z), ED (that over alpha), RGB+D, RGB+ED: the Gaussian's own depth as the last
@@ -187,8 +188,8 @@ def rasterization(
             W, E) on nothing; with `extra_signals_sh_degree` coefficients (N, K, E).
         preset: A preset's name or `RenderSettings`; None is gsplat's own, `gsplat`, or `3dgut` with `with_eval3d`. Of
             others than `gsplat`, `near_plane` and `eps2d` replace the preset's own constants only where they are not
-            gsplat's defaults; those without projected covariance (`exact`, `fast`) have no eps2d and no antialiased
-            mode, and the z of D is that of the peak on each ray.
+            gsplat's defaults, and its own depth key and culling hold; those without projected covariance (`exact`,
+            `fast`) have no eps2d and no antialiased mode, and the z of D is that of the peak on each ray.
     Returns:
         colors (..., C, H, W, X), alphas (..., C, H, W, 1), in the precision of `means`, and a dict: `radii` (..., C, N,
         2) int32 in pixels, 0 where a Gaussian is left out; `means2d` (..., C, N, 2), `depths` (..., C, N), `conics`
@@ -216,7 +217,7 @@ def rasterization(
         lidar_coeffs=lidar_coeffs is not None,
         external_distortion_coeffs=external_distortion_coeffs is not None,
         **{f"camera_model={name!r}": camera_model == name for name in ("ortho", "lidar")},
-        **{"with_ut without with_eval3d": with_ut and not with_eval3d and preset is None},
+        **{"with_ut without with_eval3d": with_ut and not with_eval3d},
     )
     _check_unscented(ut_params)
     if not near_plane < far_plane:
@@ -238,6 +239,8 @@ def rasterization(
     lead, count = check_shapes(
         "rasterization", means, quats, scales, opacities, shown, viewmats, Ks, sh_degree, checked_backgrounds
     )
+    _check_shape("backgrounds", backgrounds, (*lead, count, colors.shape[-1]))
+    _check_shape("viewmats_rs", viewmats_rs, (*lead, count, 4, 4))
     scales, opacities = inside("rasterization", scales, opacities)
     batches = math.prod(lead)
     if not batches or not count:
@@ -248,7 +251,7 @@ def rasterization(
     coefficients = radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs
     lenses = _lenses_of(camera_model, lead, count, *coefficients, Ks)
     _check_along_rays(settings, shutter != "global", bool(lenses[0][0]), rays, mode, return_normals)
-    _check_rays(rays, (*lead, count, height, width, 6))
+    _check_shape("rays", rays, (*lead, count, height, width, 6))
     extra = None if extra_signals is None else _expanded_to_batches(extra_signals, extra_signals_sh_degree, lead)
     _check_extra(extra, extra_signals_sh_degree, lead, count, means.shape[-2])
     options = _Options(
@@ -398,9 +401,7 @@ class _View:
         elif out.depth is not None:
             depth = out.depth[..., None]
             if mode.depth == "gaussian" and not self.options.settings.planar:
-                # Along the ray -> along the axis.
-                axis = torch.from_numpy(self.camera.local_directions()[..., 2:])
-                depth = depth * axis.to(depth)
+                depth = self._along_axis(depth, alpha)
             depth = depth if mode.expected else depth * alpha.clamp_min(EPS_ALPHA)
         if signals:
             meta["render_extra_signals"] = features[..., rest - signals : rest].to(splats.means.dtype)
@@ -413,6 +414,15 @@ class _View:
         if depth is not None:
             channels.append(depth)
         return torch.cat(channels, -1)
+
+    def _along_axis(self, depth: torch.Tensor, alpha: torch.Tensor) -> torch.Tensor:
+        """(H, W, 1) camera z of what is at a distance along each ray; 0 where nothing is."""
+        if self.rays is None:
+            return depth * torch.from_numpy(self.camera.local_directions()[..., 2:]).to(depth)
+        axis = rigid_pose(self.camera)[2].to(self.rays)
+        origins, directions = self.rays[..., :3], torch.nn.functional.normalize(self.rays[..., 3:], dim=-1)
+        z = (origins @ axis[:3] + axis[3])[..., None] + (directions @ axis[:3])[..., None] * depth
+        return torch.where(alpha > 0, z, 0).to(depth)
 
     def _means_in_camera(self) -> tuple[torch.Tensor, torch.Tensor]:
         """(N, 3) means in the axes of the camera whose depths count, and where colors are seen from, (3,)."""
@@ -558,9 +568,10 @@ def _check_along_rays(
             )
 
 
-def _check_rays(rays: torch.Tensor | None, shape: tuple[int, ...]) -> None:
-    if rays is not None and tuple(rays.shape) != shape:
-        raise ValueError(f"rasterization: rays must have shape {shape}, got {tuple(rays.shape)}")
+def _check_shape(name: str, x: torch.Tensor | None, shape: tuple[int, ...]) -> None:
+    """Raise ValueError for a tensor of another shape; None is none."""
+    if x is not None and tuple(x.shape) != shape:
+        raise ValueError(f"rasterization: {name} must have shape {shape}, got {tuple(x.shape)}; correct it")
 
 
 def _check_extra(
@@ -638,6 +649,8 @@ def _settings_of(
             settings = RenderSettings.preset("gsplat", depth_key=key, dilation=eps2d, near=near)
     else:
         settings = preset if isinstance(preset, RenderSettings) else RenderSettings.preset(preset)
+        if preset == "gsplat":
+            settings = settings.replace(depth_key="z" if by_z else "distance")
         if preset == "gsplat" or near != _NEAR:
             settings = settings.replace(near=near)
         if preset == "gsplat" or eps2d != _DILATION:

@@ -244,6 +244,32 @@ def test_no_ray_shows_the_background():
     torch.testing.assert_close(image[0, 3, 4], given["backgrounds"][0])
 
 
+@pytest.mark.parametrize("preset", ["exact", "fast"])
+def test_depth_of_rays_that_are_not_the_cameras(preset):
+    """Along parallel rays from the camera's plane the distance is z; where nothing is, both are 0."""
+    given = scene()
+    pose = given["viewmats"][0]
+    grid = torch.stack(torch.meshgrid(torch.arange(26), torch.arange(22), indexing="xy"), -1).double()
+    local = torch.cat([(grid - torch.tensor([13.0, 11.0])) / 3, torch.zeros(22, 26, 1, dtype=torch.float64)], -1)
+    center = -pose[:3, 3] @ pose[:3, :3]
+    ahead = pose[2, :3].expand(22, 26, 3)
+    rays = torch.cat([local @ pose[:3, :3] + center, 2 * ahead], -1)[None]
+    draw = lambda mode: drgs.rasterization(**given, rays=rays, preset=preset, render_mode=mode)  # noqa: E731
+    along, alpha, _ = draw("Ed")
+    assert float(alpha.max()) > 0.1
+    assert bool((alpha == 0).any())
+    torch.testing.assert_close(draw("ED")[0], along, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(draw("D")[0], draw("d")[0], rtol=1e-5, atol=1e-5)
+
+
+def test_the_order_of_a_named_preset():
+    """`gsplat` by its name sorts as the default does."""
+    given = scene()
+    plain = drgs.rasterization(**given, global_z_order=False)[0]
+    assert torch.equal(drgs.rasterization(**given, global_z_order=False, preset="gsplat")[0], plain)
+    assert not torch.equal(drgs.rasterization(**given, preset="gsplat")[0], plain)
+
+
 def test_arguments_of_speed_and_memory_change_nothing():
     """Tile size, renderer, packing and sorting: gsplat's business. So are boxes, but for what lies at their edges."""
     given = scene()
