@@ -44,11 +44,13 @@ class DrgsIntegrator(mi.ad.integrators.common.RBIntegrator):  # type: ignore[nam
 
     def __init__(self, props: Any) -> None:
         super().__init__(props)
-        fields = {"traversal": "bvh"}
+        fields: dict[str, Any] = {"traversal": "bvh"}
         preset = props.get("preset", "exact")
         for field in dataclasses.fields(RenderSettings):
             if field.name in props:
                 fields[field.name] = props[field.name]
+        if "background" in fields:  # Mitsuba makes a color of it
+            fields["background"] = tuple(float(x) for x in fields["background"])
         self.settings = RenderSettings.preset(preset, **fields)
         self.pose = None
 

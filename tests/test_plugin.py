@@ -49,7 +49,7 @@ def _load(g, cam, **integrator):
         {"preset": "fast"},
         {"preset": "exact", "response": "integral"},
         {"preset": "exact", "sh_direction": "ray"},
-        {"preset": "mitsuba"},
+        {"preset": "mitsuba", "background": [0.25, 0.5, 1.0]},
         {"preset": "exact", "near": 3.6, "order": "center", "depth_key": "z"},
     ],
     ids=str,
@@ -58,7 +58,7 @@ def test_the_center_of_a_pixel_is_what_render_shows(options):
     """A box filter and one sample at the center: the same image as `drgs.render`, for presets and single settings."""
     g, cam = _scene()
     image = np.array(mi.render(_load(g, cam, **options), spp=1))
-    fields = {name: x for name, x in options.items() if name != "preset"}
+    fields = {name: tuple(x) if isinstance(x, list) else x for name, x in options.items() if name != "preset"}
     settings = RenderSettings.preset(options["preset"], traversal="bvh", **fields)
     # Mitsuba's rays start on the near plane, one centimeter on; nothing is there.
     assert np.abs(image - drgs.render(g, cam, settings).rgb.numpy()).max() < 2e-5

@@ -140,6 +140,12 @@ def test_forks():
         assert "spawn" in line
 
 
+def test_a_child_of_a_child():
+    """It is forked without a word, too."""
+    done = _run("import os, drgs\nif not os.fork():\n    os.fork()\n")
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_backward_in_another_thread():
     """One that comes back, as torch's own for what is on a card, gets the gradients of the thread that has rendered."""
     with concurrent.futures.ThreadPoolExecutor(1) as pool:

@@ -203,7 +203,8 @@ class _Collector:
 
 def _after_fork() -> None:
     """A forked child waits for no computation: one that its parent was at never ends here."""
-    gc.callbacks.remove(_collector)
+    if _collector in gc.callbacks:  # not in a child of a child
+        gc.callbacks.remove(_collector)
     if _is_paused:
         gc.enable()
 

@@ -42,7 +42,7 @@ from drgs.tracing.walk import Part
 # relative rounding of the coordinates of a ray's origin: one unit in the last place of float32
 _ORIGIN_ROUNDING = 1.2e-7
 _GRAZING = 1e-7  # relative to (distance / radius)^2: what rounding takes from the discriminant, with a margin
-_FAR_RATIO = 4e3  # distance / radius from which float32 loses more than 1e-3 of a hit
+_FAR_RATIO = 4e3  # distance / radius of the extent from which float32 loses more than 1e-3 of a hit
 _MIN_RADIUS = 1e-3  # smallest proxy radius, relative to the distance it is traced over
 # primitives around an origin that are listed and tested by every ray before the tree is traced, where origins differ;
 # chosen
@@ -406,7 +406,7 @@ def _warn_of_rounding(ellipsoids: np.ndarray, alive: np.ndarray, origins: np.nda
     ratio = (np.sqrt((to * to).sum(0)) / np.maximum(middle, 1e-300))[alive]  # a scale may underflow to 0
     if (share := float((ratio > _FAR_RATIO).sum()) / max(len(ratio), 1)) > 0.01:
         warnings.warn(
-            f"render: traversal='bvh' must have Gaussians wider than 1/{_FAR_RATIO:g} of their distance in two axes, "
+            f"render: traversal='bvh' must have extents wider than 1/{_FAR_RATIO:g} of their distance in two axes, "
             f"got {share:.0%} thinner, down to 1/{ratio.max():.1g}; expect errors in their hits or use "
             "traversal='tiles'",
             stacklevel=2,

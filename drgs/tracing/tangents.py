@@ -20,7 +20,7 @@ def push_forward(call: Call, tangents: dict) -> Output:
     each = memory.TANGENT + 4 * call.width  # of the features only their images: a lower bound
     needed = memory.frame_bytes(call.pixels, call.settings.traversal, call.width) + each * call.pixels * len(columns)
     memory.require("render_jvp", needed, what, "take fewer at a time", call.home.type == "cuda")
-    if call.count == 0:
+    if call.count == 0 or not columns:
         still = call.output(call.nothing())
         images = {name: getattr(still, name) for name in ("rgb", "alpha", "depth", "features")}
         lead = (len(columns),) if batched else ()
