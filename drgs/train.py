@@ -39,7 +39,7 @@ from drgs.fitting.config import (
     SelectionConfig,
 )
 from drgs.fitting.errors import fit_errors, is_cheap
-from drgs.fitting.frames import Frame, frames_for, warn_of_late_cameras
+from drgs.fitting.frames import Frame, frames_for, measurable, warn_of_late_cameras
 from drgs.fitting.records import config_record, pick_seconds, seconds_of
 from drgs.fitting.renderers import renderers_to_measure
 from drgs.fitting.resolution import updates_of
@@ -202,7 +202,7 @@ def _fit(
     """`fit` in a run folder that is claimed: from the first Gaussians, or a checkpoint, to the metrics."""
     tensors, header = _checkpoint(run, plan) if resume else (None, None)
     setup.frames = plan.frames() if plan else frames_for(setup.train, setup.config.data)
-    setup.held_out = frames_for(setup.test, setup.config.data)
+    setup.held_out = measurable(frames_for(setup.test, setup.config.data), "fit")
     if not setup.frames:
         raise ValueError("fit: there must be at least one training view, got none; add photographs")
     if plan is None and tensors is None:
@@ -259,7 +259,7 @@ def _result_of(loop: _Loop) -> FitResult:
         bad_steps=trainer.bad_steps,
         renderers=metrics.through_renderers(
             trainer.scene(),
-            held_out or trainer.photographs(),
+            held_out or measurable(trainer.photographs(), "fit"),
             renderers_to_measure(config.renderers, config.settings, lenses=config.data.undistort == "off"),
             "test" if held_out else "train",
             metrics.most_views(config.max_steps) if held_out else metrics.TRAIN_VIEWS,
@@ -528,7 +528,7 @@ class _Loop:
     def _preview(self, bar: Bar, is_interrupted: Callable[[], bool]) -> None:
         """One picture, and the PSNR of all held-out views, unless the fit is interrupted."""
         trainer, done = self.trainer, self.trainer.step_index
-        frames = self.held_out or trainer.photographs()[:1]
+        frames = self.held_out or [frame for frame in trainer.photographs() if frame.is_measurable][:1]
         as_photograph = self.evaluation().get("as_photograph")
         values = []
         for i, frame in enumerate(frames):

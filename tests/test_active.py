@@ -586,6 +586,16 @@ def test_killed_run_picks_the_same_views(still, tmp_path, monkeypatch, policy, m
     assert not list((tmp_path / "b").rglob("*.tmp"))
 
 
+def test_a_resumed_run_still_says_what_it_began_with(still, tmp_path):
+    """Also once photographs have been picked."""
+    active = config(selection=plan())
+    began = fit(lazily(still), tmp_path / "run", active, progress=False).run.config()["train"]
+    again = fit(lazily(still), tmp_path / "run", active, resume=True, progress=False).run
+    assert again.config()["train"] == began
+    assert fitted_views(again)[:2] == began
+    assert len(fitted_views(again)) == 4
+
+
 def test_bad_resumes_are_refused(still, tmp_path):
     """Another policy, or all views instead, cannot continue an active run."""
     fit(lazily(still), tmp_path / "run", config(selection=plan()), progress=False)

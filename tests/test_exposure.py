@@ -14,7 +14,9 @@ from test_train import config, dataset  # noqa: F401 (a fixture)
 from drgs.cameras import orbit
 from drgs.data import load
 from drgs.files import load_state
+from drgs.fitting import start as starting
 from drgs.fitting.components import exposure as exposures
+from drgs.fitting.components.base import Setup
 from drgs.fitting.components.exposure import Exposure, Meter, exposure_network
 from drgs.fitting.evaluation import evaluate_run
 from drgs.fitting.exposures import estimate_exposure
@@ -198,6 +200,19 @@ def test_by_default_gains_are_tried_where_the_fit_is_long(tmp_path, monkeypatch,
     assert "exposure" not in short.config()
     assert short.config()["fit"]["data"]["exposure"] == "off"
     assert "--exposure auto" in capsys.readouterr().err
+
+
+def test_matches_of_the_first_time_are_not_those_of_all_photographs(dataset, monkeypatch):  # noqa: F811
+    """A fit of what stands still to views of several times makes initial points of the first time alone."""
+    made = np.random.default_rng(0).random((9, 3)), np.full((9, 3), 0.5, np.float32), "made for a test"
+    monkeypatch.setattr(starting, "initial_points", lambda *_: made)
+    for times in ((None,) * 9, (0.0,) * 9, (0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 2.0, 2.0, 2.0)):
+        cameras = [dataclasses.replace(view.camera, time=time) for view, time in zip(dataset.views, times, strict=True)]
+        views = [dataclasses.replace(view, camera=x) for view, x in zip(dataset.views, cameras, strict=True)]
+        bare = dataclasses.replace(dataset, views=views, points=None, colors=None)
+        setup = Setup(bare, config(dynamics="ignore"), views, [], views, (), ())
+        starting._rows_at_points(setup)
+        assert (setup.matches is None) == (len(set(times)) > 1)
 
 
 def test_a_meter_predicts_what_was_left_out():

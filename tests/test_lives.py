@@ -21,10 +21,14 @@ from drgs.dynamics.lifespans import LIFESPAN_PARAMETERS, Lifespans, is_limited, 
 from drgs.ellipsoids import Gaussians
 from drgs.files import load_state, save_state
 from drgs.fitting.appearing import NewGaussians, agreed_trajectories, find_new_gaussians
-from drgs.fitting.components.lifespans import REFERENCE_TIMES, LifetimeTerm
-from drgs.fitting.frames import load_frames
+from drgs.fitting.components import lifespans
+from drgs.fitting.components.exposure import Exposure
+from drgs.fitting.components.lifespans import REFERENCE_TIMES, LifespansComponent, LifetimeTerm
+from drgs.fitting.components.motion import WARM_UP
+from drgs.fitting.frames import Frame, load_frames
 from drgs.fitting.records import load_run
-from drgs.fitting.stages import shows_first_time, spacing
+from drgs.fitting.rows import GaussianRows
+from drgs.fitting.stages import dynamic_stage, shows_first_time, spacing
 from drgs.integrator import render, render_jvp
 from drgs.settings import RenderSettings
 from drgs.train import FitConfig, Trainer, fit
@@ -290,6 +294,20 @@ def test_exposure_is_nothing_that_moves(tmp_path):
     assert found[1] == 0
 
 
+def test_exposure_of_photographs_larger_than_what_is_compared():
+    """Gains of a fit reach a rendering that is smaller than the photograph, its mask and its alpha channel."""
+    still, frames = together(room(), ball(0.5, 0.0)), []
+    around = orbit((0, 0, 0), 3.0, 24, width=140, height=100, up=(0, 0, -1), elevation=60.0)[:3]
+    for seen, name in zip(around, "abc", strict=True):
+        seen = dataclasses.replace(seen, time=0.5, name=name)
+        picture = 0.6 * render(still, seen, FAST).rgb.clamp(0, 1)
+        whole = torch.ones(100, 140)
+        frames.append(Frame(name, seen, picture, whole, is_object=True, alpha=(255 * whole).to(torch.uint8)))
+    exposure = Exposure(list("abc"), np.full((3, 3), math.log(0.6)), learned=True)
+    found = find_new_gaussians(frames, still, FAST, 3.0, 500, torch.Generator().manual_seed(0), exposure)
+    assert not len(found.points)
+
+
 def test_places_of_a_thing_tell_how_it_goes_on():
     """A ball goes round in a circle; velocities of places on it are off by a quarter, and nothing is known of how they
     change. Places of its whole way agree on where it is twelve times later, to about half of its radius."""
@@ -433,6 +451,32 @@ def test_only_lives_that_other_times_confirm_are_lengthened():
     loss.backward()
     assert float(widths.grad[0]) == 0
     assert float(widths.grad[1]) == pytest.approx(-2 * 0.1 / 0.3 / 2)
+
+
+def test_the_search_is_made_once_and_says_what_was_added(monkeypatch):
+    """Also where photographs that join change when it is due, and where most places have no room."""
+    draw = torch.Generator().manual_seed(0)
+    points, one = torch.randn(5, 3, generator=draw), torch.ones(5)
+    still = {"velocities": torch.zeros(5, 3), "accelerations": torch.zeros(5, 3), "sizes": 0.1 * one}
+    places = NewGaussians(points, torch.full((5, 3), 0.5), 0.5 * one, confirmed=one, photographs=2, **still)
+    monkeypatch.setattr(lifespans, "find_new_gaussians", lambda *_: places)
+    how = config(max_gaussians=10)
+    stage = dynamic_stage(how)
+    frames = [SimpleNamespace(camera=SimpleNamespace(time=time)) for time in (0.0, 0.5, 1.0)]
+    component, part = LifespansComponent((0.0, 0.5, 1.0)), dict.fromkeys(("scene", "photographs"), list)
+    rows = GaussianRows.from_points(torch.randn(9, 3, generator=draw), torch.rand(9, 3, generator=draw), 0.8)
+    rows.add_tensor("motion", torch.zeros(9))  # as the field has added it
+    fit_of_these = SimpleNamespace(
+        config=how, frames=frames, rows=rows, step_index=stage.begin, reserved=0, extent=1.0, generator=draw,
+        as_photograph=None, components=[], **part,
+    )  # fmt: skip
+    (event,) = component.before_density(fit_of_these)
+    assert (event["found"], event["added"], event["gaussians"]) == (5, 1, 10)
+    assert "1 Gaussians with a limited lifetime are added, 4 more have no room" in component.describe(event)
+    fit_of_these.frames = [*frames[:1] * 3, *frames]
+    assert shows_first_time(fit_of_these.frames)
+    fit_of_these.step_index += round(WARM_UP * stage.length)
+    assert component.before_density(fit_of_these) == []
 
 
 def test_time_between_photographs():

@@ -14,7 +14,7 @@ import torch
 from scenes_random import gaussians
 
 import drgs
-from drgs.cameras import orbit
+from drgs.cameras import Camera, intrinsics, orbit
 from drgs.planner import Planner, default_config
 from drgs.select import Refine, Scoring, select
 
@@ -270,6 +270,17 @@ def test_a_model_of_its_own(world):
     ]
     assert error[1] < error[0] / 2
     assert planner.fit(seconds=0) == 0
+
+
+def test_a_surface_that_is_there_gets_no_points_again():
+    """At the sides of a wide picture a wall is farther along the ray than its depth, and yet where the map says."""
+    seen = Camera(intrinsics(20.0, 20.0, 20.0, 15.0), np.eye(4), 40, 30, name="a")
+    wall, depth = np.full((30, 40, 3), 128, np.uint8), np.full((30, 40), 2.0)
+    planner = Planner(config(max_gaussians=4000, max_pixels=1200, max_steps=1000))
+    first = planner.observe(wall, seen, depth)
+    assert first > 800
+    planner.fit(steps=20)  # until nothing is open any more
+    assert planner.observe(wall, dataclasses.replace(seen, name="b"), depth) < 0.05 * first
 
 
 def test_without_depth_two_photographs_are_needed(world):

@@ -12,6 +12,7 @@ import pytest
 import torch
 from scenes_random import gaussians
 from test_active import write_still
+from test_data import write_image
 
 import drgs
 from drgs import cli, fisher
@@ -152,6 +153,15 @@ def test_fitting_on_repairs(tmp_path):
     there = fit_on(spoiled.replace(origin=shift), moved, config, 30)
     assert np.array_equal(there.origin, shift)
     torch.testing.assert_close(there.means, better.means, rtol=1e-3, atol=1e-3)
+
+
+def test_fitting_on_adds_no_noise(tmp_path, monkeypatch):
+    """A run that was fitted with exploration noise is made better, not explored."""
+    g = write_still(tmp_path)
+    frames = load_frames(load(tmp_path).views, 10_000, mask="ignore")
+    monkeypatch.setattr("drgs.fitting.trainer.explore", lambda *_: pytest.fail("noise is added"))
+    config = FitConfig(renderers=("fast",), settings=FAST).replace(noise=5e5)
+    assert len(fit_on(g, frames, config, 2)) == len(g)
 
 
 def test_fitting_on_keeps_to_exposures(tmp_path):
@@ -361,6 +371,24 @@ def test_command_by_views_that_show_nothing(place, monkeypatch, capsys):
     assert cli.main(["prune", "scene.ply", "--data", "away.json", "--keep", "0.5", "-o", "no.ply", "--quiet"]) == 2
     assert "the 5 given ones show nothing; check that they are of this scene" in capsys.readouterr().err
     assert not (place / "no.ply").exists()
+
+
+def test_command_by_photographs_whose_mask_keeps_nothing(place, monkeypatch, capsys, caplog):
+    """They are left out, held out or not, and named; with these alone there is nothing to go by."""
+    monkeypatch.chdir(place)
+    shutil.copytree("data", "masked")
+    for name in ("0", "1"):  # held out, and not
+        write_image(place / f"masked/masks/{name}.png", np.zeros((24, 24), np.uint8))
+    line = ["prune", "run", "--data", "masked", "--quiet", "-o", "masked.ply"]
+    assert cli.main([*line, "--keep", "0.5"]) == 0
+    record = json.loads((place / "masked.json").read_text())
+    assert "1" not in record["views"]["names"]
+    assert all(math.isfinite(x) for x in record["psnr"]["fast"].values())
+    assert "prune: masks must keep at least one pixel, those of 1 of" in caplog.text
+    for path in (place / "masked/masks").iterdir():
+        write_image(path, np.zeros((24, 24), np.uint8))
+    assert cli.main([*line, "--keep", "0.5"]) == 2
+    assert "masked: must hold a training view whose mask keeps a pixel" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -137,6 +137,16 @@ def test_pictures_are_made_once_a_size_and_then_dropped(rng):
     assert Resolution(0, 12).resized(0, frames[0], 0) is frames[0]
 
 
+def test_small_pictures_are_those_of_their_camera_once_a_photograph_is_dropped(dataset):  # noqa: F811
+    """Indices of those behind it change."""
+    made = trainer_of(dataset, config(num_downscales=1))
+    for i, frame in enumerate(made.frames):
+        made.resolution.resized(i, frame, 0)
+    made.drop_frame(made.frames[1].name)
+    kept = made.resolution.resized(1, made.frames[1], 0)
+    assert torch.equal(kept.pixels, Resolution(1, 60).resized(0, made.frames[1], 0).pixels)
+
+
 def test_a_step_has_several_updates_until_it_sees_whole_photographs(rng):
     """Small ones in the first half, quarters until 0.8 of the steps; with one update a step there are no quarters."""
     schedule, frames = Resolution(1, 20, 3), [photograph(101, 75, rng)]

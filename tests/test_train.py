@@ -131,6 +131,31 @@ def test_eval_command_repeats_the_metrics(dataset, tmp_path, monkeypatch, capsys
     assert (again["split"], again["count"]) == ("train", 7)
 
 
+def test_photographs_whose_mask_keeps_nothing_are_not_compared(dataset, tmp_path, monkeypatch, caplog):
+    """A fit and `drgs eval` leave them out and name them, where they are held out and where nothing else is."""
+    from drgs.commands.options import Eval
+
+    write_png(tmp_path / "black.png", np.zeros((SIZE, SIZE, 3), np.float32))
+    black = {"mask_path": tmp_path / "black.png"}
+    views = [View(**{**vars(v), **(black if v.name in ("0", "1") else {})}) for v in dataset.views]
+    made = Dataset(dataset.path, "transforms", views, dataset.points, dataset.colors, "made for a test")
+    result = fit(made, tmp_path / "run", config(max_steps=2), progress=False)
+    assert "fit: masks must keep at least one pixel, those of 1 of 2 views keep none (0);" in caplog.text
+    assert [view["name"] for view in result.metrics["views"]] == ["8"]
+    assert result.run.config()["test"] == ["0", "8"]
+    monkeypatch.setattr("drgs.data.load", lambda path, **_: made)
+    for split, count in (("train", 6), ("test", 1)):
+        run_eval(Eval(run=tmp_path / "run", split=split))
+        assert json.loads((tmp_path / "run" / "metrics.json").read_text())["count"] == count
+    views[8] = View(**{**vars(views[8]), **black})
+    with pytest.raises(ValueError, match="eval: split test must hold a view whose mask keeps a pixel, the 2 masks"):
+        run_eval(Eval(run=tmp_path / "run"))
+    alone = Dataset(dataset.path, "transforms", views[:3], dataset.points, dataset.colors, "made for a test")
+    result = fit(alone, tmp_path / "alone", config(max_steps=2, test_every=0), progress=False)
+    assert [view["name"] for view in result.metrics["renderers"]["rows"][0]["views"]] == ["2"]
+    assert "those of 2 of 3 views keep none (0, 1);" in caplog.text
+
+
 @pytest.mark.same_bits
 def test_resumed_run_equals_an_uninterrupted_one(dataset, tmp_path, monkeypatch, two_threads):
     """With `deterministic`, interrupting at step 33 and resuming gives the same PLY, bit for bit."""

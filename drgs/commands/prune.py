@@ -24,7 +24,7 @@ from drgs.ellipsoids import Gaussians, Scene
 from drgs.fitting.components.base import Checkpoint, Component, RunViews
 from drgs.fitting.components.table import COMPONENTS, component_files, held_components
 from drgs.fitting.config import FitConfig
-from drgs.fitting.frames import Frame, load_frames
+from drgs.fitting.frames import Frame, load_frames, measurable
 from drgs.fitting.metrics import TRAIN_VIEWS, through_renderers
 from drgs.fitting.networks import saved_networks
 from drgs.fitting.records import fitted_views, is_run, of_some
@@ -232,10 +232,15 @@ class _Views:
             for view in views:
                 view.background = given.background  # behind photographs with an alpha channel
             pixels = args.max_pixels or config.max_pixels
-            return load_frames(views, pixels, config.mask, "off" if lenses else "on")
+            return measurable(load_frames(views, pixels, config.mask, "off" if lenses else "on"), "prune")
 
         with Bar("photographs", show=not args.quiet):
             seen, held_out = frames(train), frames(test)
+        if not seen:
+            raise ValueError(
+                f"{text}: must hold a training view whose mask keeps a pixel, its {len(train)} masks keep none; mend "
+                "them, or name another set"
+            )
         return cls([frame.camera for frame in seen], seen, held_out, text, source)
 
     def measured(

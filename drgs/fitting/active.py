@@ -392,9 +392,7 @@ class ActiveViews:
             return choose(self.active.policy, pool)
 
         def photographs(folder: Path) -> tuple[list[torch.Tensor], list[Camera]]:
-            lenses = self._config.data.undistort == "off"
-            seen = [dataclasses.replace(self.views[i], keeps_lens=lenses) for i in self.chosen]
-            return masked_photographs(folder, seen, list(pool.train), "active")
+            return masked_photographs(folder, [self.views[i] for i in self.chosen], list(pool.train), "active")
 
         text = RegionText.of(self.active.region, "active")
         try:

@@ -27,6 +27,7 @@ from drgs.cameras.sizes import reduced_size
 from drgs.display.progress import Bar
 from drgs.ellipsoids import Scene, colors_only
 from drgs.fitting.depths import renders_z
+from drgs.fitting.resolution import averaged
 from drgs.fitting.stages import spacing
 from drgs.integrator import Output, render
 
@@ -287,12 +288,15 @@ def _compared(
     """A photograph beside its rendering, and the pixels whose depth is to be searched."""
     width, height = reduced_size(frame.camera, _PIXELS)
     camera = frame.camera.resized(width, height)
+    image = _reduced(frame)
     with torch.no_grad():  # compared, not optimized
         out = render(colors_only(scene, camera.time), camera, settings, outputs=("depth",))
         if shown is not None:
-            out = shown(out, frame)
+            # What exposure does to a pixel depends on the photograph's, so that both have one size.
+            mask, alpha = (None if x is None else averaged(x, (width, height)) for x in (frame.mask, frame.alpha))
+            small = dataclasses.replace(frame, camera=camera, pixels=image.permute(1, 2, 0), mask=mask, alpha=alpha)
+            out = shown(out, small)
     rgb = out.rgb.cpu().clamp(0, 1).permute(2, 0, 1)
-    image = _reduced(frame)
     assert out.depth is not None  # an output of this rendering
     assert camera.time is not None  # a fit to what moves
     distance = torch.where(out.alpha.cpu() > _SOLID, out.depth.cpu(), torch.inf)

@@ -9,7 +9,7 @@ from drgs.cameras.sizes import reduced_size
 from drgs.display.pictures import file_names
 from drgs.fitting.components.base import RunViews
 from drgs.fitting.components.table import COMPONENTS
-from drgs.fitting.frames import Frame, frames_for, load_dataset
+from drgs.fitting.frames import Frame, frames_for, load_dataset, measurable
 from drgs.fitting.metrics import VIEW_PICTURES, Lpips, evaluate, through_renderers, write_metrics
 from drgs.fitting.near_planes import warn_of_near_planes
 from drgs.fitting.records import FitRecord, LoadedRun, fit_record, fitted_views, load_run
@@ -62,7 +62,12 @@ def evaluate_run(
     views = {"test": test, "train": train, "all": train + test}[split]
     if not views:
         raise ValueError(f"eval: split {split} must hold a view, holds none ({dataset.split_rule()}); use --split")
-    frames = frames_for(views, config.data, _most_pixels(views, config.data.max_pixels, scale))
+    frames = measurable(frames_for(views, config.data, _most_pixels(views, config.data.max_pixels, scale)), "eval")
+    if not frames:
+        raise ValueError(
+            f"eval: split {split} must hold a view whose mask keeps a pixel, the {len(views)} masks keep none; mend "
+            "them, or use --split"
+        )
     _check_pictures(output, recorded, split, frames)
     known = RunViews(
         scene,

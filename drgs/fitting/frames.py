@@ -73,6 +73,11 @@ class Frame:
         """`image`, black outside the mask."""
         return self.image() if self.mask is None else self.image() * self.mask[..., None]
 
+    @property
+    def is_measurable(self) -> bool:
+        """Whether its mask keeps a pixel; one whose mask keeps none has no PSNR."""
+        return self.mask is None or bool((self.mask > 0).any())
+
     def empty(self) -> torch.Tensor | None:
         """(H, W) float32 in [0, 1], how much of each pixel is known to show nothing; None if that is not known."""
         shown = self.mask if self.is_object else None
@@ -119,6 +124,25 @@ def frames_for(views: list[View], data: DataConfig, max_pixels: int | None = Non
         max_pixels: Pixels of one image at most, if others than those of the fit.
     """
     return load_frames(views, max_pixels or data.max_pixels, data.mask, data.undistort)
+
+
+def measurable(frames: list[Frame], where: str) -> list[Frame]:
+    """The photographs whose mask keeps a pixel; a warning names the others.
+
+    Args:
+        frames: Photographs that something is to be compared with.
+        where: Who compares, for the warning.
+    """
+    if empty := [frame.name for frame in frames if not frame.is_measurable]:
+        _log.warning(
+            "%s: masks must keep at least one pixel, those of %d of %d views keep none (%s); they are not compared "
+            "with anything, mend the masks or drop these views",
+            where,
+            len(empty),
+            len(frames),
+            ", ".join(empty),
+        )
+    return [frame for frame in frames if frame.is_measurable]
 
 
 def warn_of_late_cameras(dataset: Dataset, frames: list[Frame]) -> None:

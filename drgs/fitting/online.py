@@ -22,6 +22,7 @@ from drgs.data.camera_layout import scene_extent, scene_origin
 from drgs.data.resampling import resize_area
 from drgs.ellipsoids import Gaussians
 from drgs.fitting.config import FitConfig
+from drgs.fitting.depths import axis_cosines, renders_z
 from drgs.fitting.frames import Frame
 from drgs.fitting.records import check_checkpoint
 from drgs.fitting.rows import GaussianRows
@@ -189,7 +190,10 @@ class OnlineFit:
         with torch.no_grad():
             out = render(self.trainer.gaussians(), seen, self.config.settings, outputs=("median_depth",))
         assert out.median_depth is not None  # an output of this rendering
-        alpha, known = (resize_area(x.cpu().numpy(), *depth.shape[::-1]) for x in (out.alpha, out.median_depth))
+        z = out.median_depth.cpu()
+        if not renders_z(self.config.settings):
+            z = z * axis_cosines(seen)
+        alpha, known = (resize_area(x.numpy(), *depth.shape[::-1]) for x in (out.alpha.cpu(), z))
         wanted = (alpha < _OPEN_OPACITY) | ((depth > 0) & (depth < (1 - _BEHIND) * known))
         share = wanted.mean()
         most = min(self._room(), int(share * _BUDGET_SHARE * self.config.density.max_gaussians))

@@ -283,7 +283,7 @@ def fit_on(
     rows = GaussianRows({**parameters, "sh_dc": dc, "sh_rest": rest}, gaussians.origin)
     rows.far = far
     done = round(steps * _BEGUN / (1 - _BEGUN))
-    fixed = dataclasses.replace(config.density, refine_start=1.0, refine_stop=1.0)  # as many rows as there are
+    fixed = dataclasses.replace(config.density, refine_stop=0.0)  # as many rows as there are, and no noise
     config = config.replace(max_steps=done + steps, density=fixed, sh_degree=gaussians.sh_degree)
     extent = scene_extent([frame.camera for frame in frames])
     trainer = Trainer(config, list(frames), rows, extent, list(components))

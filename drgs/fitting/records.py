@@ -310,16 +310,16 @@ def config_record(
         before: Contents of config.json of a fit that is resumed; else empty.
         begin: Checkpoint whose Gaussians it begins with.
     """
-    dataset, data, frames, held_out = setup.dataset, trainer.config.data, setup.frames, setup.held_out
+    dataset, data, frames = setup.dataset, trainer.config.data, setup.frames
     recorded: dict[str, Any] = {
         "schema": CONFIG_SCHEMA,
         "command": "fit",
         "data": str(Path(dataset.path).resolve()),
         "format": dataset.format,
         "split_rule": dataset.split_rule(data.test_every, data.test_offset, data.test_cameras),
-        "train": [frame.name for frame in frames],
-        "test": [frame.name for frame in held_out],
-        "size": sorted({(f.camera.width, f.camera.height) for f in frames + held_out}),
+        "train": plan.names[: len(plan.timetable.start)] if plan else [frame.name for frame in frames],
+        "test": [view.name for view in setup.test],  # also those whose mask keeps nothing, which are not measured
+        "size": sorted({(f.camera.width, f.camera.height) for f in frames + setup.held_out}),
         "masks": sorted({kind for frame in frames for kind in _mask_kinds(frame)}),
         "points": source,
         **({"origin": trainer.rows.origin.tolist()} if trainer.rows.origin.any() else {}),

@@ -56,11 +56,7 @@ _LEAST = 11  # pixels of the shorter side: the window of SSIM (losses.py) is as 
 
 
 class Resolution:
-    """How many updates a step has, and what each sees of its photograph.
-
-    Attributes:
-        num_downscales: How many times photographs are halved at the start.
-    """
+    """How many updates a step has, and what each sees of its photograph."""
 
     def __init__(self, num_downscales: int, max_steps: int, updates: int = 1) -> None:
         """
@@ -69,7 +65,6 @@ class Resolution:
             max_steps: Steps of the fit.
             updates: Updates of a step that does not see whole photographs.
         """
-        self.num_downscales = num_downscales
         self._updates = updates
         self._ends = [round(FULL * max_steps * (k + 1) / num_downscales) for k in range(num_downscales)]
         self._parts_end = round(WHOLE * max_steps) if updates > 1 else 0
@@ -144,8 +139,8 @@ class Resolution:
         if size == (frame.camera.width, frame.camera.height):
             return frame
         if index not in self._kept:
-            mask, alpha = (None if x is None else _averaged(x, size) for x in (frame.mask, frame.alpha))
-            self._kept[index] = _averaged(frame.pixels, size), mask, alpha
+            mask, alpha = (None if x is None else averaged(x, size) for x in (frame.mask, frame.alpha))
+            self._kept[index] = averaged(frame.pixels, size), mask, alpha
         pixels, mask, alpha = self._kept[index]
         return dataclasses.replace(
             frame,
@@ -154,7 +149,7 @@ class Resolution:
             mask=mask,
             alpha=alpha,
             # Made anew each time: what is transient changes on the way.
-            transient=None if frame.transient is None else _averaged(frame.transient.float(), size) > 0,
+            transient=None if frame.transient is None else averaged(frame.transient.float(), size) > 0,
         )
 
 
@@ -213,6 +208,6 @@ def _quarter(frame: Frame, generator: torch.Generator) -> Frame:
     return dataclasses.replace(frame, camera=camera, pixels=pixels, mask=mask, alpha=alpha, transient=transient)
 
 
-def _averaged(values: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+def averaged(values: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     """(H, W) or (H, W, C) values at a smaller (width, height), of the same type."""
     return torch.from_numpy(resize_area(values.numpy(), *size))

@@ -24,8 +24,6 @@ def run_files() -> tuple[str, ...]:
     return *before, "point_cloud.ply", "errors.safetensors", "report.html", *_CHECKPOINTS
 
 
-"""What a fit writes into its run folder, besides `renders/`."""
-
 _log = logging.getLogger(__name__)
 
 

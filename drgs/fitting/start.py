@@ -19,7 +19,7 @@ from drgs.fitting.rows import GaussianRows
 from drgs.fitting.trainer import Trainer
 from drgs.io.checkpoint import load_state
 from drgs.sfm.guided import Matches
-from drgs.sfm.points import initial_points
+from drgs.sfm.points import at_first, initial_points
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -81,7 +81,9 @@ def _rows_at_points(setup: Setup) -> tuple[GaussianRows, str]:
             None if is_active else seen,
         )
         bar.note(f"{len(points)} initial points: {source}")
-    setup.points, setup.matches = points, None if given else matches
+    # Who goes on with matches takes their pictures for the first of all views, which those of one time need not be.
+    is_of_all = not given and len(at_first(seen)) == len(setup.views)
+    setup.points, setup.matches = points, matches if is_of_all else None
     dense = not given and any(view.depth_path is not None for view in seen)
     kind = config.density.start_of(dense)
     made = GaussianRows.from_points(torch.from_numpy(points), torch.from_numpy(colors), *kind, dataset.origin)

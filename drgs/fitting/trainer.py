@@ -209,6 +209,7 @@ class Trainer:
         if not left or len(left) == len(self.frames):
             raise ValueError(f"fit: {name!r} must be one of two photographs or more, is not; keep it")
         self.frames = left
+        self.resolution = Resolution.of(self.config)  # small photographs are kept by their index
         self._queue = self._queue[:0]
         self._changed()
 

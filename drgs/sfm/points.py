@@ -27,6 +27,7 @@ from drgs.sfm.proposals import (
 
 __all__ = [
     "added_points",
+    "at_first",
     "initial_points",
     "matched_points",
     "shared_points",
@@ -78,9 +79,9 @@ def initial_points(
     """
     rng = np.random.default_rng(seed)
     if isinstance(data, Dataset):
-        views = _at_first(data.split()[0] if data.camera_names else data.views)  # not of cameras that are held out
+        views = at_first(data.split()[0] if data.camera_names else data.views)  # not of cameras that are held out
     else:
-        views = _at_first(list(data))
+        views = at_first(list(data))
     if not views:
         raise ValueError("initial_points: there must be at least one view, got none; pass the training views")
     if isinstance(data, Dataset) and data.points is not None and len(data.points):
@@ -248,7 +249,7 @@ def triangulated_count(views: list[View], matches: Matches, progress: Progress |
     return len(_triangulated(views, matches, progress).points)
 
 
-def _at_first(views: list[View]) -> list[View]:
+def at_first(views: list[View]) -> list[View]:
     """Those at the first time, if there are several times and these views are from several places; else all."""
     times = sorted({view.camera.time for view in views if view.camera.time is not None})
     if len(times) < 2:

@@ -87,7 +87,8 @@ class Setup:
         frames, held_out: Photographs of the views that are fitted to at the start, and of `test`, once decoded.
         reserved: Gaussians of the budget that components will add at the start.
         points: (P, 3) initial points, world, once there are some.
-        matches: Matches between photographs for the initial points; None where none were made.
+        matches: Matches between the photographs of `views` for the initial points; None where none were made, or of
+            some of these alone.
         picked_points: Of an active fit, `ActiveViews.compared_points`.
     """
 

@@ -461,7 +461,7 @@ def _trial(fit: Fit, views: list[View], estimate: ExposureEstimate) -> float:
     """
     config = fit.config
     frames = frames_for(views, config.data, min(_TRIAL_PIXELS, config.data.max_pixels))
-    held_out = frames[_TRIAL_EVERY // 2 :: _TRIAL_EVERY]
+    held_out = [frame for frame in frames[_TRIAL_EVERY // 2 :: _TRIAL_EVERY] if frame.is_measurable]
     rest = [row for row in range(len(frames)) if row % _TRIAL_EVERY != _TRIAL_EVERY // 2]
     if not held_out:
         return 0.0

@@ -82,7 +82,7 @@ class LifespansComponent(Component):
         Where the static stage was fitted to all times it shows nothing that moves, and this is at once. Where it shows
         the first time, the field may carry what it shows to the others, and is given the time for it.
         """
-        if not self.times:
+        if not self.times or REFERENCE_TIMES in fit.rows.tensors:
             return []
         stage = dynamic_stage(fit.config)
         wait = WARM_UP if shows_first_time(fit.frames) else 0.0
@@ -95,11 +95,12 @@ class LifespansComponent(Component):
             fit.photographs(), fit.scene(), fit.config.settings, fit.extent, most, fit.generator, fit.as_photograph
         )
         self._use(fit)
-        add_new_gaussians(fit.rows, new, self.times, _CLOSED_LOGIT, fit.config.density.max_gaussians)
+        added = add_new_gaussians(fit.rows, new, self.times, _CLOSED_LOGIT, fit.config.density.max_gaussians)
         return [
             {
                 "event": "births",
                 "found": len(new.points),
+                "added": added,
                 "photographs": new.photographs,
                 "of": len(fit.frames),
                 "gaussians": len(fit.rows),
@@ -142,9 +143,11 @@ class LifespansComponent(Component):
             return None
         if not event["found"]:
             return "photographs agree with the scene at their times: no Gaussian with a limited lifetime is added"
+        without = event["found"] - event["added"]
+        left = f", {without} more have no room (more --max-gaussians gives it)" if without else ""
         return (
             f"{event['photographs']} of {event['of']} photographs show what is not there at most times: "
-            f"{event['found']} Gaussians with a limited lifetime are added (--lives off: none)"
+            f"{event['added']} Gaussians with a limited lifetime are added{left} (--lives off: none)"
         )
 
     @classmethod
@@ -222,7 +225,7 @@ def lifespan_rates(config: FitConfig, times: Sequence[float], length: float) -> 
     }
 
 
-def add_new_gaussians(rows: GaussianRows, places: NewGaussians, times: Sequence[float], gate: float, most: int) -> None:
+def add_new_gaussians(rows: GaussianRows, places: NewGaussians, times: Sequence[float], gate: float, most: int) -> int:
     """Add Gaussians with a limited lifetime; where there are `most` already, they take the place of the faintest.
 
     Args:
@@ -231,10 +234,12 @@ def add_new_gaussians(rows: GaussianRows, places: NewGaussians, times: Sequence[
         times: Times of all photographs, sorted.
         gate: Logit of the gates of those that are added.
         most: How many Gaussians there may be.
+    Returns:
+        How many are added: fewer than there are places where neither room nor faint Gaussians are left.
     """
     count = len(places.points)
     if not count:
-        return
+        return 0
     if REFERENCE_TIMES not in rows.tensors:
         for name, x in _unlimited(len(rows), times).items():
             rows.add_tensor(name, x)
@@ -248,6 +253,7 @@ def add_new_gaussians(rows: GaussianRows, places: NewGaussians, times: Sequence[
     taken = faint[: count - room]
     rows.overwrite(taken, {name: x[room : room + len(taken)] for name, x in new.items()})
     rows.append({name: x[:room] for name, x in new.items()})
+    return room + len(taken)
 
 
 def _rows_at(places: NewGaussians, times: Sequence[float], gate: float) -> dict[str, torch.Tensor]:

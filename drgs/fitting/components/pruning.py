@@ -63,8 +63,7 @@ class PruningComponent(Component):
         end = stage.begin + fit.config.density.refine_stop * stage.length
         if not loss or self.counts or stage.end < fit.config.max_steps or fit.step_index < end:
             return []
-        # A photograph whose mask keeps nothing has no PSNR.
-        photographs = [x for x in fit.photographs() if x.mask is None or bool((x.mask > 0).any())]
+        photographs = [frame for frame in fit.photographs() if frame.is_measurable]
         chosen = np.linspace(0, len(photographs) - 1, min(_PHOTOGRAPHS, len(photographs))).round().astype(int)
         frames = [photographs[i] for i in chosen]
         images, masks = [frame.image() for frame in frames], [frame.mask for frame in frames]
