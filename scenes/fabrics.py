@@ -104,7 +104,7 @@ def spines(rng, count=64, height=256, each=32):
 
 
 def art(rng, kind, height=256, width=320):
-    """A painting: hills under a sun, shapes, or a flower."""
+    """A painting (height, width, 3) by the name of its kind: hills (under a sun), shapes, or flower (seven of them)."""
     import cv2
 
     y = np.linspace(0, 1, height)[:, None].repeat(width, 1)

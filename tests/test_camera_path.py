@@ -231,8 +231,9 @@ def test_poses_as_matrices(tmp_path):
     np.testing.assert_allclose(camera.w2c, w2c, atol=1e-12)
 
 
-def test_camera_paths_of_nerfstudio(tmp_path):
-    """OpenGL axes, 16 numbers, vertical fields of view: one keyframe a camera, one frame each."""
+def test_camera_paths_of_nerfstudio(tmp_path, caplog):
+    """OpenGL axes, 16 numbers, vertical fields of view: one keyframe a camera, one frame each; of panoramas, a line."""
+    caplog.set_level("INFO", "drgs")
     poses = [np.linalg.inv(look_at((np.sin(a), 0.2, np.cos(a)), (0, 0, 0), (0, 1, 0))) for a in (0, 0.2, 0.4)]
     path = {
         "camera_type": "perspective",
@@ -253,6 +254,10 @@ def test_camera_paths_of_nerfstudio(tmp_path):
     cameras = flight.cameras(3, 96, 54)
     for camera, pose in zip(cameras, poses, strict=True):
         np.testing.assert_allclose(camera.c2w, pose, atol=1e-9)
+    assert not caplog.messages
+    (tmp_path / "path.json").write_text(json.dumps(path | {"camera_type": "equirectangular"}))
+    assert read_camera_path(tmp_path / "path.json").frame_count(30.0) == 3
+    assert "path.json: is of panoramas, add --panorama" in caplog.text
     path["camera_path"][1]["camera_to_world"] = path["camera_path"][1]["camera_to_world"][:12]
     (tmp_path / "path.json").write_text(json.dumps(path))
     with pytest.raises(ValueError, match=r"camera_path\[1\]: camera_to_world must hold 16 numbers, got 12") as error:
@@ -299,7 +304,7 @@ def test_camera_paths_of_nerfstudio(tmp_path):
         ),
         (
             {"camera_path": [{}], "render_height": 2, "render_width": 2, "camera_type": "fisheye"},
-            "camera_type must be perspective, got 'fisheye'",
+            "camera_type must be perspective or equirectangular, got 'fisheye'",
         ),
     ],
 )

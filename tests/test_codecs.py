@@ -166,6 +166,20 @@ def test_an_spz_for_antialiased_rasterization_is_named(tmp_path, caplog):
     assert not caplog.messages
 
 
+def test_a_sog_for_antialiased_rasterization_is_named(tmp_path, rng, caplog):
+    """By what its meta.json says; what is written says it is not."""
+    meta, images, _ = sog_scene(rng, version=2, degree=1)
+    for antialias in (False, True):
+        caplog.clear()
+        (tmp_path / "a.sog").write_bytes(encode.zipped(encode.sog_files(meta | {"antialias": antialias}, images)))
+        g = load_gaussians(tmp_path / "a.sog")
+        assert caplog.text.count("a.sog: was fitted by antialiased rasterization") == antialias
+    caplog.clear()
+    save_gaussians(g, tmp_path / "b.sog")
+    load_gaussians(tmp_path / "b.sog")
+    assert not caplog.messages
+
+
 def test_what_is_said_of_files_for_antialiased_rasterization():
     """A Gaussian of a tenth of a pixel has over 10 times the alpha in gsplat that is meant, summed (measured: 33)."""
     camera = drgs.cameras.orbit((0, 0, 0), 2.0, 1, width=32, height=32)[0]

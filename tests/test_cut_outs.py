@@ -1,5 +1,6 @@
 """Claims of photographs that are cut out, by masks or an alpha channel: what is outside, and what is behind."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -75,7 +76,8 @@ def discs(folder, ground):
 
 def test_edges_say_what_photographs_were_cut_out_of(tmp_path):
     """Half-transparent pixels that are clearly mixed with black or white decide, before the layout; those of the
-    object's own color and those mixed with gray leave it to the layout, and without alpha nothing is said.
+    object's own color and those mixed with gray leave it to the layout, also of a file that is named, and without alpha
+    nothing is said.
     """
     grounds = {"own": (None, "white, as"), "gray": (0.5, "white, as")}
     grounds |= {"black": (0.0, "black, which half"), "white": (1.0, "white, which half")}
@@ -86,6 +88,9 @@ def test_edges_say_what_photographs_were_cut_out_of(tmp_path):
         assert reason.startswith(said), name
         assert color == (float("white" in reason),) * 3
         assert default_background(data, lazy=True)[1].startswith("white, as")  # opens no photograph
+        for file, said_of_file in (("transforms_train.json", "white, as"), ("transforms.json", "black")):
+            named = dataclasses.replace(data, path=tmp_path / name / file)
+            assert default_background(named, lazy=True)[1].startswith(said_of_file)
         (tmp_path / name / "transforms.json").touch()  # another layout
         assert default_background(data, lazy=True) == ((0.0, 0.0, 0.0), "black")
     write_still(tmp_path / "opaque")

@@ -11,6 +11,7 @@ import pytest
 
 from drgs.cameras import Camera, c2w_to_opengl, intrinsics, look_at
 from drgs.data import Dataset, View, load, scene_extent
+from drgs.data.masks import read_mask
 
 pytestmark = pytest.mark.core
 
@@ -191,6 +192,18 @@ def test_transforms_with_masks_and_depth(tmp_path):
     np.testing.assert_array_equal(view.mask(12, 8), np.repeat([[0.0] * 6 + [1.0] * 6], 8, axis=0))
     np.testing.assert_allclose(view.depth(6, 4), 2.5)
     assert view.image(12, 8).dtype == view.depth().dtype == view.mask().dtype == np.float32
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_a_mask_with_an_opaque_alpha_channel_is_black_and_white(tmp_path, dtype):
+    """Alpha that is 1 throughout says nothing; alpha that is not is the mask, whatever the colors are."""
+    white = np.iinfo(dtype).max
+    kept = np.zeros((HEIGHT, WIDTH), dtype)
+    kept[:, 12:] = white
+    every = np.full_like(kept, white)
+    for name, channels in (("opaque", (kept, kept, kept, every)), ("cut", (every, every, every, kept))):
+        write_image(tmp_path / f"{name}.png", np.dstack(channels))
+        np.testing.assert_array_equal(read_mask(tmp_path / f"{name}.png"), kept / white)
 
 
 def test_a_mask_is_within_its_bounds_at_every_size(tmp_path):

@@ -467,6 +467,19 @@ def test_colmap_text_as_other_programs_write_it(tmp_path, change, points):
     assert not points or len(dataset.points) == 5
 
 
+def test_a_byte_order_mark_costs_no_tracks(tmp_path, caplog):
+    """An editor of Windows writes it into each file of a model; which view shows which point is read all the same."""
+    target = text_model(tmp_path)
+    plain = load(tmp_path).tracks
+    for path in target.glob("*.txt"):
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    found = load(tmp_path).tracks
+    assert not caplog.messages
+    np.testing.assert_array_equal(found[0], plain[0])
+    assert found[1].keys() == plain[1].keys()
+    assert all(np.array_equal(found[1][name], shown) for name, shown in plain[1].items())
+
+
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize(
     ("name", "old", "new", "told"),

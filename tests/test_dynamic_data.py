@@ -841,6 +841,25 @@ def test_frames_that_are_missing(tmp_path, caplog):
     assert "must have images named by their cameras" in refused(tmp_path)
 
 
+@pytest.mark.parametrize("layout", ["frames", "train_meta"])
+def test_frames_that_are_damaged(tmp_path, caplog, layout):
+    """As those that are missing, of a folder a camera and of Dynamic 3D Gaussians' list; lazily none is looked at."""
+    if layout == "frames":
+        write_model(tmp_path / "sparse_", write_frames(tmp_path), [f"cam{k:02d}.png" for k in range(4)])
+        damaged, name = tmp_path / "cam02" / "frame_00003.png", "cam02/0003"
+    else:
+        write_train_meta(tmp_path, cameras(4))
+        damaged, name = tmp_path / "ims/2/000003.png", "2/0003"
+    damaged.write_bytes(damaged.read_bytes()[:60])
+    data = load(tmp_path)
+    assert [view.name for view in data.absent] == [name]
+    assert len(data.views) == 23
+    assert data.times == tuple(i / 5 for i in range(FRAMES))
+    assert "1 of the 24 images that it lists are damaged" in caplog.text
+    assert "all must be there" in refused(tmp_path, FileNotFoundError, strict=True)
+    assert len(load(tmp_path, lazy=True).views) == 24
+
+
 @pytest.mark.parametrize(
     ("changed", "told"),
     [

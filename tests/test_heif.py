@@ -15,7 +15,7 @@ from test_sfm import corner  # noqa: F401 (a fixture)
 
 from drgs.cli import main
 from drgs.data import load
-from drgs.data.images import heif_as_jpeg, image_size, list_images, read_image
+from drgs.data.images import MissingReader, heif_as_jpeg, image_size, list_images, read_image
 from drgs.sfm.reconstruction import SfmOptions, run_sfm
 
 pillow_heif = pytest.importorskip("pillow_heif")
@@ -142,6 +142,22 @@ def test_named_when_missing(tmp_path, gradient, monkeypatch, capsys, command):
     assert "img_9.heic: HEIC and AVIF photographs need the package pillow-heif, which is missing" in told[0]
     assert "pip install 'drgs[heic]'" in told[0]
     assert not (tmp_path / "scene").exists()
+
+
+def test_a_data_set_is_not_damaged_where_the_reader_is_missing(tmp_path, gradient, monkeypatch):
+    """One HEIC among JPEGs is not left out: the extra is named, as there is nothing wrong with the photograph."""
+    frames = []
+    for index in range(4):
+        pose = np.eye(4)
+        pose[:3, 3] = index, 0, 4
+        name = f"{index}.{'heic' if index == 1 else 'jpg'}"
+        assert cv2.imwrite(str(tmp_path / f"{index}.jpg"), gradient)
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+    save(tmp_path / "1.heic", gradient)
+    (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames}))
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    with pytest.raises(MissingReader, match=r"1\.heic: HEIC and AVIF .* pip install 'drgs\[heic\]'"):
+        load(tmp_path)
 
 
 @pytest.mark.slow

@@ -106,7 +106,7 @@ def test_one_file(tmp_path):
             check_file(tmp_path / "x.json", "select")
     with pytest.raises(ValueError, match="must be a JSON file, is a folder; name a file in it, e.g. .*/select.json"):
         check_file(tmp_path, "select")
-    with pytest.raises(ValueError, match="x.json: -o must be a folder that can be written, got"):
+    with pytest.raises(ValueError, match="x.json: the output must be a folder that can be written, got"):
         check_file(tmp_path / "x.json" / "y.json", "select")
 
 
@@ -114,7 +114,7 @@ def test_folders_that_cannot_be_written(tmp_path):
     """A file in the way, anywhere in the path, and /proc; nothing is left behind."""
     (tmp_path / "file").write_text("")
     for path in (tmp_path / "file", tmp_path / "file" / "out", Path("/proc/out")):
-        with pytest.raises(ValueError, match=r"-o must be a folder that can be written, got: .*; choose another"):
+        with pytest.raises(ValueError, match=r"output must be a folder that can be written, got: .*; choose another"):
             lock_folder(path, "fit")
     assert visible(tmp_path) == ["file"]
 

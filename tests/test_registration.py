@@ -16,6 +16,7 @@ from test_sfm import (
 
 from drgs.data import load
 from drgs.data.images import list_images
+from drgs.io.outputs import lock_folder
 from drgs.sfm.image_folder import FRAMES
 from drgs.sfm.reconstruction import SfmOptions, run_sfm
 from drgs.sfm.registration import register
@@ -153,3 +154,17 @@ def test_what_is_refused(corner, scene, tmp_path):  # noqa: F811
         before[(scene / "sparse/0/points3D.bin").relative_to(tmp_path)]
     )
     assert content(tmp_path) == before
+
+
+@pytest.mark.parametrize("name", ["images.bin", "points3D.bin"])
+def test_a_damaged_model_is_refused_in_our_words(corner, scene, name):  # noqa: F811
+    """As of a copy that was cut short, whose files no record has: the file is named, not COLMAP's code."""
+    file = scene / "sparse" / "0" / name
+    file.write_bytes(file.read_bytes()[:-9])
+    (scene / ".drgs.jsonl").unlink()
+    with lock_folder(scene, "sfm") as output:
+        output.record_existing([path.relative_to(scene).as_posix() for path in scene.rglob("*")], "sfm")
+    before = content(scene)
+    with pytest.raises(ValueError, match=rf"{re.escape(str(file))}: must hold .* copy it again$"):
+        register(scene, [corner[0] / "2.png"])
+    assert content(scene) == before

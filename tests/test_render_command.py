@@ -240,8 +240,8 @@ def test_lens(scene, gaussians, tmp_path, capsys):
         ("{scene} --orbit distance=0", "--orbit distance must be positive and finite, got 0"),
         ("{scene} --orbit span=400", "--orbit span must be in [0, 360] degrees, got 400"),
         ("{scene} --fps 0", "--fps must be in [0.001, 240], got 0"),
-        ("{scene} -o {scene}", "-o must be a folder that can be written"),
-        ("{scene} -o {scene}/inside", "-o must be a folder that can be written"),
+        ("{scene} -o {scene}", "the output must be a folder that can be written"),
+        ("{scene} -o {scene}/inside", "the output must be a folder that can be written"),
         ("{broken}", "means must be finite"),
     ],
 )

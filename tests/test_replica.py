@@ -117,6 +117,25 @@ def test_poses_that_are_wrong(text, words, tmp_path):
     refused(tmp_path, words)
 
 
+def test_damaged_frames_are_named_and_left_out(tmp_path, caplog):
+    """The others keep their poses, names and split; lazily none is looked at, and `strict` refuses."""
+    write_sequence(tmp_path)
+    whole = load(tmp_path, test_every=2)
+    damaged = tmp_path / "rgb" / "rgb_2.png"
+    damaged.write_bytes(damaged.read_bytes()[:60])
+    left = load(tmp_path, test_every=2)
+    assert f"1 of the 5 images that it lists are damaged ({damaged}); going on with the other 4" in caplog.text
+    assert [view.name for view in left.views] == ["rgb_00", "rgb_01", "rgb_10", "rgb_11"]
+    assert [view.name for view in left.absent] == ["rgb_02"]
+    assert [view.name for view in left.split()[0]] == ["rgb_01", "rgb_10"]
+    for one, other in zip(left.views, (view for view in whole.views if view.name != "rgb_02"), strict=True):
+        np.testing.assert_array_equal(one.camera.w2c, other.camera.w2c)
+        assert one.depth_path == other.depth_path
+    assert len(load(tmp_path, lazy=True).views) == 5
+    with pytest.raises(FileNotFoundError, match="1 of the 5 .* all must be there"):
+        load(tmp_path, strict=True)
+
+
 def test_folders_that_are_wrong(tmp_path):
     """No frames, a frame beyond the poses, two of one number, and the folder above sequences."""
     write_sequence(tmp_path / "room_0" / "Sequence_1", numbers=(0, 1, 2, 12))

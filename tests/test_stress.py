@@ -177,4 +177,4 @@ def test_bad_input(monkeypatch, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
     (tmp_path / "file").write_text("")
     assert cli.main(["stress", "--match", TWO, "-o", "file"]) == 2
-    assert "-o must be a folder" in capsys.readouterr().err
+    assert "the output must be a folder" in capsys.readouterr().err

@@ -190,7 +190,9 @@ def test_maps_are_of_photographs_as_they_are(capture, model, capsys):
 
 
 def test_teach_goes_on_where_it_stopped(capture, model, monkeypatch, capsys):
-    """A map that is missing is made, the others are not; other options make all anew, other classes only the texts."""
+    """A map that is missing is made, the others are not; other options make all anew, other classes only the texts, and
+    another name of the model's folder nothing.
+    """
     assert teach(capture, model, "--quiet") == 0
     maps = sorted((capture / "rgb_feature_langseg").glob("*.pt"))
     assert len(maps) == 3
@@ -214,8 +216,23 @@ def test_teach_goes_on_where_it_stopped(capture, model, monkeypatch, capsys):
     assert data.load(capture).semantics.classes.names == ("lamp", "rug")
     assert teach(capture, model) == 0  # the classes of before
     assert np.load(capture / "text_embeddings.npy").shape == (2, CHANNELS)
+    assert teach(capture, model / ".." / model.name) == 0
+    assert len(made) == 1
+    assert {path: path.read_bytes() for path in maps} == kept
     assert teach(capture, model, "--no-flip") == 0
     assert len(made) == 4
+
+
+def test_teach_writes_into_the_data_set_below(capture, model, tmp_path, capsys):
+    """Of the folder above a data set, which archives are unpacked to: beside the photographs, where the loader looks;
+    and of a file that is named, beside it.
+    """
+    assert teach(tmp_path, model) == 0
+    assert str(capture / "rgb_feature_langseg") in capsys.readouterr().out
+    assert [path.name for path in tmp_path.iterdir()] == [capture.name]
+    assert data.load(tmp_path).semantics.teacher == "rgb_feature_langseg"
+    assert teach(capture / "transforms.json", model) == 0
+    assert "3 of them made before" in capsys.readouterr().out
 
 
 def test_teach_replaces_nothing_of_others(capture, model, capsys):

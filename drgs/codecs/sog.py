@@ -31,6 +31,7 @@ from drgs.codecs.bounded import Archive, pixels_of_webp, webp_of_pixels
 from drgs.codecs.clustering import codebook, morton_order, palette
 from drgs.codecs.codec import Codec
 from drgs.codecs.folders import is_checkpoint, names_in_archive
+from drgs.codecs.ply import note_antialiased
 from drgs.codecs.values import SH_COUNTS, assembled, check_count, logits_of_bytes, quats_of_smallest, smallest_of_quats
 from drgs.ellipsoids import Gaussians
 from drgs.io.json_files import check_json, parse_json
@@ -110,6 +111,8 @@ class _Reader:
             logits = lerped[:, 3]
         sh = np.concatenate([dc[:, None, :].astype(np.float32), self._higher(degree)], axis=1)
         made = assembled(self.path, means, self._quats(), log_scales, logits, sh)
+        if self.meta.get("antialias") is True:
+            note_antialiased(self.path)
         asset = self.meta.get("asset")
         if not isinstance(asset, dict) or "offset" not in asset:
             return made

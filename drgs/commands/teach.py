@@ -46,13 +46,15 @@ def run(args: Teach) -> None:
     scales = parsed_scales(args.scales)
     if not args.data.exists():
         raise FileNotFoundError(f"{args.data}: must be a data set, found no such file or folder; check the path")
-    folder = args.data if args.data.is_dir() else args.data.parent
+    times = DataConfig.times if args.times is None else args.times
+    # Before the folder is locked: it may be one below that was named, where the loader looks for maps.
+    dataset = data.load(args.data, points=False, strict=args.strict, semantics=False, times=times)
+    folder = dataset.path if dataset.path.is_dir() else dataset.path.parent
     output = lock_folder(folder, "teach", inputs=[args.model])
     output.remove_unfinished(_FOLDER)
     _check_no_other_files(output)
     names = _names(args, output)
-    times = DataConfig.times if args.times is None else args.times
-    files = _files(data.load(args.data, points=False, strict=args.strict, semantics=False, times=times).views)
+    files = _files(dataset.views)
     with Bar("loading the model", show=not args.quiet):
         on_cuda = args.variant != "llvm_ad_rgb" and torch.cuda.is_available()
         encoder = ClipEncoder(args.model, "cuda" if on_cuda else "cpu")
@@ -159,13 +161,21 @@ def _write_record(output: LockedFolder, record: dict) -> None:
     path = output.path / _RECORD
     held = read_json(path) if path.is_file() else {}
     wanted = json.loads(json.dumps(record))
-    maps = {key: value for key, value in wanted.items() if key not in ("classes", "templates")}
-    if any(held.get(key) != value for key, value in maps.items()):
+    before = _of_maps(held)
+    if any(before.get(key) != value for key, value in _of_maps(wanted).items()):
         if (output.path / _FOLDER).is_dir():
             output.remove(output.path / _FOLDER)
         output.remove(output.path / EMBEDDINGS)
     if held != wanted:
         write_json(path, record)
+
+
+def _of_maps(record: dict) -> dict:
+    """What a record says that maps depend on: not the texts, nor where the model lies, whose SHA-256 is compared."""
+    maps = {key: value for key, value in record.items() if key not in ("classes", "templates")}
+    if isinstance(maps.get("model"), dict):
+        maps["model"] = {key: value for key, value in maps["model"].items() if key != "folder"}
+    return maps
 
 
 def _write_texts(output: LockedFolder, texts: torch.Tensor, names: list[str]) -> None:

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -34,6 +35,7 @@ from drgs.data.checks import check_last_row, inverse_pose
 from drgs.io.journal import SCHEMA
 from drgs.io.json_files import check_json, read_json
 
+_log = logging.getLogger(__name__)
 _TINY = 1e-12  # radians: below, an arc and its chord are the same to rounding
 
 
@@ -427,7 +429,12 @@ def _of_nerfstudio(where: str, found: dict) -> CameraPath:
     check_json(where, found, _THEIRS, "export the camera path again")
     kind = found.get("camera_type", "perspective")
     if kind not in ("perspective", "equirectangular"):
-        raise ValueError(f"{where}: camera_type must be perspective, got {kind!r}; export a camera path of that type")
+        raise ValueError(
+            f"{where}: camera_type must be perspective or equirectangular, got {kind!r}; export a camera path of "
+            "one of these types"
+        )
+    if kind == "equirectangular":
+        _log.info("%s: is of panoramas, add --panorama: without it pictures are those of a pinhole camera", where)
     fps = _number(where, found, "fps", 0.1, _FASTEST) or _FPS
     rows = found["camera_path"]
     if not 1 <= len(rows) <= _MANY:

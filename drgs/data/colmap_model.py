@@ -33,6 +33,7 @@ _MODELS = {
     "FISHEYE": (15, 4),
     "EQUIRECTANGULAR": (17, 2),
 }
+_BOM = b"\xef\xbb\xbf"  # byte order mark of UTF-8, which editors of Windows write
 _ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE")
 _log = logging.getLogger(__name__)
 
@@ -159,6 +160,8 @@ def _write_plain(folder: Path, file: Path, name: str, tracks: bool) -> None:
         data = _without_observations(file)
     elif name == "points3D" and not tracks:
         data = _without_tracks(file)
+    elif file.suffix == ".txt" and (data := file.read_bytes()).startswith(_BOM):
+        data = data.removeprefix(_BOM)  # which COLMAP takes for part of the first line
     else:
         (folder / file.name).symlink_to(file.resolve())
         return
@@ -440,7 +443,7 @@ def _names(path: Path) -> dict[int, str]:
 
 def _text_lines(path: Path) -> list[tuple[int, str]]:
     """Numbers and texts of the lines of a file, without comments, which may be in any encoding."""
-    lines = path.read_bytes().removeprefix(b"\xef\xbb\xbf").splitlines()
+    lines = path.read_bytes().removeprefix(_BOM).splitlines()
     try:
         return [(number, line.decode()) for number, line in enumerate(lines, 1) if not line.lstrip().startswith(b"#")]
     except UnicodeDecodeError:

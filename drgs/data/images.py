@@ -73,11 +73,14 @@ def is_damaged(path: Path) -> bool:
 
     Raises:
         ValueError: The file is of another kind, of which it is said what to do, e.g. a Git LFS pointer.
+        MissingReader: The package that reads it is missing, so that nobody knows.
     """
     if not is_heif(path):  # which is an image here
         refuse_foreign(path, "an image")
     try:
         image_size(path)
+    except MissingReader:
+        raise
     except ValueError:
         return True
     return False

@@ -25,12 +25,14 @@ def mask_file(masks: Path, name: str) -> Path | None:
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """(H,W) float32 in [0,1] of a mask as stored: the last of four channels, else the first; of a JPEG 0 or 1, whose
-    compression leaves neither black nor white.
+    """(H,W) float32 in [0,1] of a mask as stored: alpha, if it is not opaque throughout, else the first channel; of a
+    JPEG 0 or 1, whose compression leaves neither black nor white.
     """
     raw = read_image(path)
     if raw.ndim == 3:
-        raw = raw[..., 3] if raw.shape[2] == 4 else raw[..., 0]
+        # Editors add an alpha channel to black and white masks, which then says nothing.
+        opaque = np.iinfo(raw.dtype).max if raw.dtype.kind in "iu" else 1
+        raw = raw[..., 3] if raw.shape[2] == 4 and raw[..., 3].min() < opaque else raw[..., 0]
     if path.suffix.lower() in (".jpg", ".jpeg"):
         return (raw >= MASK_KEEP * np.iinfo(raw.dtype).max).astype(np.float32)
     # Masks stored as 0 and 1 in 8 bits would otherwise be nearly black.

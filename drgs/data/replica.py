@@ -21,7 +21,8 @@ from drgs.cameras import Camera, intrinsics
 from drgs.data.checks import inverse_pose, read_text, repaired_pose, said_of
 from drgs.data.dataset import Dataset
 from drgs.data.formats import Format
-from drgs.data.images import IMAGE_SUFFIXES, image_size
+from drgs.data.images import IMAGE_SUFFIXES, image_size, is_damaged
+from drgs.data.view_checks import report_missing_images
 from drgs.data.views import View
 
 POSES = "traj_w_c.txt"
@@ -37,6 +38,7 @@ def load_replica(
     test_every: int = 8,
     test_offset: int = 0,
     lazy: bool = False,
+    strict: bool = False,
 ) -> Dataset:
     """Load a sequence of Replica. Views are named by their numbers, with as many digits as the last one has, so that
     their names sort as they were taken: `rgb_002` for `rgb_2.png` of 900.
@@ -44,9 +46,10 @@ def load_replica(
     Args:
         path: The sequence's folder, as `room_0/Sequence_1`.
         background: Color that images with alpha are composited on.
-        test_every, test_offset, lazy: See `drgs.data.load`. Lazily, all views get the size of the first training image.
+        test_every, test_offset, lazy, strict: See `drgs.data.load`. Lazily, all views get the size of the first
+            training image.
     Raises:
-        FileNotFoundError: No poses, no `rgb` folder, or no images in it.
+        FileNotFoundError: No poses, no `rgb` folder, or no images in it, or too few that are not damaged.
         ValueError: Poses that are none, or an image beyond them.
     """
     poses = _poses(path / POSES)
@@ -70,11 +73,19 @@ def load_replica(
             "number frames from 0"
         )
     digits = len(str(len(poses) - 1))
-    views = [View(None, f"rgb_{number:0{digits}d}", image_path=frames[number]) for number in sorted(frames)]
-    dataset = Dataset(path, "replica", views)
+    dataset = Dataset(path, "replica", [])
+    numbers = []  # of the views
+    for number in sorted(frames):
+        view = View(None, f"rgb_{number:0{digits}d}", image_path=frames[number])
+        if not lazy and is_damaged(frames[number]):
+            dataset.absent.append(view)
+            continue
+        dataset.views.append(view)
+        numbers.append(number)
+    report_missing_images(folder, [view.image_path for view in dataset.absent], len(dataset.views), strict)
     first = dataset.split(test_every, test_offset)[0][0] if lazy else None
     size = image_size(first.image_path) if first else None
-    for number, view in zip(sorted(frames), views, strict=True):
+    for number, view in zip(numbers, dataset.views, strict=True):
         width, height = size or image_size(view.image_path)
         where = f"{path / POSES}: pose {number}"
         focal = 0.5 * width / math.tan(math.radians(_FIELD_OF_VIEW / 2))

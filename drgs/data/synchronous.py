@@ -11,7 +11,7 @@ import numpy as np
 
 from drgs.cameras import Camera
 from drgs.data.dataset import Dataset
-from drgs.data.images import image_size
+from drgs.data.images import image_size, is_damaged
 from drgs.data.resampling import fit_to_image, resized_to
 from drgs.data.videos import VideoFile, VideoFrame
 from drgs.data.view_checks import report_missing_images
@@ -29,7 +29,7 @@ class Recording:
     Attributes:
         name: Name of the camera.
         cameras: Calibrated camera of every frame, by its number; those of a moving camera differ.
-        source: A video, or the image of each of these frames by its number; some may not exist.
+        source: A video, or the image of each of these frames by its number; some may not exist, or be damaged.
         where: What states the calibration, for messages.
         split: What the data set's own files say that it is for; else empty.
     """
@@ -111,7 +111,7 @@ def synchronous(
 
 
 def _attach_image(view: View, recording: Recording, number: int, lazy: bool) -> bool:
-    """Set a view's camera and image; False if there is no image."""
+    """Set a view's camera and image; False if the image is not there or damaged, for which none is opened if `lazy`."""
     where = f"{recording.where}: camera {recording.name}"
     camera, source = recording.cameras[number], recording.source
     if isinstance(source, VideoFile):
@@ -120,7 +120,7 @@ def _attach_image(view: View, recording: Recording, number: int, lazy: bool) -> 
         view.camera = resized_to(camera, (source.width, source.height), source.path, where)
         return True
     view.image_path = source[number]
-    if not is_file(view.image_path):
+    if not is_file(view.image_path) or (not lazy and is_damaged(view.image_path)):
         return False
     view.camera = fit_to_image(camera, view.image_path, where, lazy)
     return True

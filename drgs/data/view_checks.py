@@ -304,7 +304,9 @@ def default_background(dataset: Dataset, lazy: bool = False) -> tuple[tuple[floa
     found = "" if lazy else _mixed_with(views[:: -(-len(views) // _EDGE_PROBES)])
     if found:
         return _COLORS[found], f"{found}, which half-transparent pixels at the edges of objects are mixed with"
-    if dataset.format == "transforms" and dataset.path.is_dir() and not (dataset.path / "transforms.json").is_file():
+    path = dataset.path
+    is_blender = not (path / "transforms.json").is_file() if path.is_dir() else path.name == "transforms_train.json"
+    if dataset.format == "transforms" and is_blender:
         return _COLORS["white"], "white, as readers of Blender's and D-NeRF's data sets take it"
     return _COLORS["black"], "black"
 

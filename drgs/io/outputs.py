@@ -400,7 +400,7 @@ def _make(folder: Path, path: Path) -> list[Path]:
 
 def _unwritable(folder: Path, error: OSError) -> ValueError:
     reason = error.strerror or error
-    return ValueError(f"{folder}: -o must be a folder that can be written, got: {reason}; choose another")
+    return ValueError(f"{folder}: the output must be a folder that can be written, got: {reason}; choose another")
 
 
 def _refuse_inputs(target: Path, inputs: list[Path]) -> None:

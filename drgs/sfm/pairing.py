@@ -25,7 +25,6 @@ _SEQUENTIAL_WINDOW = 10  # photographs that follow, with which one is matched: C
 _NARROW_WINDOW = 4  # the same beside matches by appearance; chosen
 _NEAREST_BY_APPEARANCE = 20  # photographs most alike, with which one is matched; chosen
 _NEAREST_FOR_NEW = 30  # the same for photographs that are added later and enter the model by these pairs alone; chosen
-# cluster centers of VLAD: 64 x 128 numbers describe a photograph; the usual number (Jegou et al. 2010)
 # cluster centers of VLAD, of 16, 64 and 256 that Jegou et al. (2010) test: 64 x 128 numbers describe a photograph
 _VLAD_CENTERS = 64
 _FEATURES_PER_PHOTO = 400  # features of a photograph that the centers are fitted to: bounds time

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from drgs.data.colmap_model import read_model
 from drgs.data.images import IMAGE_SUFFIXES, image_size
 from drgs.io.atomic import temporary_folder
 from drgs.io.outputs import LockedFolder, lock_folder
@@ -149,13 +150,13 @@ def _registered(
         partial: Empty folder.
         options, report, status: The arguments of `register`.
     """
-    from drgs.data.colmap_bindings import opened_database, pycolmap
+    from drgs.data.colmap_bindings import opened_database
     from drgs.sfm.matching import extract, match, quiet
 
     _link_photographs(scene, new, partial)
     database = partial / "database.db"
     shutil.copyfile(scene / "database.db", database)
-    before = pycolmap.Reconstruction(str(scene / "sparse/0"))
+    before: Any = read_model(scene / "sparse/0")
     cameras = list(before.cameras.values())
     with opened_database(database) as handle:
         old = [image.name for image in handle.read_all_images()]
