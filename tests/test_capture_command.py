@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import io
 import json
 import os
 import shutil
@@ -226,7 +227,17 @@ def test_photographs_are_kept_while_there_is_room(tmp_path, monkeypatch):
         photographs.decode(tmp_path / "none.png")
 
 
-def test_the_page_to_send_may_be_out_of_reach(captured, tmp_path, monkeypatch, capsys):
+def cut_off(*_, **__):
+    """A download that ends before its archive does."""
+    return io.BytesIO(b"the beginning")
+
+
+def no_network(*_, **__):
+    raise urllib.error.URLError("no network")
+
+
+@pytest.mark.parametrize(("answer", "reason"), [(no_network, "no network"), (cut_off, "must have the SHA-512")])
+def test_the_page_to_send_may_be_out_of_reach(captured, tmp_path, monkeypatch, capsys, answer, reason):
     """Without the viewer's code the capture ends well, and says why there is no page; later there is one."""
     folder = tmp_path / "run"
     shutil.copytree(captured, folder, symlinks=True)
@@ -235,16 +246,13 @@ def test_the_page_to_send_may_be_out_of_reach(captured, tmp_path, monkeypatch, c
     record.write()
     (folder / "scene.html").unlink()
 
-    def refused(*_, **__):
-        raise urllib.error.URLError("no network")
-
     there = npm.cache_folder
     monkeypatch.setattr(npm, "cache_folder", lambda: tmp_path / "none")
-    monkeypatch.setattr(urllib.request, "urlopen", refused)
+    monkeypatch.setattr(urllib.request, "urlopen", answer)
     run(Capture(output=folder, resume=True))
     told = capsys.readouterr().out
     assert "share: not written, " in told
-    assert "no network" in told
+    assert reason in told
     assert steps_of(folder) == ["photos", "poses", "fit", "report"]
     monkeypatch.setattr(npm, "cache_folder", there)
     run(Capture(output=folder, resume=True))
@@ -431,6 +439,9 @@ def test_bad_photographs(photographs, tmp_path, capsys):
         (tmp_path / "run" / name).write_text("{}")
     assert "is a run; add photographs to it" in refused([tmp_path / "run", "-o", tmp_path / "f"], capsys)
     assert not (tmp_path / "f").exists()
+    told = refused([first, "-o", tmp_path / "e", "--length", "IMG_0 IMG_1 1 m"], capsys)
+    assert told.endswith("--length must have --more, which it is for, got 'IMG_0 IMG_1 1 m'; drop it")
+    assert not (tmp_path / "e").exists()
     assert "--budget must be a time with its unit" in refused([first, "-o", tmp_path / "e", "--budget", "10"], capsys)
 
 

@@ -592,6 +592,10 @@ def hole(**arguments):
     image = image.nan_to_num()
     image[0, 5, 3:5, 1] = float("inf")
     return image, alpha, info
+def nan_alpha(width, height, means, **arguments):
+    image, alpha, info = constant(width, height, means)
+    alpha[0, 7, 2:4] = float("nan")
+    return image + means.sum(), alpha, info
 not_a_function = 3
 """
 
@@ -606,6 +610,7 @@ not_a_function = 3
         ("bad_rasterizers:constant", "must be differentiable by torch"),
         ("bad_rasterizers:nan", "its image must be finite"),
         ("bad_rasterizers:hole", "has NaN or Inf in 2 of 768 pixels, first at (3, 5); correct the rasterizer"),
+        ("bad_rasterizers:nan_alpha", "its alpha must be finite, view random_0 has NaN or Inf in 2 of 768 pixels"),
         ("bad_rasterizers:not_a_function", "must have a function not_a_function, has raises, number"),
         ("bad_rasterizers:missing", "must have a function missing, has raises, number"),
         ("no_such_module:f", "must be importable, got ModuleNotFoundError"),

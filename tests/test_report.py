@@ -26,6 +26,7 @@ from drgs.commands.report import fit_command, report_of
 from drgs.display.pictures import file_names
 from drgs.files import Run
 from drgs.fitting.config import FitConfig, SelectionConfig
+from drgs.fitting.resume import lock_run
 from drgs.information.prior import Prior
 from drgs.pages.report import pictures
 from drgs.pages.report.account import account_of
@@ -269,6 +270,25 @@ def test_the_file_is_replaced_only_where_it_is_ours(run, tmp_path, capsys):
         assert path.read_text() == "<h1>mine</h1>"
     assert cli.main(["report", str(run), "-o", str(tmp_path / "page.txt")]) == 2
     assert "must be named *.html" in capsys.readouterr().err
+
+
+def test_the_runs_own_file_by_its_name(run, monkeypatch):
+    """`-o RUN/report.html`, however it is spelled, is the page of the run, which goes on."""
+    monkeypatch.chdir(run)
+    before = (run / "report.html").read_bytes()
+    assert cli.main(["report", str(run), "-o", "../run/report.html", "--quiet"]) == 0
+    assert (run / "report.html").read_bytes() != before, "by now it has maps of other directions"
+    lock_run(Run(run), "fit").release()
+
+
+def test_whose_photograph_is_used(run, tmp_path):
+    """The expected error of held-out views is without their photographs; that of fitted ones is not."""
+    words = "this view's photograph is not used"
+    assert words in page_of(run, tmp_path).texts["p"]
+    assert cli.main(["eval", str(run), "--split", "train", "--quiet"]) == 0
+    page = page_of(run, tmp_path)
+    assert "Expected error: how far from a photograph" in page.texts["p"]
+    assert words not in page.texts["p"]
 
 
 def test_no_report_is_wanted(tmp_path):

@@ -283,6 +283,49 @@ def test_what_is_refused_leaves_nothing(still, tmp_path, capsys):
         assert [path.name for path in out.glob("*") if not path.name.startswith(".")] == []
 
 
+def test_rows_of_another_configuration(tmp_path, monkeypatch, capsys):
+    """A folder has one configuration of a study: another --config, of fits or of picks, is refused before any cell, and
+    that of before goes on. Rows alone, copied or of a time before this was kept, are taken as they are.
+    """
+    monkeypatch.setattr("drgs.commands.reproduce.run_cells", lambda *_: ([], {}))
+    out, copied = tmp_path / "out", tmp_path / "copied"
+    line = ["reproduce", "dynamic", "--scale", "tiny", "--seeds", "1", "--no-figures", "--quiet"]
+    line += ["--policy", "random", "-o"]
+    assert cli.main([*line, str(out)]) == 0
+    for name, value, before in (("opacity_rate", 0.5, 0.05), ("every", 7, None)):
+        config = tmp_path / f"{name}.toml"
+        config.write_text(f"{name} = {value}\n")
+        assert cli.main([*line, str(out), "--config", str(config)]) == 2
+        (told,) = capsys.readouterr().err.splitlines()
+        assert f"{out}: must be of one configuration of dynamic-tiny, {name} was {before} and is {value}; " in told
+    assert cli.main([*line, str(out)]) == 0
+    study = study_of("dynamic", "tiny", tmp_path)
+    copied.mkdir()
+    row = rows_of(study, ["random"], 1)[0] | Cell("kitchen-1", (0, 0), "first", "random", "paper", 0, "cam00").to_json()
+    (copied / "rows.jsonl").write_text(json.dumps(row) + "\n")
+    assert cli.main([*line, str(copied), "--config", str(config)]) == 0
+    assert json.loads((copied / "dynamic.json").read_text())["finished"] == 1
+    assert cli.main([*line, str(copied)]) == 2
+    (out / "fits.json").write_text('{"dynamic-tiny": 3}')
+    assert cli.main([*line, str(out)]) == 2
+    assert "fits.json" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_tables_without_figures(tmp_path, monkeypatch, capsys):
+    """Figures that cannot be drawn take no tables with them."""
+
+    def fail(*_):
+        raise ValueError("no figures")
+
+    monkeypatch.setattr("drgs.commands.reproduce.run_cells", lambda *_: ([], {}))
+    monkeypatch.setattr("drgs.commands.reproduce._figures", fail)
+    out = tmp_path / "out"
+    assert cli.main(f"reproduce dynamic --scale tiny --seeds 1 --quiet --policy random -o {out}".split()) == 2
+    assert "no figures" in capsys.readouterr().err
+    assert (out / "dynamic.md").is_file()
+    assert (out / "dynamic.json").is_file()
+
+
 def test_workers_get_whole_paths(tmp_path, monkeypatch):
     """What is sent to workers, which have working directories of their own, does not depend on this one."""
     pytest.importorskip("cloudpickle")

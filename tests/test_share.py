@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import gzip
 import io
 import json
@@ -21,6 +22,7 @@ from test_semantic_fit import run as labelled_run  # noqa: F401 (a fixture)
 
 import drgs
 from drgs import cli
+from drgs.cameras import orbit
 from drgs.codecs import save_gaussians
 from drgs.codecs.clustering import morton_order
 from drgs.codecs.sog import load_sog
@@ -32,7 +34,9 @@ from drgs.io.run import Run
 from drgs.pages.sharing import npm
 from drgs.pages.sharing.layers import GaussianScale, scale_layer
 from drgs.pages.sharing.placing import upright_matrix
+from drgs.pages.sharing.scene import _cameras
 from drgs.pages.sharing.write import archive_of
+from drgs.viewing.placed_views import Ranking, Score
 
 
 def blobs(count: int = 300, degree: int = 3, seed: int = 0) -> drgs.Gaussians:
@@ -169,7 +173,7 @@ def test_what_is_fetched_is_what_is_pinned(tmp_path, monkeypatch):
     assert package.address == "https://registry.npmjs.org/@some/thing/-/thing-1.2.3.tgz"
     monkeypatch.setattr(npm, "PACKAGES", (package,))
     monkeypatch.setattr(npm.urllib.request, "urlopen", lambda address, timeout: io.BytesIO(packed.getvalue()))
-    with pytest.raises(ValueError, match=r"must have the SHA-512 .* it was changed on the way"):
+    with pytest.raises(OSError, match=r"must have the SHA-512 .* it was changed on the way"):
         npm.fetch_into(tmp_path / "npm")
     assert not (tmp_path / "npm").exists()
     digest = base64.b64encode(npm.hashlib.sha512(packed.getvalue()).digest()).decode()
@@ -177,6 +181,42 @@ def test_what_is_fetched_is_what_is_pinned(tmp_path, monkeypatch):
     npm.fetch_into(tmp_path / "npm")
     found = {str(x.relative_to(tmp_path / "npm")) for x in (tmp_path / "npm").rglob("*") if x.is_file()}
     assert found == {"thing-1.2.3/dist/thing.js", "thing-1.2.3/LICENSE"}
+
+
+def test_the_runs_own_file_by_its_name(viewer, place, tmp_path):  # noqa: F811
+    """`-o RUN/scene.html` is the page of the run, which `drgs share RUN` replaces."""
+    run = shutil.copytree(place / "run", tmp_path / "run")
+    for more in (["-o", str(run / "scene.html")], []):
+        assert cli.main(["share", str(run), *more, "--no-uncertainty", "--quiet"]) == 0
+    assert '"scene.html"' in (run / ".drgs.jsonl").read_text()
+
+
+def test_a_folder_without_a_name(viewer, tmp_path, monkeypatch, capsys):
+    """`.` is no run: the line says so. Of a folder of Gaussians, the page has the folder's name."""
+    folder = tmp_path / "trained" / "point_cloud" / "iteration_7"
+    (tmp_path / "trained").mkdir()
+    monkeypatch.chdir(tmp_path / "trained")
+    assert cli.main(["share", ".", "--quiet"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{tmp_path / 'trained'}: must be a run folder, found no config.json" in line
+    folder.mkdir(parents=True)
+    save_gaussians(blobs(20), folder / "point_cloud.ply")
+    assert cli.main(["share", ".", "--quiet"]) == 0
+    assert Page(tmp_path / "trained.html").texts["title"] == "trained"
+
+
+def test_picks_of_what_moves():
+    """Of synchronous cameras, picks at the place of a fitted view and of views with higher scores are there; fitted
+    ones are not."""
+    views = [
+        drgs.data.View(dataclasses.replace(camera, time=time), f"{k}_{time}")
+        for time in (0.0, 0.5, 1.0)
+        for k, camera in enumerate(orbit((0, 0, 0), 3.0, 2, width=8, height=8))
+    ]
+    scores = {view.name: Score(view.camera.time, {}, 1, 6) for view in views}
+    cameras = _cameras(views, ["0_0.0", "1_1.0"], Ranking("", scores, ("1_1.0", "0_0.5", "1_0.5")))
+    following = [(camera.name, camera.time) for kind, camera in cameras if kind == "next"]
+    assert following == [("2. 0_0.5", 0.5), ("3. 1_0.5", 0.5)]
 
 
 def test_where_harmonics_are(tmp_path):

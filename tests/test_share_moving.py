@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.resources
+import json
+import shutil
+import subprocess
 
 import numpy as np
+import pytest
 import torch
 from test_dynamic_fit import _small_field, dataset, run  # noqa: F401 (fixtures)
 from test_share_browser import BACKGROUND, CAMERAS, decibels, ours, picture, shown  # noqa: F401 (a fixture)
@@ -110,3 +115,98 @@ def test_lives_in_a_browser(shown, run, tmp_path):  # noqa: F811
             assert decibels(pictures[-1], ours(looked.moving.at(time), CAMERAS[0])) > 38
     with torch.no_grad():
         assert decibels(pictures[0], ours(looked.moving.at(times[1]), CAMERAS[0])) < 32
+
+
+# What the page's own code asks of Spark: words whose lower half is an opacity, here in thousandths.
+SPARK = """
+export class RgbaArray { constructor({ array }) { this.array = array; } dispose() {} }
+export const [ExtSplats, SparkRenderer, SplatFileType, SplatMesh] = [];
+export const mesh = { updateGenerator() {}, updateVersion() {} };
+export function splatsOf(opacities) {
+  const words = new Uint32Array(4 * opacities.length);
+  const setSplat = (i, center, scales, quaternion, opacity) => {
+    words[4 * i + 3] = 0xabcd0000 + Math.round(1000 * opacity);
+  };
+  const getSplat = (i) => ({ opacity: (words[4 * i + 3] & 0xffff) / 1000 });
+  opacities.forEach((opacity, i) => setSplat(i, null, null, null, opacity));
+  return { numSplats: opacities.length, extArrays: [words], textures: [], getSplat, setSplat };
+}
+"""
+
+HIDDEN = """
+import { Gaussians } from "./gaussians.mjs";
+import { mesh, splatsOf } from "./spark.mjs";
+const gaussians = new Gaussians(splatsOf([0.8, 0.4, 0.2]), mesh);
+const found = [];
+const look = () => found.push([0, 1, 2].flatMap((i) => [
+  gaussians.splats.getSplat(i).opacity, mesh.splatRgba.array[4 * i + 3] / 255,
+]));
+gaussians.tint(new Uint8Array(9));
+gaussians.move([1, 2], () => 0.5);
+look();
+gaussians.hide((i) => i === 1);
+look();
+gaussians.move([1, 2], () => 0.25);
+look();
+gaussians.hide(() => false);
+look();
+console.log(JSON.stringify(found));
+"""
+
+OPENED = """
+class Element {
+  style = {};
+  append() {} addEventListener() {} setAttribute() {} replaceChildren() {}
+}
+const made = [];
+globalThis.innerWidth = 1000;
+globalThis.document = {
+  getElementById: () => new Element(),
+  createElement: () => (made.push(new Element()), made.at(-1)),
+};
+const { buildPanel } = await import("./panel.mjs");
+const parts = { moving: new Uint32Array(1), moments: new Uint16Array(30), lives: new Float32Array(9) };
+parts.moments[10] = parts.moments[20] = 65535; // the first coordinate of the center, after the first moment
+const point = () => ({ set(...x) { [this.x] = x; return this; }, normalize() {} });
+const centers = [];
+const gaussians = {
+  move: (_, poseOf) => { const center = point(); poseOf(0, center, point(), point()); centers.push(center.x); },
+};
+const first = { name: "all of it", kind: "other", time: null };
+const moments = { times: [1, 2, 4], count: 1, low: Array(10).fill(0), high: Array(10).fill(1) };
+await buildPanel({
+  scene: { moments, photos: [first] }, gaussians, first, frusta: {}, steering: {}, goTo() {}, changed() {},
+  bytesOfPart: async (name) => new Uint8Array(parts[name].buffer), asked: new URLSearchParams(""),
+});
+console.log(JSON.stringify([made.find((x) => x.type === "range").value, centers]));
+"""
+
+
+def answer_of(program: str, folder):
+    """What a program that takes the page's own code prints, in Node.js."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("no Node.js: apt-get install nodejs")
+    (folder / "spark.mjs").write_text(SPARK)
+    for name in ("gaussians", "panel"):
+        code = (importlib.resources.files("drgs.pages.sharing") / f"{name}.js").read_text()
+        code = code.replace('"three"', '"./spark.mjs"').replace('"@sparkjsdev/spark"', '"./spark.mjs"')
+        (folder / f"{name}.mjs").write_text(code)
+    (folder / "program.mjs").write_text(program)
+    done = subprocess.run([node, folder / "program.mjs"], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_hidden_ones_stay_hidden(tmp_path):
+    """As time goes on, opacities and those of a layer are those of the time, and 0 of what is hidden; what is shown
+    again has the opacity of the time.
+    """
+    found = np.array(answer_of(HIDDEN, tmp_path)).reshape(-1, 3, 2)
+    wanted = [[0.8, 0.2, 0.1], [0.8, 0.0, 0.1], [0.8, 0.0, 0.05], [0.8, 0.1, 0.05]]
+    np.testing.assert_allclose(found, np.repeat(np.array(wanted)[..., None], 2, axis=2), atol=0.003)
+
+
+def test_a_page_opens_at_its_first_time(tmp_path):
+    """Where the first photograph has no time, the slider says what the picture shows: the first moment."""
+    assert answer_of(OPENED, tmp_path) == [1, [0]]

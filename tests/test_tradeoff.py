@@ -367,6 +367,24 @@ def test_tables_and_no_matplotlib(place, monkeypatch, capsys, caplog):
     assert not (place / "plain" / "tradeoff.png").exists()
 
 
+def test_a_plot_takes_nothing_with_it(place, monkeypatch, capsys):
+    """Dollar signs of a path are no formula; whatever else a plot fails of, what was measured is there."""
+    few(monkeypatch, "fast")
+    scene, draw, drawn = "scene $\\frac{$.ply", tradeoff.plot, []
+    (place / scene).write_bytes((place / "scene.ply").read_bytes())
+
+    def fail(*arguments):
+        drawn.append(draw(*arguments))
+        raise ValueError("no plot")
+
+    monkeypatch.setattr(tradeoff, "plot", fail)
+    assert command(place, place / "failed", "--repeats", 1, scene=scene) == 2
+    assert "no plot" in capsys.readouterr().err
+    assert drawn == [True]
+    assert rows(json.loads((place / "failed" / "tradeoff.json").read_text())).keys() == {"exact", "fast"}
+    assert "| fast |" in (place / "failed" / "tradeoff.md").read_text()
+
+
 @pytest.mark.parametrize(
     ("options", "expected"),
     [

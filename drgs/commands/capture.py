@@ -25,6 +25,8 @@ def run(args: Capture) -> None:
         _print_next(args)
     elif args.region is not None:
         raise ValueError(f"--region must have --more, whose photographs it is for, got {args.region}; drop it")
+    elif args.length is not None:
+        raise ValueError(f"--length must have --more, which it is for, got {args.length!r}; drop it")
     else:
         capture_photographs(args, FitConfig().replace(exposure="auto"))
 

@@ -397,7 +397,9 @@ class View(Information, Orbits, Views):
         "Training views to display: a data set, a run, a cameras.json or selection.json; default those of the run.",
     )
     selection: Path | None = of_views(
-        None, "Scores of cameras, a file that drgs select wrote; default those of the run, if it chose its views."
+        None,
+        "Scores of cameras, a file that drgs select wrote; default those of the run, if it chose its views, or of drgs"
+        " capture --more.",
     )
     scoring: Scoring = part(
         Scoring(blocks=("geometry", "backdrop")), only=("method", "blocks", "prior", "probes", "nuisances")
@@ -538,7 +540,8 @@ class Share(Views, Common):
     )
     selection: Path | None = of_views(
         None,
-        "Photographs to take next, a file that drgs select wrote; default those of the run, if it chose its views.",
+        "Photographs to take next, a file that drgs select wrote; default those of the run, if it chose its views, or"
+        " of drgs capture --more.",
     )
     uncertainty: bool = option(True, "Leave out the layer of the expected error (docs/uncertainty.md).")
     moments: int = option(

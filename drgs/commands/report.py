@@ -32,7 +32,7 @@ def run(args: Report) -> None:
     folder = Run(args.run)
     record = fit_record(folder)
     path = args.output
-    if path is None:
+    if path is None or is_same_place(path, folder.path / FILE):
         path = folder.path / FILE
         lock_run(folder, "report").check([FILE])
     else:
@@ -63,6 +63,11 @@ def report_of(run: Run, path: Path, dataset: Dataset | None) -> None:
             f"It began with the Gaussians of another fit, which no option says; this command begins with points. {text}"
         )
     write_report(run, path, command, text, dataset)
+
+
+def is_same_place(path: Path, other: Path) -> bool:
+    """Whether two paths name the same entry of the same folder; what the entry links to does not count."""
+    return path.parent.resolve() / path.name == other.parent.resolve() / other.name
 
 
 def dataset_of(record: FitRecord, otherwise: str) -> Dataset | None:

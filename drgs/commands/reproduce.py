@@ -15,6 +15,7 @@ from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import check_lenses, held_out_views, known_views
 from drgs.display import tables
 from drgs.display.progress import Bar
+from drgs.fitting.config import FitConfig
 from drgs.fitting.metrics import Lpips
 from drgs.information.blocks import MAP_PRIOR
 from drgs.information.scoring import Scoring
@@ -23,7 +24,7 @@ from drgs.io.json_files import check_json, read_json
 from drgs.io.outputs import lock_folder, write_json, write_whole
 from drgs.runtime.machine import commit, cpu_model
 from drgs.settings import RenderSettings
-from drgs.studies.cells import run_cells
+from drgs.studies.cells import Study, changed_field, run_cells
 from drgs.studies.plan import StudyPlan, plan_of
 from drgs.studies.results import results_page, results_rows
 from drgs.studies.rows import Cell, cell_of, read_study
@@ -35,13 +36,16 @@ if TYPE_CHECKING:
 # of all experiments in one folder: they share cells
 _ROWS = "rows.jsonl"
 _GIVEN = "data.json"
+_FITS = "fits.json"
 _FIGURE = "all views"  # is given what the others choose from: no row of the sheet is the better for it
 
 
 def run(args: Reproduce) -> None:
     """`drgs reproduce static -o OUT`."""
     out: Path = args.output
-    lock_folder(out, "reproduce", [_GIVEN, *(f"{args.what}.{kind}" for kind in ("md", "json", "png"))], args.data)
+    lock_folder(
+        out, "reproduce", [_GIVEN, _FITS, *(f"{args.what}.{kind}" for kind in ("md", "json", "png"))], args.data
+    )
     known = _data_of_rows(out, args.data)
     weights = args.lpips_weights and args.lpips_weights.resolve()
     if weights:
@@ -60,7 +64,9 @@ def run(args: Reproduce) -> None:
             weights,
             {} if args.config is None else config_fields(args.config, {"policy": None}),  # each cell has its own
         )
+        fits = _fits_of_rows(out, plan.study)
         write_json(out / _GIVEN, known)
+        write_json(out / _FITS, fits)
         for note in plan.notes:
             say(f"note: {note}")
         done = {cell_of(row) for row in read_study(out / _ROWS)}
@@ -71,8 +77,9 @@ def run(args: Reproduce) -> None:
     if taken:
         say(f"{len(taken)} cells are with other processes: repeat the command when these have ended")
     rows = [row for row in read_study(out / _ROWS) if cell_of(row) in {(plan.study.name, cell) for cell in plan.cells}]
-    pictures = _figures(plan, out, args) if args.figures else []
-    _write(plan, rows, out, args, pictures)
+    _write(plan, rows, out, args, [])  # first: whatever becomes of the figures, the tables are there
+    if args.figures:
+        _write(plan, rows, out, args, _figures(plan, out, args))
     if not args.quiet:
         _print(plan, rows, out, args.what)
     if failed:
@@ -101,6 +108,29 @@ def _data_of_rows(out: Path, given: Sequence[Path]) -> dict[str, str]:
         if known.setdefault(real.name, str(real)) != str(real):
             raise ValueError(f"{out}: must be of one {real.name}, holds rows of {known[real.name]}; choose another -o")
     return known
+
+
+def _fits_of_rows(out: Path, study: Study) -> dict[str, Any]:
+    """Study -> configuration of its fits, of a folder's rows and of this study; refuses another one than its rows have.
+
+    A folder without the file goes on: its rows may be of a time before there was one, or copied.
+    """
+    path = out / _FITS
+    advice = "restore it, or choose another -o"
+    known = read_json(path, "configurations by study", advice) if path.exists() else {}
+    check_json(str(path), known, {}, advice)
+    if study.name in known:
+        try:
+            was = FitConfig.from_json(known[study.name])
+        except (ValueError, NotImplementedError) as error:
+            raise ValueError(f"{path}: {error}; {advice}") from None
+        if change := changed_field(study.fit, was):
+            name, now, before = change
+            raise ValueError(
+                f"{out}: must be of one configuration of {study.name}, {name} was {before!r} and is {now!r}; choose "
+                "another -o"
+            )
+    return {**known, study.name: study.fit.to_json()}
 
 
 def _figures(plan: StudyPlan, out: Path, args: Reproduce) -> list[tuple[str, str]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from drgs.cameras import Camera
 from drgs.cameras.origins import origin_text
 from drgs.commands.options import Share
 from drgs.commands.orbits import scene_orbit
-from drgs.commands.report import dataset_of, written_by
+from drgs.commands.report import dataset_of, is_same_place, written_by
 from drgs.commands.scene_input import SceneInput
 from drgs.commands.viewpoints import known_views
 from drgs.ellipsoids import Gaussians
@@ -30,8 +31,10 @@ _DEFAULT_SIZE = 960, 640  # pixels of the first view of a scene without photogra
 
 def run(args: Share) -> None:
     """`drgs share SCENE`."""
+    if args.scene.name in ("", ".."):
+        args = dataclasses.replace(args, scene=args.scene.resolve())  # `.` has no name, which file and title take
     path = _output(args)
-    is_inside = args.output is None and is_run(args.scene)
+    is_inside = is_run(args.scene) and path == args.scene / FILE
     with lock_run(Run(args.scene), "share") if is_inside else contextlib.nullcontext() as held:
         if held is not None:
             held.check([FILE])
@@ -47,7 +50,7 @@ def run(args: Share) -> None:
 def _output(args: Share) -> Path:
     """The file to write, which outside of a run is free or a page that this command wrote."""
     path = args.output
-    if path is None and is_run(args.scene):
+    if is_run(args.scene) and (path is None or is_same_place(path, args.scene / FILE)):
         return args.scene / FILE
     path = path or args.scene.with_suffix(".html")
     if path.suffix.lower() not in (".html", ".htm"):

@@ -93,9 +93,12 @@ def run(args: Tradeoff) -> None:
         env=runtime.info(),
     )
     title = f"{args.scene}: {len(gaussians):,} Gaussians"
-    drawn = plot(measured, args.max_error, title, args.output / "tradeoff.png")
-    write_whole(args.output / "tradeoff.md", _page(report, drawn).encode())
+    # First: whatever becomes of the plot, what was measured is there.
     write_json(args.output / "tradeoff.json", report.to_json())
+    write_whole(args.output / "tradeoff.md", _page(report, False).encode())
+    drawn = plot(measured, args.max_error, title, args.output / "tradeoff.png")
+    if drawn:
+        write_whole(args.output / "tradeoff.md", _page(report, drawn).encode())
     if not args.quiet:
         _print(report)
         files = "tradeoff.json, tradeoff.md" + (", tradeoff.png" if drawn else "")

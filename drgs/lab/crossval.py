@@ -295,7 +295,7 @@ def _images(
     """The rasterizer's images and alphas, one a view, and (C, H, W, 3) cotangents: random signs, or a dump's own.
 
     Raises:
-        ValueError: If an image has NaN or Inf.
+        ValueError: If an image or an alpha has NaN or Inf.
     """
     if isinstance(rasterizer, Dump):
         pictures, alphas, signs = list(rasterizer.images), list(rasterizer.alphas), rasterizer.cotangents
@@ -303,13 +303,14 @@ def _images(
         pairs = [rasterizer.image(raw, camera, background) for camera in cameras]
         pictures, alphas = ([pair[k] for pair in pairs] for k in range(2))
         signs = cotangents(cameras, seed)
-    for camera, picture in zip(cameras, pictures, strict=True):
-        if len(bad := (~torch.isfinite(picture)).any(-1).nonzero()):
-            y, x = bad[0].tolist()
-            raise ValueError(
-                f"{rasterizer.name}: its image must be finite, view {camera.name} has NaN or Inf in {len(bad)} of "
-                f"{picture[..., 0].numel()} pixels, first at ({x}, {y}); correct the rasterizer"
-            )
+    for camera, picture, alpha in zip(cameras, pictures, alphas, strict=True):
+        for what, wrong in (("image", (~torch.isfinite(picture)).any(-1)), ("alpha", ~torch.isfinite(alpha))):
+            if len(bad := wrong.nonzero()):
+                y, x = bad[0].tolist()
+                raise ValueError(
+                    f"{rasterizer.name}: its {what} must be finite, view {camera.name} has NaN or Inf in {len(bad)} of "
+                    f"{wrong.numel()} pixels, first at ({x}, {y}); correct the rasterizer"
+                )
     return pictures, alphas, signs
 
 

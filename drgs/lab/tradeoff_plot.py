@@ -65,7 +65,7 @@ def plot(measured: Measured, budgets: Sequence[float], title: str, path: Path) -
         # The front first: what finds no free place is left without a label.
         rest = [p for p in points if p not in front]
         _labels(figure, axis, [*front, *rest], points)
-    figure.suptitle(title, fontsize=10)
+    figure.suptitle(title, fontsize=10, parse_math=False)  # paths may have dollar signs
     figure.tight_layout(rect=(0, 0, 1, 0.985))
     with replacing(path, path.suffix) as name:
         figure.savefig(name)

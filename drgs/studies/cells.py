@@ -36,7 +36,17 @@ from drgs.studies.rows import Cell, append_row, is_done, read_study
 from drgs.studies.statistics import decided
 from drgs.train import fit
 
-__all__ = ["FAILURES", "Metric", "Study", "distinct_seeds", "out_of_race", "result_line", "run_cell", "run_cells"]
+__all__ = [
+    "FAILURES",
+    "Metric",
+    "Study",
+    "changed_field",
+    "distinct_seeds",
+    "out_of_race",
+    "result_line",
+    "run_cell",
+    "run_cells",
+]
 
 FAILURES = (ValueError, OSError, ArithmeticError, RuntimeError, MemoryError)
 """What a fit raises that cannot be done; the next one may do."""
@@ -305,15 +315,21 @@ def result_line(study: Study, cell: Cell, row: Mapping[str, Any]) -> str:
     return f"{cell.name}: {numbers}" + (f", {row['seconds']:.0f} s" if row["seconds"] is not None else "")
 
 
+def changed_field(config: FitConfig, was: FitConfig) -> tuple[str, Any, Any] | None:
+    """The first field that makes another fit, of its selection, too: its name, its value and that in `was`, as JSON."""
+    change = config.difference(was)
+    if change is None and config.selection is not None:
+        mine, theirs = config.selection.flat(), (was.selection or SelectionConfig()).flat()
+        change = next(((name, x, theirs[name]) for name, x in mine.items() if x != theirs[name]), None)
+    return change
+
+
 def _check_same(run: Run, config: FitConfig) -> None:
     """Refuse a run folder that was begun by another fit: by a study that had other numbers under the same name."""
     was = fit_record(run).config
     if config.data.undistort == "auto":  # the run has recorded what that was
         was = was.replace(data=dataclasses.replace(was.data, undistort="auto"))
-    change = config.going_on(was).difference(was)
-    if change is None and config.selection is not None:
-        mine, theirs = config.selection.flat(), (was.selection or SelectionConfig()).flat()
-        change = next(((name, x, theirs[name]) for name, x in mine.items() if x != theirs[name]), None)
+    change = changed_field(config.going_on(was), was)
     if change is not None:
         name, now, before = change
         raise ValueError(

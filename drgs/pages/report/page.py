@@ -197,10 +197,11 @@ def _views(metrics: Mapping[str, Any], drawings: Drawings) -> dict[str, Any]:
     several = len(views) > 1
     text = "From the worst to the best by PSNR." if several else ""
     if drawings.maps:
+        unused = "; this view's photograph is not used" if metrics["split"] == "test" else ""  # others were fitted to
         text += (
             " Expected error: how far from a photograph each pixel's color is expected to be, in units of color, by "
             "what the fit gets wrong in its own photographs, directions that none of them has, and what they leave "
-            "open; this view's photograph is not used. Not covered: white where no Gaussian is."
+            f"open{unused}. Not covered: white where no Gaussian is."
         )
     definitions = metrics.get("variants")
     listed = [(str(key), str(x)) for key, x in definitions.items()] if isinstance(definitions, dict) else []

@@ -55,12 +55,15 @@ export class Gaussians {
     this.splats = splats;
     this.mesh = mesh;
     this.count = splats.numSplats;
-    this.opaque = splats.extArrays[0].slice(); // words with the opacities, of which hidden ones are set to 0
+    // Words with the opacities at the time that is shown, of which hidden ones are set to 0.
+    this.opaque = splats.extArrays[0].slice();
+    this.isHidden = () => false;
     this.colors = null;
   }
 
   // Draws all but those for which the function of an index is true.
   hide(isHidden) {
+    this.isHidden = isHidden;
     const words = this.splats.extArrays[0];
     for (let i = 0; i < this.count; i++) {
       const word = this.opaque[4 * i + 3];
@@ -94,12 +97,14 @@ export class Gaussians {
   // returns its opacity over that of the file.
   move(places, poseOf) {
     this.opacities ??= Float32Array.from(places, (index) => this.splats.getSplat(index).opacity);
+    const words = this.splats.extArrays[0];
     places.forEach((index, k) => {
       const { center, scales, quaternion, color } = this.splats.getSplat(index);
       const share = poseOf(k, center, scales, quaternion);
       this.splats.setSplat(index, center, scales, quaternion, share * this.opacities[k], color);
+      this.opaque[4 * index + 3] = words[4 * index + 3];
     });
-    this.upload();
+    this.hide(this.isHidden); // which the new opacities have undone
   }
 
   // Spark is told of a change, be it of these or of the camera, however little: it colors and sorts them anew.

@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 import hashlib
+import http.client
 import io
 import logging
 import os
@@ -82,8 +83,7 @@ def viewer_files() -> Path:
     """The folder with the files of all packages; what it lacks is fetched.
 
     Raises:
-        OSError: If they are not there and cannot be fetched, or not be written.
-        ValueError: If what was fetched is not what is pinned.
+        OSError: If they are not there and cannot be fetched, as they are pinned, or not be written.
     """
     folder = cache_folder()
     fetch_into(folder)
@@ -96,8 +96,7 @@ def fetch_into(folder: Path) -> None:
     Args:
         folder: Folder that gets a folder for each package; it is made.
     Raises:
-        OSError: If the network or the disk refuses.
-        ValueError: If an archive is not the one that is pinned.
+        OSError: If the network or the disk refuses, or an archive is not the one that is pinned.
     """
     for package in PACKAGES:
         target = folder / package.folder
@@ -119,7 +118,7 @@ def _downloaded(package: Package) -> bytes:
     try:
         with urllib.request.urlopen(package.address, timeout=_TIMEOUT) as answer:
             return answer.read(_MOST_BYTES)
-    except (urllib.error.URLError, TimeoutError) as error:
+    except (urllib.error.URLError, http.client.HTTPException, TimeoutError) as error:
         reason = getattr(error, "reason", error)
         raise OSError(
             f"share: the viewer's code must be fetched once from {package.address}, got: {reason}; connect to the "
@@ -131,7 +130,8 @@ def _checked(package: Package, archive: bytes) -> dict[str, bytes]:
     """Name -> content of the files that are kept of an archive."""
     digest = base64.b64encode(hashlib.sha512(archive).digest()).decode()
     if digest != package.sha512:
-        raise ValueError(
+        # The network's fault, be it a download that was cut off: callers go on as if there were none.
+        raise OSError(
             f"share: {package.address} must have the SHA-512 {package.sha512[:12]}..., has {digest[:12]}...; it was "
             "changed on the way, fetch it from another network"
         )

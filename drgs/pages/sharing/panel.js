@@ -63,6 +63,7 @@ export async function buildPanel({
     controls.append(time.row);
   }
   await layers({ scene, gaussians, controls, changed, bytesOfPart, asked });
+  time?.set(scene.moments.times[0]); // where photographs without a time leave it
   choose(first);
   if (time && asked.has("time")) {
     time.set(Number(asked.get("time")));

@@ -194,7 +194,9 @@ def _cameras(views: Sequence, names: Sequence[str], ranking: Ranking | None) -> 
     """Cameras of a run's photographs and of the photographs to take next; none where they are not known."""
     placed = placed_views_of(views, names, ranking)
     fitted = [place.camera for place in placed if place.kind == "training"]
-    picks = {place.best.pick: place.best.camera for place in placed if place.kind != "training" and place.best.pick}
+    # Not of places: at the place of a pick, others may have been scored higher or fitted to, at other times.
+    sights = [sight for place in placed for sight in place.sights if sight.camera.name not in names]
+    picks = {sight.pick: sight.camera for sight in sights if sight.pick}
     following = [dataclasses.replace(picks[k], name=f"{k}. {picks[k].name}") for k in sorted(picks)]
     ordered: list[tuple[PhotoKind, Camera]] = [("fitted", camera) for camera in sorted(fitted, key=lambda x: x.name)]
     return ordered + [("next", camera) for camera in following]
