@@ -13,7 +13,7 @@ import torch
 from scenes_random import camera, gaussians
 
 from drgs import fisher, reference
-from drgs.cameras import orbit
+from drgs.cameras import at_first_time, orbit
 from drgs.data import Dataset, View
 from drgs.deform import DeformationField, DynamicGaussians, FieldConfig
 from drgs.display.pictures import write_png
@@ -216,6 +216,11 @@ def ball(time: float, way: float = FLIGHT) -> Gaussians:
 
 def together(a: Gaussians, b: Gaussians) -> Gaussians:
     return a.replace(**{name: torch.cat([x, b.parameters()[name]]) for name, x in a.parameters().items()})
+
+
+def standing(x: float, time: float) -> SimpleNamespace:
+    """What counts of a camera: where it stands, and when."""
+    return SimpleNamespace(center=np.array([x, 0.0, 0.0]), time=time)
 
 
 def filmed(folder, cameras_a_time: int, way: float = FLIGHT, shown: tuple[float, float] = (0.0, 1.0)) -> Dataset:
@@ -435,11 +440,18 @@ def test_a_fit_that_was_stopped_ends_with_the_same_bits(dataset, tmp_path):
 
 
 def test_what_the_static_stage_shows(tmp_path):
-    """The first time where three photographs or more are of it, also when there are no others yet; else all times."""
+    """The first time where three photographs or more are of it, also when there are no others yet; else all times.
+
+    Of poses that are of one time each, the first time shows a part of the scene alone.
+    """
     one, six = (filmed(tmp_path / str(n), n).views for n in (1, 6))
     assert not shows_first_time(one)
     assert shows_first_time(six)
     assert shows_first_time([view for view in six if view.camera.time == 0])
+    poses = [SimpleNamespace(camera=standing(x, x // 4)) for x in range(12)]
+    assert not shows_first_time(poses)
+    assert at_first_time([pose.camera for pose in poses[:8]]) == [0, 1, 2, 3]
+    assert at_first_time([pose.camera for pose in poses]) == [*range(12)]
 
 
 def test_only_lives_that_other_times_confirm_are_lengthened():
@@ -462,7 +474,7 @@ def test_the_search_is_made_once_and_says_what_was_added(monkeypatch):
     monkeypatch.setattr(lifespans, "find_new_gaussians", lambda *_: places)
     how = config(max_gaussians=10)
     stage = dynamic_stage(how)
-    frames = [SimpleNamespace(camera=SimpleNamespace(time=time)) for time in (0.0, 0.5, 1.0)]
+    frames = [SimpleNamespace(camera=standing(x, time)) for x, time in ((0, 0.0), (1, 0.5), (2, 1.0))]
     component, part = LifespansComponent((0.0, 0.5, 1.0)), dict.fromkeys(("scene", "photographs"), list)
     rows = GaussianRows.from_points(torch.randn(9, 3, generator=draw), torch.rand(9, 3, generator=draw), 0.8)
     rows.add_tensor("motion", torch.zeros(9))  # as the field has added it
@@ -473,7 +485,7 @@ def test_the_search_is_made_once_and_says_what_was_added(monkeypatch):
     (event,) = component.before_density(fit_of_these)
     assert (event["found"], event["added"], event["gaussians"]) == (5, 1, 10)
     assert "1 Gaussians with a limited lifetime are added, 4 more have no room" in component.describe(event)
-    fit_of_these.frames = [*frames[:1] * 3, *frames]
+    fit_of_these.frames = [*(SimpleNamespace(camera=standing(x, 0.0)) for x in (1, 2, 3)), *frames]
     assert shows_first_time(fit_of_these.frames)
     fit_of_these.step_index += round(WARM_UP * stage.length)
     assert component.before_density(fit_of_these) == []

