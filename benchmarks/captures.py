@@ -41,7 +41,9 @@ arcs (benchmarks/kitchen.py; max_steps = 1500 and semantics = "ignore" in fit.to
 
 Named on 2026-11-29, before they ran: on all of these starts, farthest point sampling of positions and directions
 (benchmarks/farthest_poses.py); in the rooms, views of one object with `region` (benchmarks/regions.py). Of halls and
-kitchens one start each is run first.
+kitchens one start each is run first: hall43 and kitchen45 by commit 8da4b168, whose fits began with the four
+photographs of the first time. Since f9c1d494 they begin with those of all times (kitchen45 by `random` and `farthest`
+has 4.5 dB more); all are to be run again, so that no page has these rows.
 
 As starts in the rooms have differed (a standard deviation of 0.6 to 1.5 dB of the average over numbers of views, by the
 other policy), a paired t test finds 0.8 to 2.1 dB with six starts and 0.7 to 1.7 dB with eight, in 4 of 5 studies; four
@@ -80,9 +82,8 @@ DEFAULT = "geometry+backdrop, v_opt"
 OTHERS = ("farthest", "fisherrf", "uniform")
 POOL_OTHERS = ("random", "uniform", "farthest", "fisherrf")
 FREE_OTHERS = ("random", "farthest", "farthest, directions", "fisherrf", "coverage", "moments")
-FREE_KINDS = {"Rooms": "free", "Still lifes": "still", "Halls and kitchens": ("hall", "kitchen")}
+FREE_KINDS = {"Rooms": "free", "Still lifes": "still"}
 """Kind of free poses -> how names of its scenes begin."""
-MOVING_DEFAULT = "joint+backdrop, v_opt"
 LEFT = "blur"
 SHOWN = (10, 20)  # views
 
@@ -125,28 +126,15 @@ def section(rows: Rows) -> str:
 
 
 def free_section(rows: Rows) -> str:
-    """The text and the tables of free poses: rooms, still lifes, and where things move."""
+    """The text and the tables of free poses: rooms, and still lifes."""
     parts = []
     for kind, starts in FREE_KINDS.items():
         own = [row for row in rows if row["scene"].startswith(starts)]
-        if not own:
-            continue
         scenes, commits = (", ".join(sorted({row[key] for row in own})) for key in ("scene", "commit"))
         commits = f"commit{'s' * (',' in commits)} {commits}"
         head = f"**{kind}** ({scenes}): {len(own)} fits, {len({unit_of(row) for row in own})} starts, {commits}."
-        moving = any(row["policy"] == MOVING_DEFAULT for row in own)
-        parts += [textwrap.fill(head, 120), moving_table(own) if moving else compared_with(own, FREE_OTHERS)]
+        parts += [textwrap.fill(head, 120), compared_with(own, FREE_OTHERS)]
     return "\n\n".join(parts)
-
-
-def moving_table(rows: Rows) -> str:
-    """The table of the default less others where things move, after all picks."""
-    lines = []
-    for other in FREE_OTHERS:
-        found = [differences(rows, metric, MOVING_DEFAULT, other) for metric in ("psnr", "psnr_moving")]
-        if found[0]:
-            lines.append([f"`{other}`", str(len(found[0])), *(lead(one, 2) for one in found)])
-    return markdown_table(["against", "starts", "PSNR", "moving pixels"], lines)
 
 
 def pool_section(rows: Rows) -> str:
