@@ -207,7 +207,7 @@ def test_matches_of_the_first_time_are_not_those_of_all_photographs(dataset, mon
     made = np.random.default_rng(0).random((9, 3)), np.full((9, 3), 0.5, np.float32), "made for a test"
     monkeypatch.setattr(starting, "initial_points", lambda *_: made)
     for times in ((None,) * 9, (0.0,) * 9, (0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 2.0, 2.0, 2.0)):
-        cameras = [dataclasses.replace(view.camera, time=time) for view, time in zip(dataset.views, times, strict=True)]
+        cameras = [dataclasses.replace(dataset.views[i % 3].camera, time=time) for i, time in enumerate(times)]
         views = [dataclasses.replace(view, camera=x) for view, x in zip(dataset.views, cameras, strict=True)]
         bare = dataclasses.replace(dataset, views=views, points=None, colors=None)
         setup = Setup(bare, config(dynamics="ignore"), views, [], views, (), ())
