@@ -6,8 +6,6 @@ import pytest
 
 from drgs.display import tables
 
-pytestmark = pytest.mark.core
-
 LONG = "IMG_20231012_123456_a_name_that_is_rather_long_[bold].JPG"
 
 
