@@ -31,7 +31,7 @@ class PlyElement:
     """An element: what it is called, how many rows it has, and its columns.
 
     Attributes:
-        kinds: The type of each column, as the file names it; of a list, that of its entries.
+        kinds: The type of each column, as the file names it; of a list, that of its length.
     """
 
     name: str
@@ -64,12 +64,12 @@ def read_ply_header(path: Path) -> list[PlyElement]:
     end = last.start() + 1 if last else -1
     newline = head.find(b"\n", end)
     if not head.startswith((b"ply\n", b"ply\r")) or end < 0 or newline < 0:
-        raise ValueError(f"{path}: must be a PLY file, got {head[:8]!r}; convert it to a 3DGS PLY")
+        raise ValueError(f"{path}: must be a PLY file, got {head[:8]!r}; export it again")
     elements: list[PlyElement] = []
     text_format = None
     for line in head[:end].decode("ascii", "replace").splitlines():
         match line.split():
-            case ["format", kind, _]:
+            case ["format", "ascii" | "binary_little_endian" | "binary_big_endian" as kind, _]:
                 text_format = kind
             case ["element", name, count] if count.isdecimal() and len(count) < 1000:
                 elements.append(PlyElement(name, int(count)))
