@@ -132,7 +132,7 @@ SCENES: dict[str, Callable[[np.random.Generator], Scene]] = {
     "opacities of 1e-8 to 1e-4": faint,
     "needles, 30:1": needles,
     "fisheye, 175 degrees": fisheye,
-    "that fisheye inside": fisheye_inside,
+    "fisheye, camera inside": fisheye_inside,
     "tails alone": tails_alone,
 }
 
@@ -216,8 +216,8 @@ def text(result: dict[str, Any]) -> str:
     """What the page says."""
     told = (
         f"`python benchmarks/claims.py`, {result['machine']}, {result['date']}, commit {result['commit']}: the "
-        f"largest error of preset `exact` over {result['scenes']} scenes of each kind, of images absolute, of others "
-        "relative in norm, of the Fisher diagonal to the group's largest entry ([every parameter group and "
+        f"largest error of preset `exact` over {result['scenes']} scenes of each kind, absolute for images, relative "
+        "in norm for derivatives, for the Fisher diagonal to its group's largest entry ([every parameter group and "
         "response](data/claims.csv))."
     )
     lines = []

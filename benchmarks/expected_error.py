@@ -200,14 +200,14 @@ def summary(rows: list[dict]) -> str:
     """What the runs that only report say together, captures and made scenes apart."""
     sentences = []
     parts = halves(rows)
-    kinds = {"captures": "captures that chose nothing", "made": "made scenes that chose nothing"}
+    kinds = {"captures": "captures not tuned on", "made": "made scenes not tuned on"}
     kinds["picked"] = "fits to 20 views that the default picked among free poses or in pools as people leave them"
     for kind, what in kinds.items():
         some = parts[kind]
         if not some:
             continue
         names = [TOLD, next(iter(MAPS)), "1 - alpha"]
-        means = (f"{name} {statistics.mean(row['ause'][name] for row in some):.2f}" for name in names)
+        means = (f"{statistics.mean(row['ause'][name] for row in some):.2f} ({name})" for name in names)
         told, true = ([x for row in some for x in row[key]] for key in ("told", "true"))
         sentences.append(
             f"On {len(some)} {what}, mean AUSE: {', '.join(means)}; Spearman's rho of views' errors, over "

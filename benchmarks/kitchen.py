@@ -118,7 +118,7 @@ def told(rows: Rows) -> str:
         if (values := differences(rows, "psnr", DEFAULT, label)) and (one := estimate(values)).detectable is not None
     ]
     least = f"; {np.median(seen):.2f} dB would be detectable" if seen else ""
-    return f"{size}. {held} of such intervals hold the true mean{least}."
+    return f"{size}. {held} of such intervals contain the true mean{least}."
 
 
 def unit_lines(study: Study, rows: Rows) -> Iterator[list[str]]:

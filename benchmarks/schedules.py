@@ -213,7 +213,7 @@ def write_page() -> None:
     of, plain, cut, small = (f"{min(column)} to {max(column)}" for column in zip(*shares, strict=True))
     told = (
         f"At 130,000 pixels, over {len(shares)} captures, a step takes {cut} times as long as one of `fast`, and "
-        f"{plain} times without the tolerance, when `exact` has a share of {of}; a step of half the width and height "
+        f"{plain} times without the tolerance, {of} of that in `exact`; a step of half the width and height "
         f"takes {small} of the time of one of full size."
     )
     fill_between(PAGE, "step_times", paragraph(told))
