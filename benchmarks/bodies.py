@@ -125,9 +125,9 @@ def summary(rows: list[dict]) -> str:
         told.append(f"{psnr:.1f} ({psnr_off:.1f}) dB in `{scene}`")
     overlap = min(row["worst_overlap"] for row in fits)
     return paragraph(
-        f"Moving bodies of a physics simulator, photographed by one of 12 cameras at each time, have {told[0]}, "
-        f"{told[1]} and {told[2]} (in parentheses: `--lives off`); what is rendered as moving overlaps with their "
-        f"masks by {overlap:.2f} at worst ([{len(fits)} fits](data/moving-bodies.csv), `python benchmarks/bodies.py`, "
+        "Pixels of bodies moved by a physics simulator, photographed by one of 12 cameras at each time, have "
+        f"{told[0]}, {told[1]} and {told[2]} (in parentheses: `--lives off`); the IoU of their masks with rendered "
+        f"motion is {overlap:.2f} at worst ([{len(fits)} fits](data/moving-bodies.csv), `python benchmarks/bodies.py`, "
         f"{fits[-1]['machine']}, {fits[-1]['date']})."
     )
 

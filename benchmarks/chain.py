@@ -102,8 +102,8 @@ def text(result: dict) -> str:
         means, worst = [100 * x["regret"] for x in own], 100 * max(x["worst_regret"] for x in own)
         told.append(f"`{form}` {min(means):.1f} to {max(means):.1f} % ({worst:.0f} %)")
     return paragraph(
-        f"Mean regret (and the worst one): {', '.join(told)} ([each case](data/criteria.csv); "
-        f"`python benchmarks/chain.py`, {result['machine']}, {result['date']})."
+        f"Mean regret (and the worst one; the [trace bound](maths.md#scores) is no criterion): {', '.join(told)} "
+        f"([each case](data/criteria.csv); `python benchmarks/chain.py`, {result['machine']}, {result['date']})."
     )
 
 

@@ -177,9 +177,9 @@ def section() -> str:
         found.append(f"{told}: {recorded:.1f} instead of {traced:.1f}")
     made = list(shown.values())[-1]["ran"]
     return paragraph(
-        "Images of a pinhole on tiles, their gradients and their Fisher information are launched as they were recorded "
-        "at the first frame of the same sizes and settings (`drgs/tracing/recordings.py`), with the same bits on LLVM; "
-        f"all else is traced by Python each time. Milliseconds of the processor: {'; '.join(found)} (`python "
+        "Images of a pinhole on tiles, their gradients and their Fisher information replay kernels recorded at the "
+        "first frame of the same sizes and settings (`drgs/tracing/recordings.py`), bit for bit on LLVM; all else is "
+        f"traced anew each time. CPU milliseconds: {'; '.join(found)} (`python "
         f"benchmarks/recordings.py`, {made['machine']}, {made['date']}, commit {made['commit']})."
     )
 

@@ -319,8 +319,8 @@ def report(result: dict) -> str:
             paragraph(
                 f"Of {x['true hits']:,} true hits (within 3 sigma, counted by `tiles`) `bvh` finds "
                 f"{100 * x['bvh finds']:.2f} %, `volprim_rf_basic` {100 * x['volprim finds']:.2f} %, in "
-                f"{x['bvh ns per true hit']:.0f} and {x['volprim ns per true hit']:.0f} ns each; a lone Gaussian of "
-                "this size it misses on 40 % of its rays."
+                f"{x['bvh ns per true hit']:.0f} and {x['volprim ns per true hit']:.0f} ns each; "
+                "`volprim_rf_basic` misses a lone Gaussian of this size on 40 % of its rays."
             )
         )
     growth = "; ".join(
