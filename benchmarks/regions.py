@@ -552,8 +552,8 @@ def write_page() -> None:
     commits = ", ".join(sorted({row["commit"] for row in told}))
     head = (
         f"PSNR of the object with `region` less that of another policy, in dB, with 95 % intervals "
-        f"({coverage(3, 18):.0%} contain the true mean in simulated studies); bold where that excludes 0 and "
-        f"there are {FEWEST_UNITS} units; *wins*: units in which `region` is better, 3 to 12 views. {len(told)} fits by "
+        f"({coverage(3, 18):.0%} contain the true mean in simulated studies); bold where that excludes 0 and there "
+        f"are {FEWEST_UNITS} units; *wins*: units in which `region` is better, 3 to 12 views. {len(told)} fits by "
         f"`python benchmarks/regions.py`, {told[0]['machine']}, {told[0]['date']}, commits {commits} "
         "([rows](../benchmarks/regions.jsonl), [by fit](data/active-region.csv), [4 views, and "
         "IoU](data/active-region-differences.csv))."

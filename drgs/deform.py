@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 __all__ = ["DeformationField", "Deltas", "DynamicGaussians", "FieldConfig"]
 
 _HEADS = {"means": 3, "quats": 4, "log_scales": 3}
-_SPAN_TOLERANCE = 1e-6  # of the span: how far outside of it a time may lie, by rounding
-_LEAST_SIDE = 1e-3  # of the longest side of the bounds: shortest other side, which coordinates are divided by; chosen
+_SPAN_TOLERANCE = 1e-6  # fraction of the span by which rounding may put a time outside of it
+_LEAST_SIDE = 1e-3  # shortest side of the bounds / longest: keeps divisors of flat scenes above 0; chosen
 PHI = "phi."
 LENGTHS = ("mlp.means.3.weight", "mlp.means.3.bias")
 """Weights of a field that are lengths: the last of the head for means, whose outputs are in world units."""
@@ -144,9 +144,9 @@ class DeformationField(torch.nn.Module):
             time: A number, or a scalar tensor, which the deltas are then differentiated by.
             origin: (3,) world units, or None for 0.
         Returns:
-            Deltas in the dtype of the weights, differentiable in both modes by weights, means and time. By the time the
-            derivative is that of the cell above, at a node of the grid too: one-sided there, from the right (from the
-            left at the last one).
+            Deltas in the dtype of the weights, differentiable in both modes by weights, means and time. At a node of
+            the time grid the derivative with respect to time is the right-sided one (the left-sided one at the last
+            node).
         Raises:
             ValueError: If the time lies outside of the span.
         """
@@ -163,8 +163,8 @@ class DeformationField(torch.nn.Module):
         planes = [weights[f"grid.{k}"] for k in range(len(self.grid))]
         return _deltas(weights, features(planes, self._places(means, origin), self._moment(time, means.device)))
 
-    def squared_slopes(
-        self, means: torch.Tensor, time: float, slopes: Deltas, origin: ArrayLike | None = None
+    def squared_vjps(
+        self, means: torch.Tensor, time: float, cotangents: Deltas, origin: ArrayLike | None = None
     ) -> dict[str, torch.Tensor]:
         """Squares of J^T u, J the derivative of the deltas by the parameters, summed over K cotangents u.
 
@@ -172,7 +172,7 @@ class DeformationField(torch.nn.Module):
 
         Args:
             means, time, origin: The same as for `forward`.
-            slopes: The cotangents, (K, N, 3), (K, N, 4) and (K, N, 3).
+            cotangents: (K, N, 3), (K, N, 4) and (K, N, 3), of the deltas.
         Returns:
             A tensor of the shape of each parameter, named as in `named_parameters`.
         """
@@ -187,7 +187,9 @@ class DeformationField(torch.nn.Module):
             deltas = _deltas(mlp, product(found))
         squared = [torch.zeros_like(x, requires_grad=False) for x in mlp.values()]
         by_nodes = [own.squares(torch.zeros_like(x)) for own, x in zip(corners, found, strict=True)]
-        for some in zip(*slopes, strict=True):  # one after another: together, copies would cost more than they spare
+        for some in zip(
+            *cotangents, strict=True
+        ):  # one after another: together, copies would cost more than they spare
             by_leaf = torch.autograd.grad(deltas, leaves, some, retain_graph=True)
             squared = [x.add_(slope.square()) for x, slope in zip(squared, by_leaf, strict=False)]
             for k, own in enumerate(corners):
@@ -276,7 +278,7 @@ class DynamicGaussians:
             "DynamicGaussians", "field", field, DeformationField, "DeformationField(config, bounds, span) makes one"
         )
         if motion is not None:
-            must_be("DynamicGaussians", "motion", motion, torch.Tensor, "a logit a Gaussian")
+            must_be("DynamicGaussians", "motion", motion, torch.Tensor, "(N,) floats, one logit per Gaussian")
             if tuple(motion.shape) != (len(gaussians),) or not motion.is_floating_point():
                 raise ArgumentError(
                     f"DynamicGaussians: motion must be {len(gaussians)} floats, one a Gaussian, got {motion.dtype} of "
@@ -375,15 +377,15 @@ class DynamicGaussians:
             self._apply_lifespans(fields, lifespans, time)
         return self.gaussians.replace(**fields)
 
-    def squared_slopes(
-        self, time: float, index: torch.Tensor, slopes: Mapping[str, torch.Tensor]
+    def squared_vjps(
+        self, time: float, index: torch.Tensor, cotangents: Mapping[str, torch.Tensor]
     ) -> dict[str, torch.Tensor]:
         """Squares of J^T u, J the derivative of raw fields by the field's parameters, summed over K cotangents u.
 
         Args:
             time: The time.
             index: (M,) int64: Gaussians whose cotangents are given; all others have 0.
-            slopes: The cotangents: (K, M, 3) `means`, (K, M, 4) `quats`, (K, M, 3) `log_scales`.
+            cotangents: (K, M, 3) `means`, (K, M, 4) `quats`, (K, M, 3) `log_scales`.
         Returns:
             A tensor of the shape of each parameter, named as in `parameters`: `phi.grid.*`, `phi.mlp.*`.
         """
@@ -391,12 +393,12 @@ class DynamicGaussians:
         index = index.to(home.device)
         moves = self.moving[index]
         index = index[moves]
-        of_deltas = [slopes[name].to(home)[:, moves] for name in Deltas._fields]
+        of_deltas = [cotangents[name].to(home)[:, moves] for name in Deltas._fields]
         if self.motion is not None:
             factor = (0.5 * self.motion.detach()[index]).tanh().to(home.dtype)
             of_deltas = [x * factor[:, None] for x in of_deltas]
         means = self.gaussians.means.detach()[index]
-        found = self.field.squared_slopes(means, time, Deltas(*of_deltas), self.gaussians.origin)
+        found = self.field.squared_vjps(means, time, Deltas(*of_deltas), self.gaussians.origin)
         return {PHI + name: x for name, x in found.items()}
 
     def _apply_lifespans(
@@ -422,9 +424,9 @@ class _FieldJacobian:
         self._time = time
         self._names = names
 
-    def squared_slopes(self, index: torch.Tensor, slopes: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    def squared_vjps(self, index: torch.Tensor, cotangents: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """As `drgs.dynamics.jacobian.SceneJacobian`."""
-        found = self._scene.squared_slopes(self._time, index, slopes)
+        found = self._scene.squared_vjps(self._time, index, cotangents)
         return {name: found[name] for name in self._names}
 
 
@@ -435,7 +437,7 @@ def is_finite(x: torch.Tensor) -> bool:
 
 def _check_lifespans(lifespans: Lifespans, count: int) -> None:
     """Raise ValueError unless every tensor has a row for each of `count` Gaussians."""
-    must_be("DynamicGaussians", "lifespans", lifespans, Lifespans, "a center, a width, ... a Gaussian")
+    must_be("DynamicGaussians", "lifespans", lifespans, Lifespans, "from drgs.dynamics.lifespans, a row per Gaussian")
     for name, x in zip(Lifespans._fields, lifespans, strict=True):
         shape = (count, 3) if name in ("velocities", "accelerations") else (count,)
         if tuple(x.shape) != shape or not x.is_floating_point():
@@ -454,7 +456,7 @@ def _name_what_is_not_finite(parameters: dict[str, torch.Tensor], moved: dict[st
             at = tuple(bad.nonzero()[0].tolist())
             raise ArgumentError(
                 f"DynamicGaussians.at: {name} must be finite, got {float(x[at]):g} at index {list(at)} "
-                f"({int(bad.sum())} of {x.numel()}); go back to weights that were"
+                f"({int(bad.sum())} of {x.numel()}); go back to weights that were finite"
             )
 
 

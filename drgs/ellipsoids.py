@@ -281,7 +281,7 @@ def check_any_scene(where: str, scene: Any) -> None:
     """Raise `ArgumentError` unless this is a `Scene`, which names its parameters (a torch Module does not)."""
     if not isinstance(scene, Scene):
         check_gaussians(where, scene)
-    hint = "tensors by name, of a torch.nn.Module dict(self.named_parameters())"
+    hint = "return {name: tensor}; a torch.nn.Module returns dict(self.named_parameters())"
     must_be(where, "scene.parameters()", scene.parameters(), Mapping, hint)
 
 

@@ -122,10 +122,10 @@ def diagonal(
             without leading axes: `means`, `quats`, `scales`, `opacities`, `colors`, `viewmats`, `Ks`, `width`,
             `height`, and maybe `sh_degree` and `backgrounds`.
     Returns:
-        Group -> float64 tensor on the CPU. Of tensors, too, about the raw parameters: H of `log_scales` divided by
-        scales^2 is about the scales, H of `logit_opacities` divided by (opacities (1 - opacities))^2 about the
-        opacities. Of plain colors (N, D) the first three channels are `sh` (N, 1, min(D, 3)), divided by
-        1 / (4 pi) about the colors themselves; the others are `features`, which say nothing about the geometry.
+        Group -> float64 tensor on the CPU. Given tensors, it is still about the raw parameters: for the
+        scales divide H of `log_scales` by scales^2, for the opacities H of `logit_opacities` by
+        (opacities (1 - opacities))^2. Of plain colors (N, D) the first three channels are `sh` (N, 1, min(D, 3)), for
+        the colors to be divided by 1 / (4 pi); the others are `features`, which say nothing about the geometry.
     Raises:
         ValueError: If a method, group, weight or tensor is unknown or wrong, a parameter is not finite, or the
             Gaussians of a scene are not as many in all views.
@@ -238,7 +238,8 @@ def backdrop(
             None: infinitely far away.
         seen_opacity: (H, W) of each view, where they are known, as `drgs.render` gives them; None: they are rendered.
         nuisances: The same as for `diagonal`.
-        semantics: The metric of the features, which show where the camera stands, too; None: only colors do.
+        semantics: The metric of the features, which help to determine the nuisances; no effect without any. None:
+            only colors help.
     """
     gaussians = once_per_time(gaussians)
     cameras, each, shown = checked_views("fisher.backdrop", gaussians, cameras, settings, masks)
@@ -273,8 +274,8 @@ def removal_error(
     Args:
         scene: N Gaussians, world frame, or a `drgs.ellipsoids.Scene`, whose Gaussians each camera sees at its time.
         cameras, settings: The same as for `diagonal`.
-        power: Of the length, over the channels, of a pixel's change: 2 is squared color, summed over pixels, channels
-            and views. 1.5 and 1 say more of what many Gaussians change together.
+        power: Exponent of the norm, over the channels, of a pixel's change, summed over pixels and views: 2 sums
+            squared colors. 1.5 and 1 say more of what many Gaussians change together.
         channel_weights: Factors of the squares of R, G and B.
         semantics: The metric in which features are a part of the image; None: colors are all of it.
         masks: One for each camera: (H, W) in [0, 1] what its image is multiplied by before it is compared; or None: 1.
@@ -312,7 +313,7 @@ def network(
         settings: Default `RenderSettings.preset("exact")`.
         estimate: `diagonal`, `trace` or `paper`, see `drgs.information.network`.
         mode: Mode of `trace`: `reverse`, or `forward`, whose tangents are carried some at a time through one
-            traversal. `diagonal` has reverse mode only, `paper` needs both.
+            traversal. With `diagonal` and `paper`, which itself uses both, pass `reverse`.
         probes: K, of each view; the error falls as 1 / sqrt(K).
         seed: Seed of the random signs, the same in all views.
         channel_weights: Inverse noise variances of R, G and B.
@@ -353,8 +354,9 @@ def network_variance_map(
     mean of (J v)^2 over v = z sqrt(weights), z random signs: forward mode.
 
     Args:
-        scene, camera, settings, probes, seed, channel_weights, semantics: The same as for `network`; a pixel of n rows
-            has a relative error of about sqrt(2 / (n probes)) at most sqrt(2 / probes).
+        scene, camera, settings, probes, seed, channel_weights, semantics: The same as for `network`; the
+            relative error of a pixel is about sqrt(2 / probes) at most, and sqrt(2 / (n probes)) if its n rows are
+            orthogonal and equally long.
         weights: Group -> (P,) as `network` returns it, >= 0; groups that are missing weigh 0.
     Raises:
         ValueError: If the scene has no network, or a weight is negative, not finite or of another shape.

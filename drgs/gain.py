@@ -1,4 +1,4 @@
-"""Information gain of a view, given the information of the known views: criteria of Fisher information, in nats.
+"""Information gain of a view, given the information of the known views: criteria of Fisher information.
 
 The public side of `drgs.information.gains` and `drgs.information.criteria`, which say what each is.
 """

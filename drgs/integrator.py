@@ -59,11 +59,11 @@ def render(
         couple_features: Whether the feature image has derivatives by all that it depends on. If not, only by
             `features`: what is learned about them moves no Gaussian (Zhou et al. 2024, Feature 3DGS).
         lens: (5 + D,) a torch tensor in place of the cameras' `lens_parameters` (fx, fy, cx, cy, skew, distortion),
-            which is differentiated, for responses along rays. Where a lens has no inverse, rays do not move.
+            which is differentiated, for responses along rays. Pixels at which a lens has no inverse have derivative 0.
         rays: (H, W, 6) origin and direction of each pixel, world frame, differentiable, instead of those of the camera,
             which still says whose z and distance count, and from where colors are seen; for responses along rays. A
-            direction of 0 is no ray: its pixel shows the background. Best where origins lie close together: lists of
-            tiles are for all of them.
+            direction of 0 is no ray: its pixel shows the background. Fastest if origins lie close together: the list of
+            Gaussians of a tile serves the rays from all of them.
     Returns:
         An `Output`; of a list of C cameras each tensor has a leading axis C, and `certificate` is a list.
     Raises:
@@ -139,9 +139,9 @@ def render_jvp(
             (6,) of the last line's; `lens` (5 + D,), of the camera's `lens_parameters`; `rays` (H, W, 6) where these
             are given, which `camera` does not move. Of a `drgs.ellipsoids.DeformableScene` the names are those of its
             `parameters()` that are floats, `camera`, `lens`, and `rotations` where it has `quats`; `time`, a number:
-            how fast the time of the view passes; and `phi`, a mapping of x to the tangent of `phi.x`. So none of its
-            own may be called `camera`, `camera_end`, `lens`, `rays`, `rotations`, `time`, `phi`, `w2c`, `ray_origins`,
-            `ray_directions` or `ray_shifts`. By the time the derivative is the scene's own, one-sided where that has a
+            the tangent of the view's time; and `phi`, a mapping of x to the tangent of `phi.x`. So none of its own may
+            be called `camera`, `camera_end`, `lens`, `rays`, `rotations`, `time`, `phi`, `w2c`, `ray_origins`,
+            `ray_directions` or `ray_shifts`. The derivative with respect to time is the scene's own, one-sided at a
             kink (`drgs.DeformationField`).
     Returns:
         An `Output` of image-shaped tangents, with the leading axis K if the tangents had one. All K are carried

@@ -88,7 +88,7 @@ _INSTEAD = {
     "external_distortion_coeffs": _RAYS,
     "camera_model='ortho'": _RAYS,
     "camera_model='lidar'": _RAYS,
-    "with_ut without with_eval3d": "the image plane's Gaussians are those of the EWA model here; pass both, or neither",
+    "with_ut without with_eval3d": "2D Gaussians come from EWA only; pass with_eval3d=True, too, or drop with_ut",
 }
 
 
@@ -159,8 +159,8 @@ def rasterization(
         near_plane, far_plane: Means outside of (near_plane, far_plane] in camera z are left out, in distance with
             `with_eval3d` and `global_z_order=False`.
         radius_clip: Gaussians whose radius (`meta["radii"]`) is at most this many pixels in both axes are left out.
-        eps2d: Added to the diagonal of the projected covariance, in px^2. Along rays nothing is; the boxes of `with_ut`
-            have 0.3.
+        eps2d: Added to the diagonal of the projected covariance, in px^2. With `with_eval3d` nothing is
+            added; the boxes of `with_ut` always have 0.3.
         sh_degree: 0 to 3, or None for plain colors.
         backgrounds: (..., C, D) or None for black; behind a depth there is 0.
         render_mode: RGB; D (sum w z), ED (that over alpha), RGB+D, RGB+ED: the Gaussian's own depth as the last
@@ -607,8 +607,8 @@ def _check_unscented(params: object) -> None:
         value = getattr(params, name, usual)
         if value != usual:
             raise NotImplementedError(
-                f"rasterization: ut_params must be alpha 0.1, beta 2, kappa 0, got {name}={value:g}; leave with_ut "
-                "out, and nothing is culled by boxes"
+                f"rasterization: ut_params must have gsplat's default {name}={usual}, got {value}; pass None, or drop "
+                "with_ut"
             )
 
 

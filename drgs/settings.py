@@ -24,20 +24,20 @@ __all__ = [
     "Preset",
     "RenderSettings",
     "check_settings",
-    "legal",
+    "why_illegal",
 ]
 
 Preset = Literal["exact", "fast", "inria", "gsplat", "3dgut", "mitsuba"]
 PRESETS: tuple[Preset, ...] = typing.get_args(Preset)
 
-# Depth is divided by max(alpha, EPS_ALPHA): what no ray meets has a finite one.
+# Depth is sum w t* / max(alpha, EPS_ALPHA): 0, not NaN, in pixels that no Gaussian covers.
 EPS_ALPHA = 1e-10
 
 TOLERANCE_OF_PICTURES = 1 / 512
 """Half a step of 8 bits, which is all that files of pictures and screens hold."""
 TOLERANCE_OF_END = 0.1
-"""Share of `tolerance` that may be behind the place where a ray ends; the rest is that of the tails that are left out.
-A ray ends early on few pixels, and tails are on all.
+"""Share of `tolerance` for ending rays early, which happens in few pixels; the rest is for the tails that are cut off,
+which is in all.
 """
 
 RESPONSES: Registry[Any] = Registry(
@@ -181,7 +181,7 @@ class RenderSettings:
         for name in ("extent", "alpha_max", "tolerance"):
             if getattr(self, name) == 0:
                 raise ValueError(f"RenderSettings: {name} must be > 0, got 0")
-        problem = legal(self)
+        problem = why_illegal(self)
         if problem:
             raise NotImplementedError(f"RenderSettings: {problem}")
 
@@ -255,7 +255,7 @@ def _refuse_unknown(fields: Iterable[str]) -> None:
         raise ValueError(f"RenderSettings: unknown field {unknown[0]!r}; the fields are {', '.join(sorted(known))}")
 
 
-def legal(s: RenderSettings) -> str | None:
+def why_illegal(s: RenderSettings) -> str | None:
     """Why a combination of response, order and traversal does not exist, or None when it does."""
     if s.planar and s.traversal == "bvh":
         return f"response={s.response!r} is defined on the image plane, use traversal='tiles' (got 'bvh')"

@@ -92,13 +92,22 @@ def test_version(capsys):
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        ("capture photos -o x --max-steps 9", "options must be those of the command, got --max-steps (of drgs fit"),
-        ("fisher x --max-pixels 9", "got --max-pixels (of drgs view, fit"),
+        ("capture photos -o x --max-steps 9", "--max-steps must be an option of this command (it is one of drgs fit"),
+        ("fisher x --max-pixels 9", "--max-pixels must be an option of this command (it is one of drgs view, fit"),
         ("fit data -o x --max-steps -1", "drgs fit: --max-steps must be a whole number in [1, 1000000000], got -1"),
         ("prune scene.ply -o small.ply --keep 2", "drgs prune: --keep must be a share above 0 and below 1, got 2"),
-        ("fisher x --data y", "got --data (of drgs prune, reproduce); did you mean --train?"),
-        ("fit data -o x --iterations 9", "got --iterations; did you mean --max-steps?"),
-        ("crossval --scene x", "got --scene; SCENE has no option: it stands alone"),
+        (
+            "fisher x --data y",
+            "(it is one of drgs prune, reproduce), is none; did you mean --train?",
+        ),
+        (
+            "fit data -o x --iterations 9",
+            "--iterations must be an option of this command, is none; did you mean --max-steps?",
+        ),
+        (
+            "crossval --scene x",
+            "--scene must be an option of this command, is none; SCENE has no option: it stands alone",
+        ),
         ("cite nowhere", "drgs cite: nowhere: must be a run folder, nothing is there; check the path"),
         ("fit scene.ply -o x", "drgs view, fisher, select and prune take a fitted scene"),
         ("fit scene.spz -o x", "drgs view, fisher, select and prune take a fitted scene"),
@@ -121,7 +130,10 @@ def test_messages_name_what_was_typed(line, expected, capsys, monkeypatch, tmp_p
         ("rendr x", "got 'rendr'; did you mean render?"),
         ("fit DATA", "drgs fit: --output must be given, is missing; add --output PATH"),
         ("render", "drgs render: SCENE must be given, is missing; add SCENE"),
-        ("render x --widht 3", "drgs render: options must be those of the command, got --widht; did you mean --width?"),
+        (
+            "render x --widht 3",
+            "drgs render: --widht must be an option of this command, is none; did you mean --width?",
+        ),
         ("render x --width a", "drgs render: --width must be a whole number, got 'a'; correct it"),
         ("render x --preset best", "'best'"),
         ("info --threads 0", "drgs info: setup: threads must be a whole number in [1, 4096]"),

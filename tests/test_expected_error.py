@@ -18,7 +18,16 @@ from drgs.cameras import orbit
 from drgs.checks.arguments import ArgumentError
 from drgs.fitting.semantic_errors import wrong_label
 from drgs.information.backdrop import backdrop_cells
-from drgs.information.expected_error import ANGLE, HIDDEN, NEW, PARTS, PIVOT, SPREAD, error_parts, residual_record
+from drgs.information.expected_error import (
+    ANGLE,
+    NEW_DIRECTION,
+    OFF_DIAGONAL,
+    PARTS,
+    PIVOT,
+    UNSEEN,
+    error_parts,
+    residual_record,
+)
 from drgs.settings import RenderSettings
 
 
@@ -84,10 +93,10 @@ def test_brute_force(rng, settings):
         per = misfit.reshape(-1, *[1] * (x.ndim - 2)) / (H[name] + prior)
         variance = variance + (x.square() * per).flatten(1).sum(1).reshape(-1, 3).sum(1)
     truth = {
-        "misfit": w @ fitted + T * NEW * (behind[1] + mean) / (behind[0] + 1),
-        "direction": w @ (NEW * misfit / (n + 1)),
-        "information": SPREAD / 3 * variance,
-        "unseen": HIDDEN * contrast[1] / contrast[0] * T.square() / (cells[backdrop_cells(cam, sphere)].flatten() + 1),
+        "misfit": w @ fitted + T * NEW_DIRECTION * (behind[1] + mean) / (behind[0] + 1),
+        "direction": w @ (NEW_DIRECTION * misfit / (n + 1)),
+        "information": OFF_DIAGONAL / 3 * variance,
+        "unseen": UNSEEN * contrast[1] / contrast[0] * T.square() / (cells[backdrop_cells(cam, sphere)].flatten() + 1),
     }
     record = drgs.error_record(g, others, images, settings, masks=masks)
     assert float((record.misfit - misfit).abs().max()) <= 1e-4 * float(misfit.max())
@@ -349,8 +358,8 @@ def test_residuals_of_another_kind(rng, settings):
     T = 1 - w.sum(1)
     fitted = sum(k * x for k, x in zip(near, told, strict=True)) / (n + 1)
     truth = {
-        "misfit": w @ fitted + T * NEW * (behind[1] + mean) / (behind[0] + 1),
-        "direction": w @ (NEW * misfit / (n + 1)),
+        "misfit": w @ fitted + T * NEW_DIRECTION * (behind[1] + mean) / (behind[0] + 1),
+        "direction": w @ (NEW_DIRECTION * misfit / (n + 1)),
         "unseen": 0.7 * T.square(),
     }
     record = residual_record(g, others, residuals, 0.7, settings, masks=masks)
@@ -381,7 +390,7 @@ def test_a_wrong_label_is_told(ring):
         (torch.zeros(24, 31), 1.0, r"must be \(24, 32\) like its camera"),
         (-torch.ones(24, 32), 1.0, "must be finite floats >= 0"),
         ([torch.zeros(24, 32)] * 2, 1.0, "one for each of 1 cameras, got 2"),
-        (torch.zeros(24, 32), math.nan, "nothing must be a finite number"),
+        (torch.zeros(24, 32), math.nan, "empty_residual must be a finite number"),
     ],
 )
 def test_residuals_are_checked(ring, residuals, nothing, message):

@@ -91,7 +91,7 @@ def test_expected_error_of_a_run(place, monkeypatch, capsys, caplog):
     assert report["misfit"] is None
     assert "error" not in report["views"][0]
     assert "expected error" not in text
-    assert caplog.text.count("cameras.json: has cameras without photographs, so that information alone is told") == 1
+    assert caplog.text.count("cameras.json: has no photographs: only information is written, no expected error") == 1
 
 
 def test_expected_error_of_a_splat(place, monkeypatch, capsys, caplog):
@@ -265,7 +265,7 @@ def test_a_splat_of_nerfstudio_is_brought_to_the_cameras(place, tmp_path, capsys
     assert f"splat.ply: is in another frame, brought to that of {place / 'data'} by {splat.parent}" in caplog.text
     (splat.parent / "dataparser_transforms.json").unlink()
     assert cli.main([*line, str(tmp_path / "two")]) == 0
-    assert "what follows says nothing of it; name the data set that it was fitted to (of nerfstudio" in caplog.text
+    assert "results below mean nothing; name the data set that it was fitted to (of nerfstudio" in caplog.text
     assert re.search(r"[5-9] of 9 known views show nothing of the scene: do the cameras belong to it", caplog.text)
     capsys.readouterr()
     reports = [json.loads((tmp_path / name / "fisher.json").read_text()) for name in ("one", "two")]

@@ -105,7 +105,7 @@ def test_edited_ply_is_told_of(run, caplog):  # noqa: F811
     damaged(run.point_cloud)
     assert equal(load_run(run).gaussians, g)
     assert len(caplog.messages) == 2
-    assert all("point_cloud.ply: does not hold what state.safetensors holds" in x for x in caplog.messages)
+    assert all("point_cloud.ply: differs from state.safetensors (edited" in x for x in caplog.messages)
 
 
 def test_a_run_holds_features_and_networks(run, caplog):  # noqa: F811

@@ -114,8 +114,8 @@ def test_through_the_graph_of_any_scene():
     assert plain.fields == scene_jacobian(scene, TIME, names).fields
     shapes = {"means": (3,), "quats": (4,), "log_scales": (3,)}
     slopes = {name: torch.randn(5, 25, *shapes[name]) for name in plain.fields}
-    want = plain.squared_slopes(index, slopes)
-    found = scene_jacobian(scene, TIME, names).squared_slopes(index, slopes)
+    want = plain.squared_vjps(index, slopes)
+    found = scene_jacobian(scene, TIME, names).squared_vjps(index, slopes)
     for name in names:
         torch.testing.assert_close(found[name], want[name], rtol=1e-5, atol=1e-6 * float(want[name].max()))
 

@@ -19,7 +19,7 @@ from drgs.information.network import NetworkInformation
 from drgs.information.quantity import ViewContext, once_per_time
 from drgs.information.replay import Replay
 from drgs.select import POLICIES, Cache, Scoring, select
-from drgs.selection.combine import joint_of
+from drgs.selection.combine import joint_and_combination
 from drgs.settings import RenderSettings
 
 FAST = RenderSettings.preset("fast")
@@ -60,7 +60,7 @@ def test_ratio_joins_the_groups(views, cache):
     assert found.blocks == ["geometry", "deformation"]
     assert found.network == {"score": "ratio", "probes": K}
     assert found.combine == "sum"
-    assert any("take 8 or more" in note for note in found.notes)
+    assert any("use --probes 8 or more" in note for note in found.notes)
     told = [fisher.network(scene, cam, FAST, probes=K) for cam in (*train, *candidates)]
     still = [fisher.diagonal(scene.at(cam.time), cam, FAST) for cam in (*train, *candidates)]
     for i, parts in enumerate(found.parts, 1):
@@ -122,7 +122,7 @@ def test_one_traversal_for_geometry_and_deformation(views, monkeypatch, preset, 
     replays = []
     plain = Replay.__init__
     monkeypatch.setattr(Replay, "__init__", lambda *a, **o: (replays.append(a), plain(*a, **o))[1])
-    found = joint_of(blocks)[0].compute(ViewContext(scene, cams[4], settings, mask))
+    found = joint_and_combination(blocks)[0].compute(ViewContext(scene, cams[4], settings, mask))
     assert len(replays) == 1
     masks = None if mask is None else [mask]
     want = fisher.network(scene, cams[4], settings, probes=K, masks=masks)
@@ -247,7 +247,7 @@ def test_a_field_that_is_silent_is_noted(views):
     scene, cams = views
     start = swarm(scene.gaussians, std=0.0)
     found = pick(start, cams[1:3], cams[:1], blocks=("deformation",))
-    assert any(note.startswith("deformation: no view has information about grid,") for note in found.notes)
+    assert any(note.startswith("deformation: no view informs grid,") for note in found.notes)
     assert not any("about mlp" in note for note in found.notes)
     nobody = swarm(scene.gaussians, motion=torch.full((8,), -1.0))
     found = pick(nobody, cams[1:3], cams[:1], blocks=("deformation",))
@@ -262,7 +262,7 @@ def test_rows_of_the_image_are_those_of_the_other_blocks():
     scene = swarm(g.replace(features=torch.randn(8, 4)))
     cams = [dataclasses.replace(cam, time=t, w2c=cam.w2c.detach()) for t in (0.0, 1.0)]
     score = lambda *blocks: Scoring(blocks=blocks, network="trace")  # noqa: E731
-    parts_of = lambda *blocks: joint_of(SceneBlocks.of(scene, score(*blocks), cams))[0].parts  # noqa: E731
+    parts_of = lambda *blocks: joint_and_combination(SceneBlocks.of(scene, score(*blocks), cams))[0].parts  # noqa: E731
     told = {}
     for blocks in (("deformation",), ("geometry", "deformation"), ("semantic", "deformation")):
         quantity = parts_of(*blocks)[-1][1]

@@ -93,9 +93,9 @@ def test_auto_is_the_word_for_none(flag):
     [
         ("x", "--output must be given, is missing; add --output PATH"),
         ("-o y", "PLACE must be given"),
-        ("x -o y --cuont 3", "options must be those of the command, got --cuont; did you mean --count"),
-        ("x -o y --zzzz", "got --zzzz; none has a name like it"),
-        ("x -o y z", "words without an option must be PLACE, got 'z', too"),
+        ("x -o y --cuont 3", "--cuont must be an option of this command, is none; did you mean --count"),
+        ("x -o y --zzzz", "--zzzz must be an option of this command, is none; none has a name like it"),
+        ("x -o y z", "arguments must be PLACE, got 'z' besides"),
         ("x -o y --count", "--count must have a value, INT, got none"),
         ("x -o y --count a", "--count must be a whole number, got 'a'"),
         ("x -o y --count 10", r"toy: count must be a whole number in \[1, 9\], got 10"),
@@ -104,7 +104,7 @@ def test_auto_is_the_word_for_none(flag):
         ("x -o y --kind tow", "--kind must be one of one, two, got 'tow'; did you mean two"),
         ("x -o y --loud=yes", "--loud must be without a value, got 'yes'; drop it, or say --no-loud"),
         ("x -o y --no-loud=3", "--no-loud must be without a value, got '3'; drop it, or say --loud"),
-        ("x -o y --no-count 3", "got --no-count"),
+        ("x -o y --no-count 3", "--no-count must be an option of this command"),
     ],
 )
 def test_bad_usage_says_what_must_hold(line, told):

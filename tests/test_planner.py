@@ -409,7 +409,11 @@ def test_candidates_of_scores_that_fail_are_not_installed(world):
     [
         (None, None, r"image must be an array of shape \(18, 24, 3\), its camera's, got None; resize it"),
         (np.zeros((4, 4, 3)), None, r"its camera's, got shape \(4, 4, 3\); resize it"),
-        (np.full((18, 24, 3), 255.0), None, r"image must be uint8, or finite and in \[0, 1\], got others; scale it"),
+        (
+            np.full((18, 24, 3), 255.0),
+            None,
+            r"image must be uint8, or finite and in \[0, 1\], got 255.0 to 255.0; scale it",
+        ),
         (np.zeros((18, 24, 3)), np.ones((2, 2)), r"depth must be an array of shape \(18, 24\), its camera's"),
     ],
 )

@@ -285,7 +285,7 @@ def test_arguments_of_speed_and_memory_change_nothing():
     seen = drgs.rasterization(**given, with_ut=True, with_eval3d=True, rolling_shutter=member, **none)[0]
     torch.testing.assert_close(plain, seen, rtol=1e-5, atol=1e-5)  # a lens without distortion
     other = types.SimpleNamespace(alpha=1.0, beta=2.0, kappa=0.0)
-    with pytest.raises(NotImplementedError, match="ut_params must be alpha 0.1, beta 2, kappa 0, got alpha=1"):
+    with pytest.raises(NotImplementedError, match="ut_params must have gsplat's default alpha=0.1, got 1"):
         drgs.rasterization(**given, with_ut=True, with_eval3d=True, ut_params=other)
 
 

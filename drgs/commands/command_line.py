@@ -100,8 +100,8 @@ def _read(options: Mapping[str, Option], words: Sequence[str], commands: Mapping
         if option is None or (is_no and option.hint is not bool):
             near = _nearest_option(flag, list(flags), [option.flag for option in places])
             owners = [name for name, other in commands.items() if flag in (x.flag for x in options_in(other).values())]
-            of_others = f" (of drgs {', '.join(owners)})" if owners else ""
-            raise ValueError(f"options must be those of the command, got {flag}{of_others}; {near}")
+            of_others = f" (it is one of drgs {', '.join(owners)})" if owners else ""
+            raise ValueError(f"{flag} must be an option of this command{of_others}, is none; {near}")
         if option.hint is bool:
             if equals:
                 opposite = option.flag if is_no else f"--no-{option.flag[2:]}"
@@ -117,7 +117,9 @@ def _read(options: Mapping[str, Option], words: Sequence[str], commands: Mapping
             alone = [] if several else alone[1:]
     if alone:
         known = " ".join(option.flag for option in places) or "none"
-        raise ValueError(f"words without an option must be {known}, got {alone[0]!r}, too; drop it, or quote spaces")
+        raise ValueError(
+            f"arguments must be {known}, got {alone[0]!r} besides; drop it, or quote a path that has spaces"
+        )
     return given
 
 

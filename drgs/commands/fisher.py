@@ -104,8 +104,8 @@ def _errors(args: Fisher, given: SceneInput, known: Known, settings: RenderSetti
         return run_error_record(given.run, settings, known.pixels)
     if not known.views:
         _log.warning(
-            "%s: has cameras without photographs, so that information alone is told, and no expected error, whose "
-            "misfit they show; name a data set by --train",
+            "%s: has no photographs: only information is written, no expected error, which needs their residuals; "
+            "name a data set by --train",
             known.source,
         )
         return None

@@ -109,8 +109,8 @@ def in_frame_of_data(gaussians: Gaussians, scene: Path, data: Path) -> Gaussians
         _log.info("%s: %.1f dB at %d photographs of %s", scene, best, len(photographs), data)
     else:
         _log.warning(
-            "%s: %.1f dB at %d photographs of %s, whose mean color has %.1f: it is of another data set, or in a frame "
-            "that nothing states, and what follows says nothing of it; name the data set that it was fitted to%s",
+            "%s: %.1f dB at %d photographs of %s, whose mean color has %.1f: it is of another data set, or in an "
+            "unknown frame, and results below mean nothing; name the data set that it was fitted to%s",
             scene,
             best,
             len(photographs),

@@ -243,7 +243,7 @@ def _expected_error(args: View, given: SceneInput, known: Known | None) -> Expec
     data = DataConfig(undistort="off" if known.lenses else "on")
 
     def made(most: int | None) -> ErrorRecord:
-        return error_record_of_views(given.scene, views, settings, data, most or pixels).times(
+        return error_record_of_views(given.scene, views, settings, data, most or pixels).scaled(
             len(known.views) / len(views)
         )
 

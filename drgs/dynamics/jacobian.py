@@ -26,12 +26,12 @@ class SceneJacobian(Protocol):
     fields: frozenset[str]
     moving: torch.Tensor | None
 
-    def squared_slopes(self, index: torch.Tensor, slopes: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    def squared_vjps(self, index: torch.Tensor, cotangents: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """Squares of J^T u, summed over K cotangents u.
 
         Args:
             index: (M,) int64, ascending: Gaussians whose cotangents are given; all others have 0.
-            slopes: Field -> (K, M, ...) cotangents; those of `fields` are there.
+            cotangents: Field -> (K, M, ...); those of `fields` are there.
         Returns:
             A tensor of the shape of each parameter, by its name.
         """
@@ -55,10 +55,10 @@ class TorchJacobian:
         self.fields = frozenset(self._fields)
         self.moving: torch.Tensor | None = None
 
-    def squared_slopes(self, index: torch.Tensor, slopes: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    def squared_vjps(self, index: torch.Tensor, cotangents: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """As `SceneJacobian`."""
         total = {name: torch.zeros_like(x, requires_grad=False) for name, x in self._leaves.items()}
-        for own in zip(*(slopes[name] for name in self._fields), strict=True):
+        for own in zip(*(cotangents[name] for name in self._fields), strict=True):
             whole = [
                 torch.zeros_like(x).index_copy_(0, index.to(x.device), slope.to(x))
                 for x, slope in zip(self._fields.values(), own, strict=True)

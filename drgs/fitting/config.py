@@ -64,10 +64,10 @@ class DataConfig(Record):
     max_pixels: int = option(130_000, "Images are reduced to at most this many pixels.", within=COUNT)
     updates_per_step: int | None = option(
         None,
-        "Optimizer updates of a step, each with another photograph: of half the width and height in the first half of"
-        " the steps, then a quarter of it, whole ones in the last fifth; 1: whole ones always; auto: 3, which take as"
-        " long, of photographs of 25,000 pixels and two a Gaussian or more, where nothing moves, no teacher or depth"
-        " map is fitted to, and all views are there from the start.",
+        "Optimizer updates per step, each on another photograph: reduced ones at first, then random quarters, and one"
+        " update on a whole photograph in the last fifth of the steps. 1: no quarters. auto: 3, which take as long, in"
+        " static fits on all views without teacher or depth maps, if photographs have 25,000 pixels, and two for each"
+        " of --max-gaussians; else 1.",
         within=(1, 64),
         rare=True,
         none="auto",
@@ -112,7 +112,8 @@ class DataConfig(Record):
         "auto",
         "Outside of masks the scene is empty (object), or unknown (valid); auto: object if all photographs have a"
         " mask file, valid if only some have one, and for empty corners of undistorted photographs; ignore: no "
-        "masks. With object, and as with masks with auto, transparent pixels of an alpha channel are empty, too.",
+        "masks. Pixels that an alpha channel leaves transparent are outside, too, with object and auto; with the others"
+        " they show the background color.",
     )
     undistort: UndistortUse = option(
         "auto",
@@ -125,8 +126,8 @@ class DataConfig(Record):
         None,
         "Multiply the rendering of each photograph by gains of R, G and B: none (off), estimated from points that"
         " several show (points), then optimized (learned); auto: points, if gains clearly differ and lower the "
-        "error of held-out photographs in short fits; left out: auto where these take at most a tenth of the fit, "
-        "nothing moves, all views are there from the start, and nothing has to be matched for it.",
+        "error of held-out photographs in short trial fits. Default: auto in static fits on all views, if the trials "
+        "take at most a tenth of the fit and no photographs have to be matched for it; else off.",
         rare=True,
     )
     poses: PoseUse = option(
@@ -204,9 +205,8 @@ class DensityConfig(Record):
     )
     prune_loss: float = option(
         0.0,
-        "When density control ends, remove the Gaussians without which the PSNR of training photographs is lower by "
-        "less than this, in dB, which the last steps make up for; 0 removes none. 0.3 removes about half "
-        "(docs/real-data.md).",
+        "When density control ends, remove as many Gaussians as lower the PSNR of training photographs by at most "
+        "this, in dB, which the last steps recover; 0: none. 0.3 removes about half (docs/real-data.md).",
         within=(0.0, 100.0),
         rare=True,
     )
@@ -287,8 +287,8 @@ class LossConfig(Record):
     )
     depth_behind: float = option(
         0.1,
-        "Factor of that weight where rendered depth is behind the map's, as mirror images are; 1 for geometry that is"
-        " as true as it can be.",
+        "Factor of --depth-weight where rendered depth is behind the map's, as mirror images are; 1: both sides count"
+        " alike.",
         within=FRACTION,
         rare=True,
     )
@@ -391,8 +391,8 @@ class MotionConfig(Record):
     )
     motion_rate: float = option(
         120.0,
-        "Learning rate of the gates (for each Gaussian a logit of whether it moves), times the steps of the "
-        "dynamic stage.",
+        "Learning rate of the gates (for each Gaussian a logit of whether it moves) is this / steps of the dynamic "
+        "stage, at most 0.5.",
         within=RATE,
         rare=True,
     )
@@ -417,8 +417,8 @@ class MotionConfig(Record):
     )
     life_weight: float = option(
         0.1,
-        "Weight of the mean ratio of the time between photographs to a Gaussian's lifetime, where it is below 1: "
-        "the larger, the longer they live.",
+        "Weight of the mean of (time between photographs / width of a Gaussian's lifetime) where this ratio is below "
+        "1: the larger, the longer they live.",
         within=WEIGHT,
         rare=True,
     )
@@ -461,9 +461,9 @@ class SelectionConfig(Record):
     code; `never`, as arXiv 2512.22771. Not where `pick_points` brings none, with points of depth maps, and where next
     to none can be triangulated.
 
-    `region`: what is left unknown of pixels that show a part of the scene decides, by the Gaussians that there are at
-    each pick. Of `masks` only those of photographs that have been picked are read, as of everything else of them. At a
-    pick at which no view shows anything of it yet the whole scene counts.
+    `region`: candidates are scored by what is still unknown of the pixels that show this part of the scene, given the
+    Gaussians at each pick. With `masks` only the masks of photographs that have been picked are read. While no view
+    shows any of the region, the whole scene counts.
     """
 
     policy: str = option(
@@ -503,7 +503,8 @@ class SelectionConfig(Record):
     )
     every: int | None = option(
         None,
-        "Steps before the first pick, and between picks; default 200, with --schedule times or pairs 200 of 17,000.",
+        "Steps before the first pick, and between picks; default 200, with --schedule times or pairs --max-steps * "
+        "200 / 17,000 (as in arXiv 2512.22771), counted from the end of the static stage.",
         within=COUNT,
         rare=True,
     )
@@ -516,7 +517,7 @@ class SelectionConfig(Record):
     pick_points: PickPoints = option(
         "auto",
         "Points that a picked view adds: triangulated, and where no Gaussian is yet (uncovered), or none; auto: "
-        "none with --init-points all.",
+        "none with --init-points all or --schedule times or pairs, else uncovered.",
         rare=True,
     )
     restart: Restart = option(
@@ -570,10 +571,9 @@ class FitConfig(Record):
     `deterministic`: an image that is drawn again without gradients differs from the one that was fitted by 1e-7, the
     rounding of its sums (presets `fast`, `inria` and `gsplat`; those of `exact` and `mitsuba` have the same bits).
 
-    `renderers`: with several of them every step is rendered with the preset that is due (`drgs.fitting.renderers`), and
-    `settings`, which are a preset's then, are those of the fit's own pictures and numbers, by which views are chosen as
-    well; their background is that of all. A single renderer is drawn with `settings`, whatever fields they replace.
-    `auto` is `any`, and with other settings than those of preset `fast` these alone.
+    `renderers`: steps take these presets in turn (`drgs.fitting.renderers`). With several, `settings` must be a
+    preset's, and are used for previews, metrics and view selection; their background holds for all. With one,
+    `settings` are its settings. `auto` is `any` if `settings` are those of preset `fast`, else `settings` alone.
 
     Raises:
         ValueError: If a field has another type or is out of its range.
@@ -623,10 +623,10 @@ class FitConfig(Record):
         if self.data.undistort == "off":
             _check_lenses(self)
 
-    def going_on(self, before: FitConfig) -> FitConfig:
-        """This configuration of a fit that was begun with `before`, which holds what `auto` turned out to be.
-
-        Not of `undistort`: photographs are there already, as this configuration has them.
+    def resuming(self, before: FitConfig) -> FitConfig:
+        """This configuration for resuming a fit of `before`: `renderers`, `updates_per_step`, `num_downscales` and
+        `exposure` that are left at auto take the values that `before` resolved. `undistort` stays as it is, since
+        photographs are there already, as this configuration has them.
         """
         config = self
         if config.renderers == AUTO and config.settings == before.settings:
@@ -637,9 +637,10 @@ class FitConfig(Record):
         return config
 
     def difference(self, other: FitConfig) -> tuple[str, Any, Any] | None:
-        """The first field whose value in `other` makes another fit, and both values as JSON has them.
+        """The first field by which `other` is another fit, and both values as JSON has them; None if there is none.
 
-        When checkpoints are written makes none; how views are chosen is compared where it is known what `auto` is.
+        `saving` is not compared, nor is `selection`, which is compared once `auto` is resolved
+        (`ActiveViews.restore`).
         """
         mine, theirs = (
             config.replace(

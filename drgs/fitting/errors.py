@@ -177,7 +177,7 @@ def _record_of(
     masks, cameras = [frame.mask for frame in frames], [frame.camera for frame in frames]
     with Bar("residuals", len(frames)) as bar:
         record = error_record(scene, cameras, images, settings, masks=masks, advance=bar.advance)
-    return record if count == len(frames) else record.times(count / len(frames))
+    return record if count == len(frames) else record.scaled(count / len(frames))
 
 
 def _save(run: Run, scene: Scene, record: ErrorRecord, photographs: int, max_pixels: int) -> None:

@@ -219,8 +219,7 @@ def load_run(run: Run | str | os.PathLike) -> LoadedRun:
         return LoadedRun(gaussians, record, None, classes=classes)
     if run.point_cloud.is_file() and not _shows(run.point_cloud, gaussians):
         _log.warning(
-            "%s: does not hold what %s holds, was edited or written at another step; the checkpoint is taken, name the "
-            "PLY to take that",
+            "%s: differs from %s (edited, or of another step); the checkpoint is used, name the PLY to use that",
             run.point_cloud,
             run.state.name,
         )

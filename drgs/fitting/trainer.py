@@ -207,7 +207,10 @@ class Trainer:
         """
         left = [frame for frame in self.frames if frame.name != name]
         if not left or len(left) == len(self.frames):
-            raise ValueError(f"fit: {name!r} must be one of two photographs or more, is not; keep it")
+            raise ValueError(
+                f"fit: drop_frame must name one of {len(self.frames)} photographs and leave another, got {name!r}; "
+                "keep it"
+            )
         self.frames = left
         self.resolution = Resolution.of(self.config)  # small photographs are kept by their index
         self._queue = self._queue[:0]
@@ -398,7 +401,7 @@ class Trainer:
         """
         # Options that an older version did not have are at their defaults.
         before = FitConfig.from_json(header["config"])
-        config = config.going_on(before)
+        config = config.resuming(before)
         if other := config.difference(before):
             name, now, was = other
             raise ValueError(

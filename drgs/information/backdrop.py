@@ -69,9 +69,11 @@ def backdrop_sphere(
     cameras: Sequence[Camera],
     compute: ComputeViews | None = None,
 ) -> Sphere | None:
-    """Around all cameras, as far away as nearly all surfaces that they show, each at its time; None: infinitely far
-    away, where they show none. Of more than 16 cameras, 16 count: sorted by x, y and z of their centers, every so
-    many.
+    """The sphere that the backdrop is painted on; None: infinitely far away, if no view shows a surface.
+
+    Its center is the mean of the camera centers. Its radius, in world units, is nearly the largest distance of the
+    surfaces that the views show, each at its time, and at least reaches around all cameras. Of more than 16 cameras 16
+    count, evenly spaced in the order of their centers.
 
     It depends on the scene and on all of these cameras, in whatever order. So it moves as candidates come and go, with
     the bits that a single call would find; `drgs.select.Cache` keeps the opacity of views apart from it.

@@ -32,7 +32,7 @@ _NULL = 1e-8
 """Eigenvalue of the nuisances' information, scaled to a diagonal of 1, below which a direction is none: what rounding
 of float32 images leaves of a direction that changes nothing (1e-6 of what each unknown alone does), squared, is 1e-12.
 A direction of unknowns that together do less than 1e-4 of what each does alone stays in the scene's information."""
-_MIN_SHARE = 1e-12  # of a direction's information, below which what is known before is all that there is
+_MIN_SHARE = 1e-12  # of a direction's information; below it the prior on the unknowns decides, and nothing is lost
 _ROUNDING = 4e-6
 """Share of an entry that is no information: the sum and what is taken from it are sums of float32 images that were
 found in two ways, apart by up to 1e-6 of the entry on scenes of 20,000 Gaussians."""

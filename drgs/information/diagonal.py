@@ -89,7 +89,7 @@ class Diagonal(Quantity):
 
     def _by_replay(self, view: ViewContext, wanted: dict[str, Group]) -> dict[str, torch.Tensor]:
         replay = view.replay(self.semantics)
-        along = [probes.sums for probes in view.probes.values() if probes.semantics is self.semantics]
+        along = [one.sums for one in view.hit_sums.values() if one.semantics is self.semantics]
         result = dict(replay.diagonal(wanted, self.channel_weights, self.method == "fisherrf", along))
         rows = ViewRows.of(view, self.channel_weights, self.semantics, self.nuisances)
         if rows is not None:
@@ -261,7 +261,7 @@ def _by_probes(
         features = semantics.cotangent(signs) * factor if semantics and signs is not None else None
         slopes = pull(sign * root * factor, features)
         for name, group in groups.items():
-            total[name] += group.pull(slopes[group.input], call.inputs[group.input].double().cpu()).square()
+            total[name] += group.to_group(slopes[group.input], call.inputs[group.input].double().cpu()).square()
     result = {name: x / probes for name, x in total.items()}
     if other:
         replay = view.replay(semantics, geometry=False)

@@ -133,7 +133,7 @@ class ViewRows:
             yield (
                 float(share),
                 {
-                    name: group.pull(slopes[group.input], self.call.inputs[group.input].double().cpu())
+                    name: group.to_group(slopes[group.input], self.call.inputs[group.input].double().cpu())
                     for name, group in groups.items()
                 },
             )

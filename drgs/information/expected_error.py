@@ -6,22 +6,23 @@ which it is seen, instead of 1 everywhere; `docs/maths.md` derives it. Of a pixe
 directions d_i, the expected squared error (mean over channels) is the sum of four variances:
 
     misfit       sum_i w_i (sum_v k_iv R_iv) / (n_i + 1), n_i = sum_v k_iv W_iv: squared residuals of training pixels
-                 that saw Gaussian i from about this direction, and (1 - alpha) NEW s_b^2 of what lies behind
-    direction    sum_i w_i NEW s_i^2 / (n_i + 1): from a direction in which no training view saw it, the error is NEW
-                 times that of the directions which were fitted
-    information  SPREAD / 3 sum over channels and parameters k of J_pk^2 s_i(k)^2 / (H_k + 1): what noise of this
-                 variance leaves open of the parameters
-    unseen       HIDDEN (1 - alpha)^2 t^2 / (H_c + 1): a color behind everything that no view has seen
+                 that saw Gaussian i from about this direction, and (1 - alpha) NEW_DIRECTION s_b^2 of what lies behind
+    direction    sum_i w_i NEW_DIRECTION s_i^2 / (n_i + 1): from a direction in which no training view saw it, the error
+                 is NEW_DIRECTION times that of the directions which were fitted
+    information  OFF_DIAGONAL / 3 sum over channels and parameters k of J_pk^2 s_i(k)^2 / (H_k + 1): what noise of this
+                 variance leaves open of the parameters, and OFF_DIAGONAL for the entries of H that are left out
+    unseen       UNSEEN (1 - alpha)^2 t^2 / (H_c + 1): a color behind everything that no view has seen
 
-and their sum x is calibrated: below q, q (x / q)^g is expected, g the power at which what other training views say of a
-training view (its `misfit` and `direction`) explains its residuals best, q PIVOT times what they say on average.
+and their sum x is calibrated: below q it becomes q (x / q)^g. The power g fits squared residuals of a training view to
+the misfit and direction that the other training views predict for it; q is PIVOT times the mean of these predictions.
 
 Of errors of another kind, such as those of labels (`residual_record`), misfit and direction are the same sums of their
-residuals, information and calibration are left out, and unseen is (1 - alpha)^2 times the error of saying nothing.
+residuals, information and calibration are left out, and unseen is (1 - alpha)^2 times the error without a Gaussian.
 
 W_iv and R_iv are the sums of view v (misfit.py), k_iv = exp(-angle^2 / (2 ANGLE^2)) of the angle between the pixel's
 direction and that of view v, s_i^2 = (sum_v R_iv + s^2) / (sum_v W_iv + 1) the misfit of Gaussian i, shrunk to the mean
-s^2 of all of them by one pixel, and t^2 the mean squared difference of the photographs from the background.
+s^2 of all of them by one pixel, s_b^2 the same of what lies behind everything, H_c the information about the cell of
+the backdrop behind the pixel, and t^2 the mean squared difference of the photographs from the background.
 """
 
 from __future__ import annotations
@@ -61,9 +62,9 @@ PARTS = ("misfit", "direction", "information", "unseen")
 
 # Chosen on half of the captures and made scenes, and measured on the other half: docs/uncertainty.md.
 ANGLE = 0.1  # radians between directions at which what one says of the other has fallen to 0.6
-NEW = 2.0  # squared error from a new direction over that from directions that were fitted
-SPREAD = 6.0  # variance of a pixel over what the diagonal of H, without its other entries, says
-HIDDEN = 0.6  # squared error where nothing is, over the mean squared difference of photographs from the background
+NEW_DIRECTION = 2.0  # squared error from a new direction / that from directions that were fitted
+OFF_DIAGONAL = 6.0  # variance of a pixel / that by the diagonal of H alone
+UNSEEN = 0.6  # squared error where no Gaussian is / the mean squared difference of photographs from the background
 PIVOT = 2.5  # squared error from which on all stay as they are, over the mean that training views expect of each other
 _PRIOR = Prior(1.0)  # lambda: what one pixel that is wholly the parameter's says; of positions in a length of the scene
 _MOST_PLACES = 64  # places that directions are known from; views beyond share the nearest one, so that a record of any
@@ -138,18 +139,18 @@ class ErrorRecord:
         their mean squared residual, and where none does, that of a new direction.
         """
         pixels = self.weights.double().sum(1)
-        total = (self.residuals.double().sum(1) + NEW * self.misfit) / (pixels + 1)
+        total = (self.residuals.double().sum(1) + NEW_DIRECTION * self.misfit) / (pixels + 1)
         return total * self.calibration(total)
 
     def calibration(self, total: torch.Tensor) -> torch.Tensor:
         """What sums of the parts are multiplied by, so that training views expect of each other what they show."""
         return torch.where(total > 0, (total / self.pivot).clamp(max=1) ** (self.power - 1), 1.0)
 
-    def times(self, factor: float) -> ErrorRecord:
-        """The record of as many views again and again: of some that stand for all."""
-        scaled = {name: getattr(self, name) * factor for name in ("weights", "residuals", "behind", "contrast")}
+    def scaled(self, factor: float) -> ErrorRecord:
+        """The record as if there were `factor` times as many views: all sums and the information are multiplied."""
+        sums = {name: getattr(self, name) * factor for name in ("weights", "residuals", "behind", "contrast")}
         information = {name: x * factor for name, x in self.information.items()}
-        return dataclasses.replace(self, views=round(self.views * factor), information=information, **scaled)
+        return dataclasses.replace(self, views=round(self.views * factor), information=information, **sums)
 
     def to_state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Tensors, and what else a file has to hold as JSON, of which `from_state` makes the record again."""
@@ -234,7 +235,7 @@ def residual_record(
     scene: Scene,
     cameras: Camera | Sequence[Camera],
     residuals: torch.Tensor | Sequence[torch.Tensor],
-    nothing: float,
+    empty_residual: float,
     settings: RenderSettings | None = None,
     *,
     masks: Masks = None,
@@ -244,30 +245,33 @@ def residual_record(
 
     A residual is any number >= 0 of a pixel: 1 where its label is wrong, so that the expected error of a pixel is the
     probability that its label is, or the squared residual of its feature. The record says nothing about parameters: its
-    maps have the parts `misfit`, `direction` and, of what no Gaussian covers, `unseen`, (1 - alpha)^2 `nothing`; the
+    maps have the parts `misfit`, `direction` and `unseen`, which is (1 - alpha)^2 `empty_residual`; the
     part `information` is 0. It is not calibrated, so that it is too even: what is small is expected too large.
 
     Args:
         scene, cameras, settings, masks, advance: The same as for `error_record`.
         residuals: (H, W) of each camera, in squared units of whatever they are residuals of.
-        nothing: The residual of saying nothing, on average over the pixels of the views, in the same units.
+        empty_residual: Mean residual, in the same units, of a prediction without any Gaussian: of labels the most
+            frequent one, of features 0.
     Raises:
-        ValueError: If there is no view, residuals or masks are not of the cameras' sizes, or a residual, or `nothing`,
-            is negative or not finite.
+        ValueError: If there is no view, residuals or masks are not of the cameras' sizes, or a residual, or
+            `empty_residual`, is negative or not finite.
     """
     where = "residual_record"
     scene = once_per_time(scene)
     cameras, each, shown = checked_views(where, scene, cameras, settings, masks)
     values = _checked_residuals(where, residuals, cameras)
-    if not (isinstance(nothing, int | float) and 0 <= nothing < math.inf):
-        raise ArgumentError(f"{where}: nothing must be a finite number >= 0, got {nothing!r}; pass a mean residual")
+    if not (isinstance(empty_residual, int | float) and 0 <= empty_residual < math.inf):
+        raise ArgumentError(
+            f"{where}: empty_residual must be a finite number >= 0, got {empty_residual!r}; pass a mean residual"
+        )
     views = [
         ViewContext(scene, camera, own, mask, residual=residual)
         for camera, own, mask, residual in zip(cameras, each, shown, values, strict=True)
     ]
     record, _ = _record_of(where, views, Joint((("", Misfit()),)), None, [], advance)
     pixels = float(sum(x.numel() for x in values))
-    return dataclasses.replace(record, contrast=torch.tensor([pixels, pixels * nothing], dtype=torch.float64))
+    return dataclasses.replace(record, contrast=torch.tensor([pixels, pixels * empty_residual], dtype=torch.float64))
 
 
 def _record_of(
@@ -304,7 +308,7 @@ def _record_of(
                 f"{len(view.gaussians)} in cameras[{number}]; take views of one time"
             )
         found = quantity.summand(quantity.compute(view), view.camera, view.mask)
-        view.probes.clear()  # which hold buffers of the traversal
+        view.hit_sums.clear()  # which hold buffers of the traversal
         if number in own_sums:
             own_sums[number] = {name: found[name].clone() for name in (WEIGHTS, RESIDUALS, BEHIND)}
         for name, by_place in columns.items():
@@ -378,8 +382,8 @@ def _left_open(view: ViewContext, record: ErrorRecord) -> dict[str, torch.Tensor
         unseen = (1 - view.opacity).square() * _difference(record)
         return {"information": torch.zeros_like(unseen), "unseen": unseen}
     weights = variances(record.information, _PRIOR.over(record.length))
-    behind = weights.pop(BACKDROP) * (HIDDEN * _difference(record) / 3)
-    scale = SPREAD / 3 * record.misfit
+    behind = weights.pop(BACKDROP) * (UNSEEN * _difference(record) / 3)
+    scale = OFF_DIAGONAL / 3 * record.misfit
     weights = {name: x * scale.reshape(-1, *[1] * (x.dim() - 1)) for name, x in weights.items()}
     return {
         "information": variance_map(view, weights),
@@ -396,7 +400,7 @@ def _noise(seen: Gaussians, camera: Camera, record: ErrorRecord) -> tuple[tuple[
         out = render(seen.replace(features=values), camera, record.settings, outputs=())
     assert out.features is not None  # two channels were given
     fitted, new = out.features.cpu().unbind(2)
-    return (fitted + (1 - out.alpha.cpu()).clamp(min=0) * (NEW * record.misfit_behind), new), out
+    return (fitted + (1 - out.alpha.cpu()).clamp(min=0) * (NEW_DIRECTION * record.misfit_behind), new), out
 
 
 def _calibrating(views: int) -> list[int]:
@@ -486,7 +490,7 @@ def _by_direction(seen: Gaussians, camera: Camera, record: ErrorRecord) -> tuple
         near = torch.exp(-0.5 * (angle / ANGLE).square())
         fitted[part] = (near * record.residuals[part]).sum(1)
         pixels[part] = (near * record.weights[part]).sum(1)
-    return fitted / (pixels + 1), NEW * record.misfit / (pixels + 1)
+    return fitted / (pixels + 1), NEW_DIRECTION * record.misfit / (pixels + 1)
 
 
 def _grouped(centers: np.ndarray) -> tuple[np.ndarray, list[int]]:
@@ -510,7 +514,8 @@ def _checked_residuals(where: str, residuals: Any, cameras: Sequence[Camera]) ->
     for index, residual in enumerate(maps):
         if not residual.is_floating_point() or not bool((torch.isfinite(residual) & (residual >= 0)).all()):
             raise ArgumentError(
-                f"{where}: residuals[{index}] must be finite floats >= 0, got {residual.dtype} or others; square them"
+                f"{where}: residuals[{index}] must be finite floats >= 0, got {residual.dtype} within "
+                f"{float(residual.min()):g} and {float(residual.max()):g}; pass squared residuals"
             )
     return maps
 

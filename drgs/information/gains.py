@@ -1,4 +1,7 @@
-"""Information gain of a view, given the information of the known views: criteria of Fisher information, in nats.
+"""Information gain of a view, given the information of the known views: criteria of Fisher information.
+
+`logdet` and `block_logdet` are twice a mutual information in nats, `eig` is its first-order bound, `v_opt` the drop of
+the variance of pixels, `trace_cov` that of the variances of parameters.
 
 Symbols: H Fisher information of the training views, Hc of a candidate (sums of squared derivatives of the image, unit
 noise on every channel), l the prior's precision lambda, in the inverse squared unit of its parameter. `drgs.gain` is

@@ -30,30 +30,30 @@ class Group:
         shape: Gaussians -> shape of its information.
         entries: What it is made from, of the sums of a replay (`jacobian.SquareSums`), one after the other; empty where
             that knows nothing.
-        collect: (N, entries) sums, `Replay`, channel weights -> its information; None likewise.
-        spread: Weights shaped like its information, `Replay` -> (N, entries or 3) weights of squares in a pixel
+        from_sums: (N, entries) sums, `Replay`, channel weights -> its information; None likewise.
+        pixel_weights: Weights shaped like its information, `Replay` -> (N, entries or 3) weights of squares in a pixel
             (`jacobian.VarianceSums`); None where a pixel's RGB do not depend on it.
         input: The tensor that reverse mode differentiates by.
-        pull: (derivative by `input`, `input`) -> derivative by the group.
+        to_group: (derivative by `input`, `input`) -> derivative by the group.
         fisherrf: Inputs by name -> what FisherRF divides the squares by; None where it leaves the group out.
         columns: Gaussians -> shape of a tangent, where it is not `shape`.
         outputs: First and last (exclusive) channel of a column that informs about it: RGB, then features.
         merge: Squares of all columns, shaped `columns` -> information.
-        there: Gaussians -> whether they have it.
+        exists: Gaussians -> whether they have it.
     """
 
     shape: Callable
     input: str
     entries: tuple[int, ...] = ()
-    collect: Callable | None = None
+    from_sums: Callable | None = None
     owner: str = "gaussians"
-    spread: Callable | None = None
-    pull: Callable = lambda slope, _: slope
+    pixel_weights: Callable | None = None
+    to_group: Callable = lambda slope, _: slope
     fisherrf: Callable | None = lambda _: 1.0
     columns: Callable | None = None
     outputs: tuple = (0, 3)
     merge: Callable = lambda squares: squares
-    there: Callable = lambda _: True
+    exists: Callable = lambda _: True
 
     def tangent(self, gaussians: Gaussians) -> tuple[int, ...]:
         """Shape of a tangent in `render_jvp`."""
@@ -66,8 +66,8 @@ def _geometry(first: int, count: int, name: str, **options: Any) -> Group:
     return Group(
         shape=shape,
         entries=tuple(range(first, first + count)),
-        collect=lambda sums, replay, weights: sums if count > 1 else sums[:, 0],
-        spread=lambda values, replay: values.reshape(len(values), count),
+        from_sums=lambda sums, replay, weights: sums if count > 1 else sums[:, 0],
+        pixel_weights=lambda values, replay: values.reshape(len(values), count),
         input=name,
         **options,
     )
@@ -88,27 +88,27 @@ def _opacity_slope(inputs: dict) -> torch.Tensor:
 # Colors are linear: dC_c / d sh_kc = w Y_k, 0 where the color is clamped.
 GROUPS = {
     "means": _geometry(0, 3, "means"),
-    "rotations": _geometry(3, 3, "quats", pull=_turned, fisherrf=None),
+    "rotations": _geometry(3, 3, "quats", to_group=_turned, fisherrf=None),
     # FisherRF squares derivatives by s and alpha, then multiplies by ds/dlog s and dalpha/dlogit once.
     "log_scales": _geometry(6, 3, "log_scales", fisherrf=lambda inputs: inputs["log_scales"].cpu().double().exp()),
     "logit_opacities": _geometry(9, 1, "logit_opacities", fisherrf=_opacity_slope),
     "sh": Group(
         shape=lambda g: tuple(g.sh.shape),
         entries=(GEOMETRY,),
-        collect=lambda sums, replay, weights: replay.sh_information(sums, weights),
-        spread=lambda values, replay: replay.sh_spread(values),
+        from_sums=lambda sums, replay, weights: replay.sh_information(sums, weights),
+        pixel_weights=lambda values, replay: replay.sh_pixel_weights(values),
         input="sh",
     ),
     "features": Group(
         shape=lambda g: (len(g),),
         entries=(GEOMETRY,),
-        collect=lambda sums, replay, weights: sums[:, 0] * replay.feature_scale,
-        spread=lambda values, replay: values[:, None] * replay.feature_scale,
+        from_sums=lambda sums, replay, weights: sums[:, 0] * replay.feature_scale,
+        pixel_weights=lambda values, replay: values[:, None] * replay.feature_scale,
         input="features",
         columns=lambda g: tuple(g.features.shape),
         outputs=(3, None),
         merge=lambda squares: squares.mean(1),
-        there=lambda g: g.features is not None,
+        exists=lambda g: g.features is not None,
     ),
 }
 
@@ -123,7 +123,7 @@ def scene_groups(scene: Scene | None) -> dict[str, Group]:
     shapes = {name: tuple(x.shape) for name, x in scene.parameters().items() if x.is_floating_point()}
     own = {name: _own(name, shape) for name, shape in shapes.items()}
     if "quats" in shapes:
-        own["rotations"] = dataclasses.replace(_own("quats", (shapes["quats"][0], 3)), pull=_turned)
+        own["rotations"] = dataclasses.replace(_own("quats", (shapes["quats"][0], 3)), to_group=_turned)
     return own
 
 
@@ -143,7 +143,7 @@ def groups_of(
     """
     if isinstance(wanted, str):
         wanted = (wanted,)
-    there = {name: group for name, group in GROUPS.items() if group.there(gaussians)}
+    there = {name: group for name, group in GROUPS.items() if group.exists(gaussians)}
     if wanted is not None:
         there |= scene_groups(scene)
     for name in wanted or ():

@@ -101,7 +101,7 @@ class _Along(Sink):
     def take(self, lib: Lib, index: UInt32, hits: Mask, rows: list[Row], states: list[dict]) -> list[dict]:
         """Add the rows of a hit, if its Gaussian is wanted, along every image."""
         place = dr.gather(lib.UInt32, self.places, index, hits)
-        own = [[row.slopes, row.g[len(row.g) - self.width :], row.turned or []] for row in rows]
+        own = [[row.slopes, row.g[len(row.g) - self.width :], row.color_by_mean or []] for row in rows]
         dr.if_stmt((place, own), hits & (place != _NOWHERE), self._add, lambda place, own: place)
         return states
 

@@ -22,7 +22,8 @@ def mask_list(where: str, masks: Any, cameras: Sequence[Camera]) -> list[torch.T
     if not isinstance(masks, list | tuple) or len(masks) != len(cameras):
         got = f"{len(masks)}" if isinstance(masks, list | tuple) else kind_of(masks)
         raise ArgumentError(
-            f"{where}: masks must be a list with one for each of {len(cameras)} cameras, got {got}; None is one, too"
+            f"{where}: masks must be a list with one for each of {len(cameras)} cameras, got {got}; use None for a "
+            "camera without a mask"
         )
     for index, (mask, camera) in enumerate(zip(masks, cameras, strict=True)):
         if mask is None:
@@ -32,8 +33,8 @@ def mask_list(where: str, masks: Any, cameras: Sequence[Camera]) -> list[torch.T
         if tuple(mask.shape) != size or not bool(((mask >= 0) & (mask <= 1)).all()):
             values = f" within {float(mask.min()):g} and {float(mask.max()):g}" if mask.numel() else ""
             raise ArgumentError(
-                f"{where}: masks[{index}] must be {size} like its camera's image, all within 0 and 1, got "
-                f"{tuple(mask.shape)}{values}; resize it"
+                f"{where}: masks[{index}] must have its camera's shape {size} and values in [0, 1], got "
+                f"{tuple(mask.shape)}{values}; resize or rescale it"
             )
     return list(masks)
 

@@ -67,7 +67,7 @@ class Row(NamedTuple):
         g: Slopes dC / da, one per channel, 0 where the ray has no such hit; None without geometry.
         w: Weight of the hit, 0 likewise.
         a: Opacity of the hit; whatever it is where `g` and `w` are 0.
-        turned: (color, axis) w dc/dmu, or None where the color does not depend on the mean.
+        color_by_mean: (color, axis) w dc/dmu, or None where the color does not depend on the mean.
         color: RGB of the Gaussian on this ray, then its other channels; None where the sink does not need them.
         basis: SH basis along the ray; empty where SH are evaluated towards the mean.
     """
@@ -76,7 +76,7 @@ class Row(NamedTuple):
     g: list[Float] | Any
     w: Float
     a: Float
-    turned: list[list[Float]] | None
+    color_by_mean: list[list[Float]] | None
     color: list[Float] | Any
     basis: list[Float]
 
@@ -153,7 +153,7 @@ class Rows(HitReplay):
             a, depth, ok = m.hit(record, ray, active & (st["alive"] != 0))
             color: list[Float] | Any = self.channels.values(m, loaded, ray) if self.colors else None
             T, w, behind, new, ok = self.replayed(k, st, a, self.terms(k, color, depth, place, ok), place, ok)
-            slopes = g = turned = None
+            slopes = g = color_by_mean = None
             if extra:
                 g = [dr.select(ok, dr.fma(T, c, -b), 0) for c, b in zip(color, behind, strict=True)]
                 moves = ok
@@ -162,12 +162,14 @@ class Rows(HitReplay):
                 # Far from the ellipsoid 0 times infinity is possible.
                 slopes = [dr.select(moves, x, 0) for x in self._slopes(record, extra, ray)]
                 if self.color:
-                    turned = [[w * extra[_COLOR + 3 * c + j] for j in range(3)] for c in range(3)]
+                    color_by_mean = [[w * extra[_COLOR + 3 * c + j] for j in range(3)] for c in range(3)]
             if self.masks:  # after `rest`, which is of the whole image
                 w = w * self.masks[k]
                 g = [x * self.masks[k] for x in g] if g else g
-                turned = [[x * self.masks[k] for x in each] for each in turned] if turned else turned
-            rows.append(Row(slopes, g, w, a, turned, color, ray.carried[: ray.basis]))
+                color_by_mean = (
+                    [[x * self.masks[k] for x in each] for each in color_by_mean] if color_by_mean else color_by_mean
+                )
+            rows.append(Row(slopes, g, w, a, color_by_mean, color, ray.carried[: ray.basis]))
             hits |= ok
             out.append(new)
         return self.sink.take(lib, index, hits, rows, out)
@@ -178,10 +180,10 @@ class Rows(HitReplay):
         return [*slopes, strength * extra[_OPACITY]]
 
 
-def _entry(slopes: list[Float], g: list[Float], turned: list[list[Float]] | None, j: int, c: int) -> Float:
+def _entry(slopes: list[Float], g: list[Float], color_by_mean: list[list[Float]] | None, j: int, c: int) -> Float:
     """dC_c / d(geometry j)."""
     value = g[c] * slopes[j]
-    return value + turned[c][j] if turned and j < 3 and c < len(turned) else value
+    return value + color_by_mean[c][j] if color_by_mean and j < 3 and c < len(color_by_mean) else value
 
 
 class SquareSums(Sink):
@@ -235,14 +237,14 @@ class SquareSums(Sink):
 
 def weighted_squares(row: Row, j: int, weights: Sequence[float], channels_first: bool = False) -> Float:
     """sum_c weight_c (dC_c / d(geometry j))^2."""
-    slopes, g, turned = row.slopes, row.g, row.turned
+    slopes, g, color_by_mean = row.slopes, row.g, row.color_by_mean
     if channels_first:
-        value = sum(_entry(slopes, g, turned, j, c) for c in range(len(g)))
+        value = sum(_entry(slopes, g, color_by_mean, j, c) for c in range(len(g)))
         return value * value
-    if turned and j < 3:
-        entries = [_entry(slopes, g, turned, j, c) for c in range(len(turned))]
+    if color_by_mean and j < 3:
+        entries = [_entry(slopes, g, color_by_mean, j, c) for c in range(len(color_by_mean))]
         value = sum(x * x * weight for x, weight in zip(entries, weights, strict=False))
-        return value + slopes[j] * slopes[j] * _uncolored(row, weights) if len(g) > len(turned) else value
+        return value + slopes[j] * slopes[j] * _uncolored(row, weights) if len(g) > len(color_by_mean) else value
     return slopes[j] * slopes[j] * sum(x * x * weight for x, weight in zip(g, weights, strict=True))
 
 
@@ -272,10 +274,10 @@ class BlockSums(Sink):
             if len(row.g) > 3:
                 others.append((row.slopes, _uncolored(row, self.weights)))
             for c in range(3 if any(self.weights[:3]) else 0):
-                entries = [_entry(row.slopes, row.g, row.turned, j, c) for j in range(GEOMETRY)]
+                entries = [_entry(row.slopes, row.g, row.color_by_mean, j, c) for j in range(GEOMETRY)]
                 # d color / d sh_0, 0 where the color is clamped.
-                lit = dr.select(row.color[c] > 0, row.w * Y_00, 0)
-                full.append((self.weights[c], [*entries, *(lit if k == c else None for k in range(3))]))
+                unclamped = dr.select(row.color[c] > 0, row.w * Y_00, 0)
+                full.append((self.weights[c], [*entries, *(unclamped if k == c else None for k in range(3))]))
         sums: list[Float | None] = []
         for i in range(self.SIZE):
             for j in range(i + 1):
@@ -364,13 +366,13 @@ class VarianceSums:
     Attributes:
         buffer: 16 floats a Gaussian: the weights of the geometry, then of w^2 in each color, then of w^2 itself.
         weights: Weights of the channels: colors first.
-        light: 3 K floats a Gaussian, the weights of SH that are evaluated along each ray, or None.
+        sh_weights: 3 K floats a Gaussian, the weights of SH that are evaluated along each ray, or None.
         plain: Whether there are weights of w^2 itself.
     """
 
     buffer: Float
     weights: Sequence[float]
-    light: Float | None = None
+    sh_weights: Float | None = None
     plain: bool = False
     needs_color: bool = False
 
@@ -382,14 +384,14 @@ class VarianceSums:
         """Add a hit's rows to their rays."""
         v = list(dr.gather(lib.ArrayXf, self.buffer, index, hits, shape=(16, dr.width(index))))
         out = []
-        light = []
-        if self.light is not None:
+        sh_weights = []
+        if self.sh_weights is not None:
             K = len(rows[0].basis)
-            light = [dr.gather(lib.Float, self.light, index * (3 * K) + k, hits) for k in range(3 * K)]
+            sh_weights = [dr.gather(lib.Float, self.sh_weights, index * (3 * K) + k, hits) for k in range(3 * K)]
         for row, state in zip(rows, states, strict=True):
             total = sum(v[j] * weighted_squares(row, j, self.weights) for j in range(GEOMETRY))
             shares = [v[GEOMETRY + c] for c in range(3)]
-            for k, weight in enumerate(light):
+            for k, weight in enumerate(sh_weights):
                 band = row.basis[k // 3]
                 c = k % 3
                 shares[c] = shares[c] + dr.select(row.color[c] > 0, band * band * weight, 0)

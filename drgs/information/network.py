@@ -103,7 +103,7 @@ class NetworkInformation(Quantity):
     @alone
     def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
         """Group -> float64 on the CPU: (P,) of its parameters, of `trace` and `paper` a number ()."""
-        if probes := view.probes.get(self):
+        if probes := view.hit_sums.get(self):
             result = probes.information()
         else:
             result = self._estimated(view)
@@ -123,7 +123,7 @@ class NetworkInformation(Quantity):
         return {name: x / self.probes for name, x in total.items()}
 
     @alone
-    def hit_probes(self, view: ViewContext) -> NetworkProbes | None:
+    def hit_sums(self, view: ViewContext) -> NetworkProbes | None:
         """None where more than the geometry of Gaussians moves, images do not fit at a time, or nothing is seen."""
         if self.estimate != "diagonal" or self.seed != 0:
             return None
@@ -150,7 +150,8 @@ class NetworkInformation(Quantity):
                 raise ValueError(f"{where}: weights of {name} must have shape ({size},), got {tuple(x.shape)}")
             if not bool((torch.isfinite(x) & (x >= 0)).all()):
                 raise ValueError(
-                    f"{where}: weights of {name} must be finite and >= 0, got others; raise lambda above 0"
+                    f"{where}: weights of {name} must be finite and >= 0, got {float(x.min()):g} to "
+                    f"{float(x.max()):g}; raise lambda above 0"
                 )
         rows = _Rows.of(where, view, dataclasses.replace(self, nuisances=NO_NUISANCES))
         camera = view.camera
@@ -342,7 +343,7 @@ class _Rows:
         moved = geometry.any(2).any(0)  # a view shows few of those that move
         index = sums.wanted.to(moved.device)[moved]
         quats = self.rendered.quats.to(geometry.device)
-        return jacobian.squared_slopes(index, _field_slopes(geometry[:, moved], quats[index]))
+        return jacobian.squared_vjps(index, _field_slopes(geometry[:, moved], quats[index]))
 
     def _squares_of_passes(self, jacobian: SceneJacobian) -> Callable[[torch.Tensor], dict[str, torch.Tensor]]:
         """The same by a reverse pass for each image, for fields beyond the geometry."""
@@ -355,7 +356,7 @@ class _Rows:
                 slopes = pull(image[:, :3], image[:, 3:] if image.shape[1] > 3 else None)
                 if "features" in slopes and self.directions is not None:
                     slopes["features"] = slopes["features"] @ self.directions.T
-                for name, x in jacobian.squared_slopes(index, {n: slope[None] for n, slope in slopes.items()}).items():
+                for name, x in jacobian.squared_vjps(index, {n: slope[None] for n, slope in slopes.items()}).items():
                     total[name] = total[name] + x if name in total else x
             return total
 

@@ -101,7 +101,8 @@ class Replay:
         self.inputs = {name: to_drjit(lib, x) for name, x in call.inputs.items()}
         self.mask = None if mask is None else to_drjit(lib, mask.float().reshape(-1).to(call.home)).array
         self.along_ray = settings.sh_direction == "ray"
-        self.light: torch.Tensor | Any = None  # of SH along each ray, once `sums` or `sh_spread` was called
+        self.sh_sums: torch.Tensor | Any = None  # of SH along each ray, once `sums` was called
+        self.sh_weights: torch.Tensor | Any = None  # of these, once `sh_pixel_weights` was called
         self.color = geometry and not self.along_ray and call.coefficients > 1  # it depends on the mean
         self.frame: Frame | None = None  # of recorded steps
         if call.is_recorded:
@@ -213,7 +214,7 @@ class Replay:
         more_sums: Sequence[WalkSums] = (),
     ) -> torch.Tensor:
         """(N, 11) float64, where kernels run: squares of the geometry, and sum w^2; those of SH along each ray are kept
-        in `light`. `channels_first`: channels are summed before they are squared.
+        in `sh_sums`. `channels_first`: channels are summed before they are squared.
         """
         bands = self.call.coefficients if self.along_ray and self.gaussian_slopes and GEOMETRY in entries else 0
 
@@ -222,7 +223,7 @@ class Replay:
             return SumsOf(SquareSums, (own, bands if first else 0, channels_first))
 
         total = self._summed(sums_of, GEOMETRY + 1 + 3 * bands, weights, more_sums)
-        self.light = total[:, GEOMETRY + 1 :].reshape(self.count, bands, 3)
+        self.sh_sums = total[:, GEOMETRY + 1 :].reshape(self.count, bands, 3)
         return total[:, : GEOMETRY + 1]
 
     def diagonal(
@@ -236,7 +237,7 @@ class Replay:
         for name, group in groups.items():
             # On a card all sums are made there: the CPU would take many times as long as the kernels.
             own = sums[:, group.entries[0] : group.entries[-1] + 1].clone(memory_format=torch.contiguous_format)
-            result[name] = group.collect(own, self, scale).cpu()
+            result[name] = group.from_sums(own, self, scale).cpu()
             if fisherrf:
                 result[name] = result[name] / group.fisherrf(self.call.inputs)
         return result
@@ -261,17 +262,17 @@ class Replay:
         table = torch.zeros(self.count, 16, dtype=torch.float64, device=self.call.home)
         for name, values in information.items():
             group = GROUPS[name]
-            assert group.spread is not None, name  # `variance_map` has refused the others
-            spread = group.spread(values.to(self.call.home, torch.float64), self)
+            assert group.pixel_weights is not None, name  # `variance_map` has refused the others
+            spread = group.pixel_weights(values.to(self.call.home, torch.float64), self)
             # Squared weights w^2 are of one color each, then of all other channels.
             first = GEOMETRY + 3 if name == "features" else group.entries[0]
             table[:, first : first + spread.shape[1]] = spread
         buffer = self._weights(table)
         image = dr.zeros(lib.Float, self.call.pixels)
-        light = None if self.light is None else self._weights(self.light)
+        sh_weights = None if self.sh_weights is None else self._weights(self.sh_weights)
         for walk in self.walks(weights):
             sink = VarianceSums(
-                buffer, walk.weights, light if walk.first else None, walk.first and "features" in information
+                buffer, walk.weights, sh_weights if walk.first else None, walk.first and "features" in information
             )
             for state, at, inside in zip(self.hits.run(walk, sink), walk.part.flat, walk.part.inside, strict=True):
                 dr.scatter_add(image, state["variance"], at, inside)
@@ -288,7 +289,7 @@ class Replay:
     def sh_information(self, squares: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
         """(N, K, 3) squares of the derivatives by SH, from (N, 1) sum w^2, times (3,) weights; call after `sums`."""
         if self.along_ray:
-            return self.light * weights
+            return self.sh_sums * weights
         arrays = {
             "squares": to_drjit(self.lib, squares).array,
             "basis": self.gaussian_slopes["basis"],
@@ -303,10 +304,10 @@ class Replay:
         """Factor from sum w^2 to the information about a channel of the features."""
         return 1.0 if self.semantics is None else self.semantics.scale
 
-    def sh_spread(self, weights: torch.Tensor) -> torch.Tensor:
+    def sh_pixel_weights(self, weights: torch.Tensor) -> torch.Tensor:
         """(N, 3) weights of w^2 in each channel, from (N, K, 3) of SH; along rays they stay with the pixel."""
         if self.along_ray:
-            self.light = weights
+            self.sh_weights = weights
             return weights.new_zeros(self.count, 3)
         basis, lit = self._squared_basis
         return (basis[:, :, None] * weights).sum(1) * lit

@@ -7,8 +7,8 @@ two orders agree where steps do not interact. Gradients are `J^T u` of one fixed
 group in raw parameters.
 
 The order is that of `RUNGS`. Its reverse is not always legal: dilation, culling and the field-of-view clamp exist
-only in `ewa`, exact order along rays only outside of it (`drgs.settings.legal`). A rung that needs others takes them
-with it: reversed, culling and dilation still come just before the EWA linearization, and that before the order.
+only in `ewa`, exact order along rays only outside of it (`drgs.settings.why_illegal`). A rung that needs others takes
+them with it: reversed, culling and dilation still come just before the EWA linearization, and that before the order.
 `float32` is measured against the float64 oracle, on crops; `response` (peak to integral) and `volume` (sorted
 compositing to the integral over summed densities) lie beyond `exact` and stay last.
 """

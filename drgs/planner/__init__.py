@@ -61,9 +61,9 @@ Cost = Sequence[float] | Callable[[Camera, Camera], float]
 
 _FAST = Scoring(settings=RenderSettings.preset("fast"))
 _RNG = torch.Generator()  # a pool must have one; policies that score by information draw nothing from it
-_DURATIONS_KEPT = 3  # latest durations whose median is what the next one takes: the fewest that one compilation leaves
-_ANSWER_SHARE = 0.5  # duration of an answer, in those of its views, before one was measured: 0.2 to 0.5 on `office`
-_REGION_SHARE = 1.2  # the same of a region, whose information is computed in the answer: 1.1 to 1.4
+_DURATIONS_KEPT = 3  # latest durations; their median, which the next one is expected to take, ignores one compilation
+_ANSWER_SHARE = 0.5  # time to score / to compute the information of its views, until measured; 0.2 to 0.5 on `office`
+_REGION_SHARE = 1.2  # the same with a region, whose information is computed while scoring; 1.1 to 1.4
 
 
 def default_config() -> FitConfig:
@@ -207,7 +207,7 @@ class Planner:
 
     @scene.setter
     def scene(self, gaussians: Gaussians) -> None:
-        must_be("Planner", "scene", gaussians, Gaussians, "a scene that moves has none that could be planned for")
+        must_be("Planner", "scene", gaussians, Gaussians, "it takes static scenes only; pass scene.at(time)")
         with self._fit_lock:
             self._callers_scene = gaussians.detach()
 
@@ -707,7 +707,10 @@ def _check_seconds(where: str, seconds: float | None) -> None:
 def _checked_image(image: np.ndarray | None, camera: Camera) -> np.ndarray:
     image = _sized_as("image", image, (camera.height, camera.width, 3))
     if image.dtype != np.uint8 and not (np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1):
-        raise ValueError("Planner.observe: image must be uint8, or finite and in [0, 1], got others; scale it")
+        raise ValueError(
+            f"Planner.observe: image must be uint8, or finite and in [0, 1], got {image.min()} to {image.max()}; "
+            "scale it"
+        )
     return image
 
 

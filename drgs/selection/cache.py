@@ -347,7 +347,7 @@ class Cache:
         now = header["now"]
         places = [row["shapes"] for row in header["answers"]] + ([] if now is None else [now])
         if not all(0 <= i < len(shapes) for i in places) or (now is None and shapes):
-            raise ValueError(f"{where}: answers must be of {len(shapes)} states of the Gaussians, are not; {_ADVICE}")
+            raise ValueError(f"{where}: answers must refer to {len(shapes)} saved scenes, refer to others; {_ADVICE}")
         most = 0 if now is None else len(shapes[now])
         with self._lock:
             self.invalidate()

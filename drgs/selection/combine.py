@@ -32,13 +32,13 @@ class Combination:
 
     Attributes:
         scoring: The scoring that has criterion, lambda and weights.
-        apart: The blocks that are scored alone, each with groups of its name; empty: all groups are scored together.
-        traced: The block that is a trace, scored without what is known; "" for none.
+        zscored: The blocks that are scored alone, each with groups of its name; empty: all groups are scored together.
+        trace_block: The block that is a trace, scored without what is known; "" for none.
     """
 
     scoring: Scoring
-    apart: tuple[str, ...] = ()
-    traced: str = ""
+    zscored: tuple[str, ...] = ()
+    trace_block: str = ""
 
     def with_prior(self, prior: Prior) -> Combination:
         """With this prior."""
@@ -48,7 +48,7 @@ class Combination:
     def pooled(self) -> bool:
         """Whether scores need the information of all views together, known ones and candidates."""
         needed = criterion_named(self.scoring.criterion, "select").needs_pool
-        return needed and (bool(self.apart) or not self.traced)
+        return needed and (bool(self.zscored) or not self.trace_block)
 
     def scorer(
         self, H: Information, pool: Information | None = None, shares: Information | None = None
@@ -63,8 +63,8 @@ class Combination:
             ValueError: If the prior or weights name a group that there is not.
         """
         scoring = self.scoring
-        if not self.apart:
-            if self.traced:
+        if not self.zscored:
+            if self.trace_block:
                 return _Trace(scoring.weights, shares)
             return scorer(H, scoring.criterion, scoring.prior_of(), scoring.weights, pool, shares)
         known = {name.partition(".")[2] for name in H}
@@ -74,13 +74,13 @@ class Combination:
                 if name not in known:
                     raise ValueError(f"{what} must be of {', '.join(sorted(known))}, got {name!r}; correct or drop it")
         by_block: dict[str, Callable[[Information], Gain]] = {}
-        for block in self.apart:
+        for block in self.zscored:
             own = _own(H, block)
             weights = {name: x for name, x in scoring.weights.items() if name in own}
             theirs = {name: x for name, x in lambdas.groups.items() if name in own}
             prior = dataclasses.replace(lambdas, groups=theirs)
             its_shares = None if shares is None else _own(shares, block)
-            if block == self.traced:
+            if block == self.trace_block:
                 by_block[block] = _Trace(weights, its_shares)
             else:
                 everything = None if pool is None else _own(pool, block)
@@ -100,11 +100,11 @@ class Combination:
     def compared(self, gains: Sequence[Gain]) -> list[Gain]:
         """The gains of all candidates that are left, as they are ranked by: where blocks are scored alone, each block's
         less its mean, over its standard deviation. Parts still add up to the total."""
-        if not self.apart or not gains:
+        if not self.zscored or not gains:
             return list(gains)
         parts: list[dict[str, float]] = [{} for _ in gains]
         unseen: list[dict[str, float]] = [{} for _ in gains]
-        for block in self.apart:
+        for block in self.zscored:
             names = [name for name in gains[0].parts if name.startswith(f"{block}.")]
             scores = [math.fsum(gain.parts[name] for name in names) for gain in gains]
             mean, spread = statistics.fmean(scores), statistics.pstdev(scores)
@@ -121,12 +121,13 @@ class Combination:
         ]
 
     @property
-    def falls(self) -> bool:
+    def scores_fall(self) -> bool:
         """Whether a candidate's score can only fall when more is known, as greedy choice may make use of.
 
         A trace stays as it is; z-scores rise as those of other candidates fall.
         """
-        return not self.apart and (bool(self.traced) or criterion_named(self.scoring.criterion, "select").scores_fall)
+        fall = criterion_named(self.scoring.criterion, "select").scores_fall
+        return not self.zscored and (bool(self.trace_block) or fall)
 
 
 class _Trace:
@@ -152,7 +153,7 @@ def _own(information: Information, block: str) -> dict[str, torch.Tensor]:
     return {name.removeprefix(prefix): x for name, x in information.items() if name.startswith(prefix)}
 
 
-def joint_of(blocks: SceneBlocks) -> tuple[Joint, Combination]:
+def joint_and_combination(blocks: SceneBlocks) -> tuple[Joint, Combination]:
     """The quantity of a view that blocks are together, and how views are scored by it.
 
     Args:
@@ -162,14 +163,14 @@ def joint_of(blocks: SceneBlocks) -> tuple[Joint, Combination]:
     """
     scoring = blocks.scoring
     blocks.check_groups()
-    apart = blocks.names if scoring.combined_of(blocks.names) == "zscore" else ()
-    together: list[Sequence[str]] = [[block] for block in apart] or [blocks.names]
-    parts = [(name if apart else "", quantity) for some in together for name, quantity in blocks.quantities(some)]
+    zscored = blocks.names if scoring.combined_of(blocks.names) == "zscore" else ()
+    together: list[Sequence[str]] = [[block] for block in zscored] or [blocks.names]
+    parts = [(name if zscored else "", quantity) for some in together for name, quantity in blocks.quantities(some)]
     if not parts:
         raise ValueError(
             f"select: groups must have one that blocks {', '.join(blocks.names)} have information about, got "
             f"{', '.join(scoring.groups or ()) or 'none'}; add the other block, or another group"
         )
     traced = [name for name, quantity in blocks.quantities(blocks.names) if not quantity.needs_known_views]
-    scored = tuple(block for block in apart if any(name == block for name, _ in parts))
+    scored = tuple(block for block in zscored if any(name == block for name, _ in parts))
     return Joint(tuple(parts)), Combination(scoring, scored, *traced[:1])

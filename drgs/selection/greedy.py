@@ -112,7 +112,7 @@ class ViewInformation:
         for quantity, view in zip(quantities, views, strict=True):
             yield self._counted(quantity, view, next(results))
 
-    def again(self, most: int) -> Callable[[Camera], Information]:
+    def for_moved_cameras(self, most: int) -> Callable[[Camera], Information]:
         """What computes the information of further cameras, so many at most, one at a time."""
         self.expect(most)
         return lambda camera: next(self.each([PoolView(f"{camera.name}, moved", camera)]))
@@ -149,9 +149,9 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
     combination = combination or Combination(pool.scoring)
     prior = pool.prior_of(combination.scoring)
     combination = combination.with_prior(prior)
-    if pool.refine is not None and combination.apart:
+    if pool.refine is not None and combination.zscored:
         raise ValueError("select: refine must be None with combine zscore, which compares candidates; use combine sum")
-    if not combination.traced or combination.apart:  # a trace alone has no lambda
+    if not combination.trace_block or combination.zscored:  # a trace alone has no lambda
         _check_prior(pool, prior)
     first = _first_round(pool, information, combination)
     gains, kept = combination.compared(first.gains), first.kept
@@ -165,7 +165,7 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         evaluations=first.evaluations,
         pixels=first.pixels,
         notes=[
-            *_notes(gains, combination.apart),
+            *_notes(gains, combination.zscored),
             *_silent(information.has_any),
             *_crowded(pool.cache, information),
             *([first.note] if first.note else []),
@@ -173,7 +173,8 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         ],
     )
     # Scores never rise as H grows, unless lambda or the set of counted parameters changes with it.
-    falling = pool.lazy and not prior.relative and min((prior.value, *prior.groups.values())) > 0 and combination.falls
+    fixed = not prior.relative and min((prior.value, *prior.groups.values())) > 0
+    falling = pool.lazy and fixed and combination.scores_fall
     left, fresh = list(range(len(gains))), set(range(len(gains)))
     while True:
         order = sorted((i for i in left if i in fresh), key=lambda i: -gains[i].total)  # stable: ties by index
@@ -182,7 +183,7 @@ def greedy(pool: Pool, information: ViewInformation, combination: Combination | 
         pick, picked = pool.pick(best, gains[best].total, gains[best].parts, margin), kept.get(best)
         if pool.refine is not None:
             score = first.scorer(combination)
-            compute = information.again(pool.refine.evaluations)
+            compute = information.for_moved_cameras(pool.refine.evaluations)
             start = pool.candidates[best]
             camera, gain, moved, count = refined(
                 pool.scene, pool.candidates, pool.train, start, gains[best], score, compute, pool.refine
@@ -294,7 +295,7 @@ def _halves(pool: Pool, combination: Combination) -> bool:
     """Whether candidates are first scored by fewer pixels: where that has been measured, and saves time."""
     few = len(pool.candidates) < _LEAST_CANDIDATES or pool.information is not None or pool.region is not None
     changes = pool.cache is not None and pool.cache.bound is not None  # which keeps views of expected cameras alone
-    asked = pool.halving and pool.k == 1 and combination.pooled and not combination.apart
+    asked = pool.halving and pool.k == 1 and combination.pooled and not combination.zscored
     return asked and isinstance(pool.scene, Gaussians) and not (few or changes)
 
 
@@ -399,11 +400,11 @@ def _nothing(part: Information) -> dict[str, torch.Tensor]:
     return {name: torch.zeros_like(x, dtype=torch.float64) for name, x in part.items()}
 
 
-def _notes(gains: list[Gain], apart: tuple[str, ...]) -> list[str]:
+def _notes(gains: list[Gain], zscored: tuple[str, ...]) -> list[str]:
     """What is worth saying about the first round, of blocks that are scored alone or of all groups together."""
     notes = []
     scores = [gain.total for gain in gains]
-    if max(scores) == 0 and apart:  # of z-scores, one is positive otherwise
+    if max(scores) == 0 and zscored:  # of z-scores, one is positive otherwise
         if len(gains) > 1:
             notes.append(f"all {len(scores)} candidates have the same score in each block; the order decided")
     elif max(scores) == 0:
@@ -429,7 +430,7 @@ def _halved(pool: Pool, pixels: Sequence[int]) -> list[str]:
 def _silent(has_any: dict[str, bool]) -> list[str]:
     """What is worth saying about a network that no view has information about."""
     return [
-        f"deformation: no view has information about {name}, which decides nothing (heads of the network that are 0, "
+        f"deformation: no view informs {name}, which adds 0 to every score (heads of the network that are 0, "
         "as at its start, or no Gaussian in sight moves)"
         for name, any_view in has_any.items()
         if not any_view

@@ -19,7 +19,7 @@ from drgs.information.criteria import criterion_named
 from drgs.information.gains import DENSE
 from drgs.information.quantity import Joint, Quantity, ViewContext
 from drgs.information.sums import Information
-from drgs.selection.combine import Combination, joint_of
+from drgs.selection.combine import Combination, joint_and_combination
 from drgs.selection.greedy import PoolView, ViewInformation, greedy
 from drgs.selection.pool import Pool, Selection
 from drgs.settings import RenderSettings
@@ -33,7 +33,7 @@ def fisher(pool: Pool) -> Selection:
     if pool.information is not None:  # its groups are its own
         return _greedy(pool)
     blocks = _blocks(pool)
-    joint, combination = joint_of(blocks)
+    joint, combination = joint_and_combination(blocks)
     selection = _greedy(pool, joint, combination)
     selection.blocks = list(blocks.names)
     selection.semantics = blocks.metric.to_json() if blocks.metric else None
@@ -41,12 +41,12 @@ def fisher(pool: Pool) -> Selection:
         selection.network = {"score": scoring.network, "probes": scoring.probes}
         if scoring.network == "ratio" and scoring.probes < _FEW_PROBES:
             selection.notes.append(
-                f"deformation: {scoring.probes} probes are few to divide by, where one view is all that is known of a "
-                f"parameter its ratio is too large; take {_FEW_PROBES} or more"
+                f"deformation: with {scoring.probes} probes the ratio Hc / H is too large for parameters that one "
+                f"known view informs; use --probes {_FEW_PROBES} or more"
             )
-    if combination.apart:
+    if combination.zscored:
         selection.combine = "zscore"
-        selection.notes.append(f"scores are sums of z-scores of {', '.join(combination.apart)} over the candidates")
+        selection.notes.append(f"scores are sums of z-scores of {', '.join(combination.zscored)} over the candidates")
     return selection
 
 
@@ -115,7 +115,7 @@ def _greedy(pool: Pool, joint: Joint | None = None, combination: Combination | N
 
 def compute_candidates(pool: Pool) -> None:
     """Compute the information of the candidates that `fisher` scores by, for the pool's cache; nothing is scored."""
-    joint, _ = joint_of(_blocks(pool))
+    joint, _ = joint_and_combination(_blocks(pool))
     views = [PoolView(f"candidate {i}", camera) for i, camera in enumerate(pool.candidates)]
     for _ in ViewInformation(pool, joint).each(views):
         pass

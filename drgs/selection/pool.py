@@ -59,8 +59,8 @@ class Selection:
         picks: Picks in the order of picking.
         scores: Scores of all candidates, before the first pick.
         parts: Parts of all candidates' scores, before the first pick: group -> what it adds.
-        unseen: Share of each candidate's score, in the same unit, that is of parameters that no training view has
-            information about (lambda alone decides how much they count).
+        unseen: What parameters that no training view has information about add to each candidate's score, in its unit
+            (lambda alone decides how much they count).
         left_out: Group -> parameters not counted because lambda = 0 and no training view has information about them.
         evaluations: How often a candidate was scored.
         computed: Views whose information was computed, not taken from the cache.
@@ -71,7 +71,7 @@ class Selection:
         semantics: What is coupled, if anything is: the metric's estimate, gamma and width.
         network: How the block `deformation` scored, and from how many probes, if it did.
         combine: `sum` of the groups' parts, or of blocks' z-scores over the candidates that were left: then scores
-            and parts, `block.group`, are in standard deviations (`unseen` not less the mean).
+            and parts, `block.group`, are in standard deviations (the mean is not subtracted from `unseen`).
         seconds: Wall time.
     """
 

@@ -71,10 +71,10 @@ class _Bounds:
 
     Attributes:
         low, high: (3,) corners of the box, world units.
-        forward: (3,) the axis that it must not leave by more than `turn` degrees.
-        turn: That.
-        solid: (M, 3) Gaussians that it must not come nearer to than any of the cameras is.
-        clearance: Distance to the tenth of these that is nearest.
+        forward: (3,) world, optical axis of the candidate.
+        turn: Largest angle between it and the axis of the moved camera, degrees.
+        solid: (M, 3) world, means of the Gaussians that are opaque enough to be run into.
+        clearance: World units: how near any of the cameras comes to the tenth nearest of these, the least distance.
     """
 
     low: np.ndarray

@@ -329,7 +329,7 @@ def _check_same(run: Run, config: FitConfig) -> None:
     was = fit_record(run).config
     if config.data.undistort == "auto":  # the run has recorded what that was
         was = was.replace(data=dataclasses.replace(was.data, undistort="auto"))
-    change = changed_field(config.going_on(was), was)
+    change = changed_field(config.resuming(was), was)
     if change is not None:
         name, now, before = change
         raise ValueError(

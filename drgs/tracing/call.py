@@ -47,6 +47,7 @@ _RECORDED_OUTPUTS = {"depth", "median", "count"}
 @dataclasses.dataclass(frozen=True, eq=False)
 class Output:
     """The images of one view (torch tensors; None where not in `outputs`); of a list of views with a leading axis.
+    t* is the distance along the ray at which a Gaussian is hit, w its weight, T the transmittance.
 
     Attributes:
         rgb: (H, W, 3) linear blend of the colors, background included, not clamped.
@@ -56,8 +57,9 @@ class Output:
         count: (H, W) int32, composited hits.
         visibility: (N,) sum of w over all pixels; not differentiated.
         features: (H, W, D) when the Gaussians have features.
-        certificate: What exact order is vouched for with: `rays`; on `bvh` `redone`, the rays walked again for more
-            hits than a buffer holds; on tiles `pairs`, the entries listed. A list of them for a list of views.
+        certificate: Counters: `pairs`, entries of the lists of tiles; `rays`, and `redone`, rays that were traced again
+            because their buffer of hits was too short for exact order. Absent where they do not apply; a list of them
+            for a list of views.
     """
 
     rgb: torch.Tensor

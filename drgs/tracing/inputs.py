@@ -31,5 +31,5 @@ def gaussians_at(where: str, scene: Any, camera: Any) -> Any:
         return scene
     check_any_scene(where, scene)
     gaussians = scene.at(camera.time)
-    must_be(where, "scene.at(time)", gaussians, Gaussians, "a scene has Gaussians at any time")
+    must_be(where, "scene.at(time)", gaussians, Gaussians, "let at(time) return drgs.Gaussians")
     return gaussians

@@ -77,7 +77,7 @@ def scene_of_file(
     if views:
         some = spread(views, _MOST_PHOTOGRAPHS)
         record = error_record_of_views(shown, some, settings, DataConfig(), _INFORMATION_PIXELS)
-        return dataclasses.replace(page, scale=error_of(record.times(len(views) / len(some))))
+        return dataclasses.replace(page, scale=error_of(record.scaled(len(views) / len(some))))
     small = spread([at_most(camera, _INFORMATION_PIXELS) for camera in photographs], _MOST_PHOTOGRAPHS)
     return dataclasses.replace(page, scale=uncertainty_of(shown, small, settings, Nuisances()))
 
