@@ -187,9 +187,7 @@ class DeformationField(torch.nn.Module):
             deltas = _deltas(mlp, product(found))
         squared = [torch.zeros_like(x, requires_grad=False) for x in mlp.values()]
         by_nodes = [own.squares(torch.zeros_like(x)) for own, x in zip(corners, found, strict=True)]
-        for some in zip(
-            *cotangents, strict=True
-        ):  # one after another: together, copies would cost more than they spare
+        for some in zip(*cotangents, strict=True):  # one by one: copies for all would cost more than they spare
             by_leaf = torch.autograd.grad(deltas, leaves, some, retain_graph=True)
             squared = [x.add_(slope.square()) for x, slope in zip(squared, by_leaf, strict=False)]
             for k, own in enumerate(corners):

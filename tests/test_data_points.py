@@ -497,6 +497,17 @@ def test_damaged_point_clouds(tmp_path, change, told):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("newline", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("kind", ["float", "f4"])
+def test_headers_as_programs_write_them(tmp_path, newline, kind):
+    """All line ends, also where the data begins like one, NumPy's names of types, control characters in comments."""
+    lines = ["ply", "format binary_little_endian 1.0", "comment a\fb", "element vertex 1"]
+    lines += [*(f"property {kind} {axis}" for axis in "xyz"), "end_header", ""]
+    point = np.frombuffer(b"\n\n\n?" * 3, "<f4")
+    (tmp_path / "points.ply").write_bytes(newline.join(lines).encode() + point.tobytes())
+    assert read_point_ply(tmp_path / "points.ply")[0][0].tolist() == point.tolist()
+
+
 def test_what_is_hidden_is_not_shared(tmp_path, rng):
     """Points on both sides of a slab, with tracks of one to three photographs of their side: all of this side show
     them, and those of the other side do not, where projections alone would be inside the picture.

@@ -385,16 +385,16 @@ def test_a_wrong_label_is_told(ring):
 
 
 @pytest.mark.parametrize(
-    ("residuals", "nothing", "message"),
+    ("residuals", "empty", "message"),
     [
         (torch.zeros(24, 31), 1.0, r"must be \(24, 32\) like its camera"),
-        (-torch.ones(24, 32), 1.0, "must be finite floats >= 0"),
+        (-torch.ones(24, 32), 1.0, "must be finite and >= 0, got -1 to -1"),
         ([torch.zeros(24, 32)] * 2, 1.0, "one for each of 1 cameras, got 2"),
         (torch.zeros(24, 32), math.nan, "empty_residual must be a finite number"),
     ],
 )
-def test_residuals_are_checked(ring, residuals, nothing, message):
+def test_residuals_are_checked(ring, residuals, empty, message):
     """One line says what must hold."""
     g, cameras = ring
     with pytest.raises(ArgumentError, match=message):
-        residual_record(g, cameras[0], residuals, nothing)
+        residual_record(g, cameras[0], residuals, empty)

@@ -206,6 +206,7 @@ def test_bad_files_are_refused_in_one_line(tmp_path, rng):
     cases = {
         "not a PLY": (good[10:], r"must be a PLY file, got b'"),
         "empty": (b"", r"must be a PLY file, got b''"),
+        "no end": (good[:40], r"header of a PLY must end with end_header within 262144 bytes"),
         "truncated": (good[:-1], r"claims 7 vertex \(1736 bytes\), the file holds 1735 bytes"),
         "text truncated": (header(BASE, 3, form="ascii").encode() + b"1 2 3\n", r"claims 3 vertex \(84 bytes\)"),
         "text of words": (header(BASE, form="ascii").encode() + b"a " * 14, r"must be a readable PLY, got"),

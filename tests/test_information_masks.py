@@ -115,9 +115,9 @@ def test_known_views_tell_less(rng):
     [
         ([], "masks must be a list with one for each of 1 cameras, got 0"),
         (torch.ones(10, 12), "masks must be a list with one for each of 1 cameras, got a Tensor of shape"),
-        ([torch.ones(3, 4)], r"masks\[0\] must be \(10, 12\) like its camera's image"),
-        ([torch.full((10, 12), 2.0)], r"all within 0 and 1, got \(10, 12\) within 2 and 2"),
-        ([torch.full((10, 12), float("nan"))], "all within 0 and 1"),
+        ([torch.ones(3, 4)], r"masks\[0\] must have its camera's shape \(10, 12\)"),
+        ([torch.full((10, 12), 2.0)], r"values in \[0, 1\], got \(10, 12\) within 2 and 2"),
+        ([torch.full((10, 12), float("nan"))], r"values in \[0, 1\], got \(10, 12\) within nan"),
         ([np.ones((10, 12))], r"masks\[0\] must be .*Tensor"),
     ],
 )

@@ -304,7 +304,7 @@ def test_values_that_cannot_be(saved, tmp_path):
         (lambda own, head: own.pop("fit.parameter.quats"), "parameter.quats must be torch.float32 of shape"),
         (lambda own, head: own.pop("shapes.0.quats"), "quats of shapes 0 must be torch.float32 of shape"),
         (lambda own, head: head["cache"]["answers"][0].update(view=99), "answer 0 must be of a view"),
-        (lambda own, head: head["cache"]["answers"][0].update(shapes=99), "answers must be of . states of the"),
+        (lambda own, head: head["cache"]["answers"][0].update(shapes=99), "answers must refer to . saved scenes"),
         (
             lambda own, head: own.update({"answer.0.means": torch.zeros(2, 3)}),
             "answer 0: means must be of .* Gaussians",

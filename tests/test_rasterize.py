@@ -364,7 +364,11 @@ def test_forward_mode_is_the_transpose():
         ({"lidar_coeffs": 1}, NotImplementedError, "lidar_coeffs is not supported; pass its rays as rays="),
         ({"covars": torch.eye(3)}, ValueError, r"covars must be a tensor of shape .*got \(3, 3\)"),
         ({"quats": None}, ValueError, "quats and scales must be tensors where there are no covars"),
-        ({"with_ut": True}, NotImplementedError, "with_ut without with_eval3d is not supported; .* pass both"),
+        (
+            {"with_ut": True},
+            NotImplementedError,
+            "with_ut without with_eval3d is not supported; .* pass with_eval3d=True",
+        ),
         ({"with_ut": True, "preset": "gsplat"}, NotImplementedError, "with_ut without with_eval3d is not supported"),
         ({"viewmats_rs": torch.eye(4)}, ValueError, r"viewmats_rs must have shape \(1, 4, 4\), got \(4, 4\)"),
         ({"colors": torch.zeros(60, 9, 5)}, ValueError, r"backgrounds must have shape \(1, 5\), got \(1, 3\)"),

@@ -343,7 +343,7 @@ def test_what_is_refused():
         select(g, candidates, known, information=lambda camera: {"a": torch.ones(1)}, region=region)
     with pytest.raises(ValueError, match="region must be a Region"):
         select(g, candidates, known, region="box:0,0,0,1,1,1")
-    with pytest.raises(ValueError, match=r"masks\[0\] must be \(24, 24\)"):
+    with pytest.raises(ValueError, match=r"masks\[0\] must have its camera's shape \(24, 24\)"):
         Region.masks([torch.ones(3, 3)], known[:1])
     with pytest.raises(ValueError, match="a mask for each of one camera or more, got 0"):
         Region.masks([], [])

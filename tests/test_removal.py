@@ -158,5 +158,5 @@ def test_refuses_wrong_weights_and_masks():
         fisher.removal_error(g, cam, power=3)
     with pytest.raises(ValueError, match=r"fisher.removal_error: channel_weights must be 3"):
         fisher.removal_error(g, cam, channel_weights=(1.0, -1.0, 1.0))
-    with pytest.raises(ValueError, match=r"fisher.removal_error: masks\[0\] must be"):
+    with pytest.raises(ValueError, match=r"fisher.removal_error: masks\[0\] must have"):
         fisher.removal_error(g, cam, masks=[torch.ones(2, 2)])

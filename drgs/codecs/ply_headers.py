@@ -18,11 +18,12 @@ EXTRA = ("uncertainty_", "label")
 """Beginnings of columns that `drgs.save_ply` adds, and viewers leave out."""
 
 _SIZES = {
-    **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
-    **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
-    **dict.fromkeys(("int", "uint", "int32", "uint32", "float", "float32"), 4),
-    **dict.fromkeys(("double", "float64"), 8),
+    **dict.fromkeys(("char", "uchar", "int8", "uint8", "i1", "u1"), 1),
+    **dict.fromkeys(("short", "ushort", "int16", "uint16", "i2", "u2"), 2),
+    **dict.fromkeys(("int", "uint", "int32", "uint32", "float", "float32", "i4", "u4", "f4"), 4),
+    **dict.fromkeys(("double", "float64", "f8"), 8),
 }
+"""Type of a column -> bytes of a number; plyfile reads NumPy's names, too."""
 _MAX_HEADER = 1 << 18  # bytes; some 9,000 columns
 
 
@@ -60,14 +61,19 @@ def read_ply_header(path: Path) -> list[PlyElement]:
         raise FileNotFoundError(f"{path}: must be a PLY file, found none; check the path")
     with path.open("rb") as file:
         head = file.read(_MAX_HEADER)
-    last = re.search(rb"[\r\n]end_header", head)  # not the word in a comment
-    end = last.start() + 1 if last else -1
-    newline = head.find(b"\n", end)
-    if not head.startswith((b"ply\n", b"ply\r")) or end < 0 or newline < 0:
-        raise ValueError(f"{path}: must be a PLY file, got {head[:8]!r}; export it again")
+    if not head.startswith((b"ply\n", b"ply\r")):
+        raise ValueError(f"{path}: must be a PLY file, got {head[:8]!r}; convert it to PLY")
+    # Not the word in a comment. Behind lines that end with \r alone the first byte of the data may be a \n.
+    newline = rb"\r?\n" if b"\n" in head[3:5] else rb"\r"
+    last = re.search(rb"[\r\n]end_header[^\r\n]*" + newline, head)
+    if last is None:
+        raise ValueError(
+            f"{path}: the header of a PLY must end with end_header within {_MAX_HEADER} bytes, does not; it is "
+            "truncated or damaged, copy it again"
+        )
     elements: list[PlyElement] = []
     text_format = None
-    for line in head[:end].decode("ascii", "replace").splitlines():
+    for line in re.split(r"\r\n|\r|\n", head[: last.start()].decode("ascii", "replace")):
         match line.split():
             case ["format", "ascii" | "binary_little_endian" | "binary_big_endian" as kind, _]:
                 text_format = kind
@@ -83,7 +89,7 @@ def read_ply_header(path: Path) -> list[PlyElement]:
         raise ValueError(f"{path}: element {empty!r} of a PLY must have a property, has none; export it again")
     is_text = text_format == "ascii"
     claimed = sum(element.least_bytes(is_text) for element in elements)
-    held = path.stat().st_size - newline - 1
+    held = path.stat().st_size - last.end()
     if claimed > held + is_text:
         counts = ", ".join(f"{element.rows} {element.name}" for element in elements)
         raise ValueError(

@@ -561,8 +561,8 @@ class Select(ComparedViews, Workers):
     k: int = of_views(1, "Number of views to pick, one after the other.", short="k", within=COUNT)
     halving: bool = of_views(
         True,
-        "Score every candidate by all of its pixels; by default only those that a quarter of the pixels puts within a "
-        "tenth of the best (docs/information.md).",
+        "Score every candidate by all of its pixels; by default, for a single pick from large views, only those that a "
+        "quarter of the pixels puts within a tenth of the best (docs/information.md).",
         rare=True,
     )
     region: str | None = same_option(SelectionConfig, "region", rare=False, heading="Views")
@@ -610,7 +610,7 @@ class Fisher(ComparedViews):
         SelectionConfig,
         "region",
         rare=False,
-        help="Also report the numbers of the pixels that show this part of the scene: a box or a sphere (world"
+        help="Also report results of the pixels alone that show this part of the scene: a box or a sphere (world"
         " coordinates), what masks of some photographs show, or a class of a scene with labels.",
         heading="Views",
     )

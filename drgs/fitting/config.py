@@ -624,9 +624,9 @@ class FitConfig(Record):
             _check_lenses(self)
 
     def resuming(self, before: FitConfig) -> FitConfig:
-        """This configuration for resuming a fit of `before`: `renderers`, `updates_per_step`, `num_downscales` and
-        `exposure` that are left at auto take the values that `before` resolved. `undistort` stays as it is, since
-        photographs are there already, as this configuration has them.
+        """This configuration for resuming a fit of `before`, whose resolved values it takes for `updates_per_step`,
+        `num_downscales` and `exposure` where they are not stated, and for `renderers` if `settings` are the same.
+        `undistort` stays as it is: photographs are there already, as this configuration has them.
         """
         config = self
         if config.renderers == AUTO and config.settings == before.settings:

@@ -31,7 +31,7 @@ def label_record(loaded: LoadedRun, frames: Sequence[Frame]) -> ErrorRecord:
 
     A pixel's residual is 1 where the label of the run, as `drgs eval` draws it, is not that of the data set, or where
     this labels none of the frames, not that of the teacher's map, whose own errors count then. Pixels without a label
-    have no say. The error of saying nothing is that of the most frequent label everywhere.
+    have no say. A prediction without Gaussians has the most frequent label everywhere.
 
     Args:
         loaded: A run with a decoder and embeddings of its classes.
@@ -56,9 +56,9 @@ def label_record(loaded: LoadedRun, frames: Sequence[Frame]) -> ErrorRecord:
             residuals.append(torch.from_numpy(found != reference).float())
             masks.append(torch.from_numpy(reference > 0).float())
             bar.advance()
-    nothing = 1 - float(counts[1:].max() / max(1, counts[1:].sum()))
+    empty = 1 - float(counts[1:].max() / max(1, counts[1:].sum()))
     cameras, settings = [frame.camera for frame in frames], loaded.record.config.settings
-    return residual_record(loaded.scene, cameras, residuals, nothing, settings, masks=masks)
+    return residual_record(loaded.scene, cameras, residuals, empty, settings, masks=masks)
 
 
 def wrong_label(scene: Scene, camera: Camera, record: ErrorRecord) -> torch.Tensor:
@@ -73,7 +73,7 @@ def wrong_label(scene: Scene, camera: Camera, record: ErrorRecord) -> torch.Tens
 
 def feature_record(loaded: LoadedRun, frames: Sequence[Frame]) -> ErrorRecord:
     """What training views say about errors of decoded features: squared differences from the teacher's maps, mean over
-    channels. Views without a map have no say. The error of saying nothing is the mean square of the maps.
+    channels. Views without a map have no say. A prediction without Gaussians is 0.
 
     Args:
         loaded: A run with a decoder.

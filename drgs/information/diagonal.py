@@ -89,7 +89,7 @@ class Diagonal(Quantity):
 
     def _by_replay(self, view: ViewContext, wanted: dict[str, Group]) -> dict[str, torch.Tensor]:
         replay = view.replay(self.semantics)
-        along = [one.sums for one in view.hit_sums.values() if one.semantics is self.semantics]
+        along = [one.sums for one in view.shared_sums.values() if one.semantics is self.semantics]
         result = dict(replay.diagonal(wanted, self.channel_weights, self.method == "fisherrf", along))
         rows = ViewRows.of(view, self.channel_weights, self.semantics, self.nuisances)
         if rows is not None:

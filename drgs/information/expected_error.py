@@ -10,7 +10,7 @@ directions d_i, the expected squared error (mean over channels) is the sum of fo
     direction    sum_i w_i NEW_DIRECTION s_i^2 / (n_i + 1): from a direction in which no training view saw it, the error
                  is NEW_DIRECTION times that of the directions which were fitted
     information  OFF_DIAGONAL / 3 sum over channels and parameters k of J_pk^2 s_i(k)^2 / (H_k + 1): what noise of this
-                 variance leaves open of the parameters, and OFF_DIAGONAL for the entries of H that are left out
+                 variance leaves open of the parameters; OFF_DIAGONAL makes up for the entries of H off its diagonal
     unseen       UNSEEN (1 - alpha)^2 t^2 / (H_c + 1): a color behind everything that no view has seen
 
 and their sum x is calibrated: below q it becomes q (x / q)^g. The power g fits squared residuals of a training view to
@@ -308,7 +308,7 @@ def _record_of(
                 f"{len(view.gaussians)} in cameras[{number}]; take views of one time"
             )
         found = quantity.summand(quantity.compute(view), view.camera, view.mask)
-        view.hit_sums.clear()  # which hold buffers of the traversal
+        view.shared_sums.clear()  # which hold buffers of the traversal
         if number in own_sums:
             own_sums[number] = {name: found[name].clone() for name in (WEIGHTS, RESIDUALS, BEHIND)}
         for name, by_place in columns.items():
@@ -512,10 +512,12 @@ def _checked_residuals(where: str, residuals: Any, cameras: Sequence[Camera]) ->
     """A map for each camera; `ArgumentError` for another number of them, another size, or what is no number >= 0."""
     maps = _one_each(where, "residuals", residuals, cameras, (), "(H, W) >= 0")
     for index, residual in enumerate(maps):
-        if not residual.is_floating_point() or not bool((torch.isfinite(residual) & (residual >= 0)).all()):
+        if not residual.is_floating_point():
+            raise ArgumentError(f"{where}: residuals[{index}] must be floats, got {residual.dtype}; use .float()")
+        if not bool((torch.isfinite(residual) & (residual >= 0)).all()):
             raise ArgumentError(
-                f"{where}: residuals[{index}] must be finite floats >= 0, got {residual.dtype} within "
-                f"{float(residual.min()):g} and {float(residual.max()):g}; pass squared residuals"
+                f"{where}: residuals[{index}] must be finite and >= 0, got {float(residual.min()):g} to "
+                f"{float(residual.max()):g}; pass squared residuals"
             )
     return maps
 

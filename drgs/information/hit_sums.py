@@ -111,7 +111,9 @@ class _Along(Sink):
 
         def body(k: UInt32, place: UInt32, own: list[list]) -> tuple[UInt32, UInt32, list[list]]:
             totals = [lib.Float(0)] * GEOMETRY
-            for (slopes, g, turned), pixel, inside in zip(own, self.walk.part.flat, self.walk.part.inside, strict=True):
+            for (slopes, g, color_by_mean), pixel, inside in zip(
+                own, self.walk.part.flat, self.walk.part.inside, strict=True
+            ):
                 at = (k * self.pixels + pixel) * self.fours
                 u: list[Float] = []
                 for four in range(self.fours):
@@ -119,7 +121,7 @@ class _Along(Sink):
                 u = u[: self.width]
                 z = sum((x * y for x, y in zip(g, u, strict=True)), lib.Float(0))
                 totals = [dr.fma(x, z, total) for x, total in zip(slopes, totals, strict=True)]
-                for by_mean, x in zip(turned if self.walk.first else [], u, strict=False):
+                for by_mean, x in zip(color_by_mean if self.walk.first else [], u, strict=False):
                     totals[:3] = [dr.fma(y, x, total) for y, total in zip(by_mean, totals, strict=False)]
             row = place * self.count + k
             add_row(lib, self.buffer, totals, row, _WIDTH, 0, lib.Bool(True), self.walk.part.reduction)

@@ -56,9 +56,9 @@ class Misfit(Quantity):
     @alone
     def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
         """Float32 on the CPU, as one traversal sums it up."""
-        return dict((view.hit_sums.get(self) or self.hit_sums(view)).information())
+        return dict((view.shared_sums.get(self) or self.shared_sums(view)).information())
 
-    def hit_sums(self, view: ViewContext) -> MisfitSums:
+    def shared_sums(self, view: ViewContext) -> MisfitSums:
         """The sums of a view."""
         return MisfitSums(view)
 

@@ -103,8 +103,8 @@ class NetworkInformation(Quantity):
     @alone
     def compute(self, view: ViewContext) -> dict[str, torch.Tensor]:
         """Group -> float64 on the CPU: (P,) of its parameters, of `trace` and `paper` a number ()."""
-        if probes := view.hit_sums.get(self):
-            result = probes.information()
+        if sums := view.shared_sums.get(self):
+            result = sums.information()
         else:
             result = self._estimated(view)
         return {name: x for name, x in result.items() if self.groups is None or name in self.groups}
@@ -123,7 +123,7 @@ class NetworkInformation(Quantity):
         return {name: x / self.probes for name, x in total.items()}
 
     @alone
-    def hit_sums(self, view: ViewContext) -> NetworkProbes | None:
+    def shared_sums(self, view: ViewContext) -> NetworkSums | None:
         """None where more than the geometry of Gaussians moves, images do not fit at a time, or nothing is seen."""
         if self.estimate != "diagonal" or self.seed != 0:
             return None
@@ -134,7 +134,7 @@ class NetworkInformation(Quantity):
         jacobian = rows.jacobian(groups)
         if not jacobian.fields <= {*_GEOMETRY_FIELDS}:
             return None
-        return NetworkProbes(rows, jacobian, groups, _first_signs(self.probes, rows.pixels, rows.channels))
+        return NetworkSums(rows, jacobian, groups, _first_signs(self.probes, rows.pixels, rows.channels))
 
     @alone
     def variance_map(self, view: ViewContext, weights: Information) -> torch.Tensor:
@@ -190,7 +190,7 @@ class NetworkInformation(Quantity):
         return groups
 
 
-class NetworkProbes:
+class NetworkSums:
     """Estimate `diagonal` of one view, from sums over its hits that a traversal for another quantity may fill.
 
     Attributes:

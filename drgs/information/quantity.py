@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from drgs.information.semantics import SemanticMetric
 
 
-class HitSums(Protocol):
+class SharedSums(Protocol):
     """A quantity's sums over the hits of a view, which a traversal of the view for another quantity may fill.
 
     Attributes:
@@ -68,7 +68,7 @@ class ViewContext:
         photograph: (H, W, 3) what the view should show; None: there is none, or no quantity asks for it.
         residual: (H, W) how wrong each pixel is, where that is known; None: as far as its color is from the photograph.
         known_opacity: (H, W) float32, where it is known; None: a traversal gives it, or it is rendered (`opacity`).
-        hit_sums: Quantity -> its sums over hits that are still to be filled, or have been.
+        shared_sums: Quantity -> its sums over hits that are still to be filled, or have been.
     """
 
     scene: Scene
@@ -79,7 +79,7 @@ class ViewContext:
     photograph: torch.Tensor | None = None
     residual: torch.Tensor | None = None
     known_opacity: torch.Tensor | None = None
-    hit_sums: dict[Quantity, HitSums] = dataclasses.field(default_factory=dict)
+    shared_sums: dict[Quantity, SharedSums] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.scene = once_per_time(self.scene)
@@ -143,7 +143,7 @@ class Quantity:
         """The same, of those pixels of a view that a mask keeps: what is known of the others does not count."""
         return self
 
-    def hit_sums(self, view: ViewContext) -> HitSums | None:
+    def shared_sums(self, view: ViewContext) -> SharedSums | None:
         """Sums over hits that a traversal for another quantity may fill; None: there are none."""
         return None
 
@@ -163,8 +163,8 @@ class Joint(Quantity):
         result: dict[str, torch.Tensor] = {}
         with torch.no_grad():  # information is a number
             if len(self.parts) > 1:  # else no other quantity walks along the view
-                probes = {quantity: quantity.hit_sums(view) for _, quantity in self.parts}
-                view.hit_sums = {quantity: sums for quantity, sums in probes.items() if sums is not None}
+                found = {quantity: quantity.shared_sums(view) for _, quantity in self.parts}
+                view.shared_sums = {quantity: sums for quantity, sums in found.items() if sums is not None}
             for block, quantity in self.parts:
                 result |= _named(block, quantity.compute(view))
         return {name: x.to(torch.float32) for name, x in result.items()}

@@ -263,10 +263,10 @@ class Replay:
         for name, values in information.items():
             group = GROUPS[name]
             assert group.pixel_weights is not None, name  # `variance_map` has refused the others
-            spread = group.pixel_weights(values.to(self.call.home, torch.float64), self)
+            squares = group.pixel_weights(values.to(self.call.home, torch.float64), self)
             # Squared weights w^2 are of one color each, then of all other channels.
             first = GEOMETRY + 3 if name == "features" else group.entries[0]
-            table[:, first : first + spread.shape[1]] = spread
+            table[:, first : first + squares.shape[1]] = squares
         buffer = self._weights(table)
         image = dr.zeros(lib.Float, self.call.pixels)
         sh_weights = None if self.sh_weights is None else self._weights(self.sh_weights)
