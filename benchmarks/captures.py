@@ -22,7 +22,7 @@ Six starts can tell about 0.6 to 1.0 dB, by how much starts in rooms have differ
 ran: `coverage` and `moments` on the same starts, for which the default's rows are those of before.
 
 Named before any fit ran: still lifes 41 and 42 with three starts each, with the same policies; halls 43 and 44,
-kitchens 45 and 46 with two starts each, which were not run yet. Nothing was chosen on them. Still lifes are made and
+kitchens 45 and 46 with two starts each. Nothing was chosen on them. Still lifes are made and
 raced by
 
     drgs scene still_life --free --views 225 --size 160x120 --spp 16 --seed 41 -o still41
@@ -41,9 +41,9 @@ arcs (benchmarks/kitchen.py; max_steps = 1500 and semantics = "ignore" in fit.to
 
 Named on 2026-11-29, before they ran: on all of these starts, farthest point sampling of positions and directions
 (benchmarks/farthest_poses.py); in the rooms, views of one object with `region` (benchmarks/regions.py). Of halls and
-kitchens one start each is run first: hall43 and kitchen45 by commit 8da4b168, whose fits began with the four
-photographs of the first time. Since f9c1d494 they begin with those of all times (kitchen45 by `random` and `farthest`
-has 4.5 dB more); all are to be run again, so that no page has these rows.
+kitchens one start each is run first. Fits of commit 8da4b168 began with the four photographs of the first time; since
+f9c1d494 they begin with those of all times (kitchen45 by `random` and `farthest` has 4.5 dB more), so that their rows
+have been replaced.
 
 As starts in the rooms have differed (a standard deviation of 0.6 to 1.5 dB of the average over numbers of views, by the
 other policy), a paired t test finds 0.8 to 2.1 dB with six starts and 0.7 to 1.7 dB with eight, in 4 of 5 studies; four

@@ -149,7 +149,7 @@ def lines(rows: list[dict]) -> list[list[str]]:
     found_lines = []
     kinds = {tuple(row[key] for key in KEY[1:5]) for row in rows if row["way"] != "off"}
     for way, trained, views, steps in sorted(kinds, key=lambda kind: (kind[3], kind[2], kind[1], kind[0])):
-        for half, scenes in (("tried on", CHOOSING), ("shown on", SHOWING)):
+        for half, scenes in (("tuned on", CHOOSING), ("tested on", SHOWING)):
             found = gains(rows, way, scenes, trained=trained, views=views, steps=steps)
             if not found["mean"]:
                 continue

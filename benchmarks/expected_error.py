@@ -200,7 +200,7 @@ def summary(rows: list[dict]) -> str:
     """What the runs that only report say together, captures and made scenes apart."""
     sentences = []
     parts = halves(rows)
-    kinds = {"captures": "captures not tuned on", "made": "made scenes not tuned on"}
+    kinds = {"captures": "captures that nothing was tuned on", "made": "made scenes that nothing was tuned on"}
     kinds["picked"] = "fits to 20 views that the default picked among free poses or in pools as people leave them"
     for kind, what in kinds.items():
         some = parts[kind]

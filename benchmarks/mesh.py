@@ -251,7 +251,7 @@ def summary(rows: list[dict]) -> str:
     return paragraph(
         f"By default, with voxels of {default['voxel_mm']:.1f} mm, accuracy and completeness are {told['default']}; "
         f"with half the voxel {told['voxel / 2']}; with `--crop 0.5` {told['crop 0.5']}; with `--depth expected` "
-        f"{told['expected depth']}. The default crop worsens no distance (on the table, which alone is measured) and "
+        f"{told['expected depth']}. The default crop worsens no distance (on the table, all that is measured here) and "
         f"removes {100 * removed:.0f} % of the triangles ([all rows](data/mesh.csv); `python "
         f"benchmarks/mesh.py`, {default['machine']}, {default['date']}, one seed, processor time without rendering)."
     )

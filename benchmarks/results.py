@@ -19,7 +19,7 @@ deviation of 1 to 2 dB over starts, so that twelve starts find 0.9 to 1.8 dB in 
     drgs reproduce prior --seeds 6 -o OUT --no-figures
     drgs reproduce blocks --seeds 6 -o OUT --no-figures
 
-Run so far: three starts of each room, and kitchens 1 to 3 without blocks; of these lambda on an AMD EPYC (AVX2, a day
+Run so far: three starts of each room, and kitchens 1 to 3; of these lambda and blocks on an AMD EPYC (AVX2, a day
 later), all others on an Intel Xeon.
 """
 

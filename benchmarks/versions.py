@@ -253,7 +253,7 @@ def fits_table() -> str:
     lines = [[scene, *(cell([scene], *at) for at in shown)] for scene in scenes]
     lines.append(["**mean**", *(cell(scenes, *at) for at in shown)])
     untuned = [scene for scene in scenes if scene not in CHOOSING]
-    lines.append(["**of those not tuned on**", *(cell(untuned, *at) for at in shown)])
+    lines.append(["**of those that nothing was tuned on**", *(cell(untuned, *at) for at in shown)])
     return markdown_table(["data", *(f"{seconds} s, `{name}`" for seconds, name in shown)], lines)
 
 
