@@ -132,7 +132,8 @@ def free_section(rows: Rows) -> str:
         own = [row for row in rows if row["scene"].startswith(beginnings)]
         scenes, commits = (", ".join(sorted({row[key] for row in own})) for key in ("scene", "commit"))
         commits = f"commit{'s' * (',' in commits)} {commits}"
-        head = f"**{kind}** ({scenes}): {len(own)} fits, {len({unit_of(row) for row in own})} starts, {commits}."
+        whole = {unit_of(row) for row in own if row["policy"] in (DEFAULT, MOVING_DEFAULT)}
+        head = f"**{kind}** ({scenes}): {len(own)} fits, {len(whole)} starts, {commits}."
         moves = any(row["policy"] == MOVING_DEFAULT for row in own)
         parts += [paragraph(head), moving_table(own) if moves else compared_with(own, FREE_OTHERS)]
     return "\n\n".join(parts)

@@ -549,12 +549,12 @@ def write_page() -> None:
         comparisons=((REFERENCE, "default"),),
     )  # fmt: skip
     draw_curves(study, rows, METRICS[0], PICTURE)
-    commits = ", ".join(sorted({row["commit"] for row in told}))
+    dates = " and ".join(sorted({row["date"] for row in told}))
     head = (
-        f"PSNR of the object with `region` less that of another policy, in dB, with 95 % intervals "
-        f"({coverage(3, 18):.0%} contain the true mean in simulated studies); bold where that excludes 0 and there "
+        "PSNR of the object with `region` less that of another policy, in dB, with 95 % intervals "
+        f"({coverage(3, 18):.0%} contain the true mean); bold where that excludes 0 and there "
         f"are {FEWEST_UNITS} units; *wins*: units in which `region` is better, 3 to 12 views. {len(told)} fits by "
-        f"`python benchmarks/regions.py`, {told[0]['machine']}, {told[0]['date']}, commits {commits} "
+        f"`python benchmarks/regions.py`, {told[0]['machine']}, {dates} "
         "([rows](../benchmarks/regions.jsonl), [by fit](data/active-region.csv), [4 views, and "
         "IoU](data/active-region-differences.csv))."
     )

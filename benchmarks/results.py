@@ -81,7 +81,7 @@ def tables() -> str:
             units, scenes = {unit_of(row) for row in rows}, {row["scene"] for row in rows}
             commits = ", ".join(sorted({row["commit"] for row in rows}))
             size = f"{len(rows)} fits, {len(units)} starts of {len(scenes)} scenes, commit {commits}"
-            heads = ["policy", "PSNR", head, f"`{criterion}` less it", "paper: PSNR, less it"]
+            heads = ["policy", "PSNR", head, f"`{criterion}` less it", "paper: PSNR, lead"]
             parts += [paragraph(f"**{experiment.title}**: {size}."), markdown_table(heads, lines)]
     return "\n\n".join(parts)
 
