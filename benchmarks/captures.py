@@ -43,7 +43,7 @@ Named on 2026-11-29, before they ran: on all of these starts, farthest point sam
 (benchmarks/farthest_poses.py); in the rooms, views of one object with `region` (benchmarks/regions.py). Of halls and
 kitchens one start each is run first. Fits of commit 8da4b168 began with the four photographs of the first time; since
 f9c1d494 they begin with those of all times (kitchen45 by `random` and `farthest` has 4.5 dB more), so that their rows
-have been replaced.
+have been replaced. Run so far: both starts of halls, one of each kitchen; by `coverage` and `moments` one of each room.
 
 As starts in the rooms have differed (a standard deviation of 0.6 to 1.5 dB of the average over numbers of views, by the
 other policy), a paired t test finds 0.8 to 2.1 dB with six starts and 0.7 to 1.7 dB with eight, in 4 of 5 studies; four
